@@ -1,0 +1,59 @@
+"""Finds the URDF files of the suite, in a checkout or in an installed wheel."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+_PACKAGE = Path(__file__).resolve().parent
+
+
+class AssetNotFoundError(FileNotFoundError):
+    """A file that a robot or a scene names does not exist."""
+
+
+def urdf_directory() -> Path:
+    """Returns the folder that holds the URDF files of the suite.
+
+    Raises:
+        AssetNotFoundError: The package was installed without its URDF files.
+    """
+    installed = _PACKAGE / "urdf"
+    checkout = _PACKAGE.parent / "urdf"
+    if installed.is_dir():
+        return installed
+    # Beside an installed package, a folder of this name is somebody else's.
+    if checkout.is_dir() and (_PACKAGE.parent / "pyproject.toml").is_file():
+        return checkout
+    raise AssetNotFoundError(
+        f"the URDF files of newton_qd are missing: neither {installed} nor a "
+        f"checkout's {checkout} exists; install the package again"
+    )
+
+
+def find_urdf(name: str | os.PathLike[str]) -> Path:
+    """Returns the path of a URDF file.
+
+    Args:
+        name: File name inside the suite's ``urdf/``; or a path, which is what a
+            name with a folder in it (``"./mine.urdf"``) and a path object are.
+
+    Raises:
+        AssetNotFoundError: There is no such file.
+    """
+    text = os.fspath(name)
+    separators = [os.sep] + ([os.altsep] if os.altsep else [])
+    if not isinstance(name, str) or any(mark in text for mark in separators):
+        path = Path(text).expanduser()
+        if not path.is_file():
+            raise AssetNotFoundError(f"urdf {text!r}: no such file ({path.absolute()})")
+        return path
+    folder = urdf_directory()
+    path = folder / text
+    if not text or not path.is_file():
+        known = ", ".join(sorted(file.name for file in folder.glob("*.urdf")))
+        raise AssetNotFoundError(
+            f"urdf {text!r}: no such file in {folder}; allowed: {known}, or a path "
+            "with a folder in it, such as './mine.urdf'"
+        )
+    return path

@@ -1,0 +1,28 @@
+"""The differentiable physics: systems, the control step, and views of it."""
+
+from newton_qd.physics.bridge import from_jax, to_jax
+from newton_qd.physics.inspection import (
+    Kinematics,
+    bias_forces,
+    forward_kinematics,
+    lowest_contact,
+    mass_matrix,
+)
+from newton_qd.physics.model import load_system
+from newton_qd.physics.step import initial_state, step
+from newton_qd.physics.system import PhysicsState, System
+
+__all__ = [
+    "Kinematics",
+    "PhysicsState",
+    "System",
+    "bias_forces",
+    "forward_kinematics",
+    "from_jax",
+    "initial_state",
+    "load_system",
+    "lowest_contact",
+    "mass_matrix",
+    "step",
+    "to_jax",
+]

@@ -1,0 +1,210 @@
+"""The kernels' structs in device memory: the model and the scratch."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from newton_qd.physics.precision import SCALARS, kernels
+from newton_qd.physics.system import JointKind, System
+from newton_qd.physics.tree import Tree, build_tree
+
+# Scratch arrays by what they count: (slot, substep or solve, item).
+_PER_BODY = ("pose", "twist_w", "twist_v", "bias_w", "bias_v", "inertia", "moment")
+_PER_BODY += ("wrench_w", "wrench_v")
+_PER_CONTACT = ("point", "arm", "normal", "velocity", "load")
+_PER_SOLVE_CONTACT = ("push", "weight_n", "weight_t", "slip")
+_PER_SOLVE_BODY = ("added_ww", "added_wv", "added_vv", "push_w", "push_v")
+_REPORTED = ("impulse", "angular_impulse", "normal_impulse")
+
+
+def _frames_inverse(frames: np.ndarray) -> np.ndarray:
+    """Inverse of (n, 7) transforms, position and quaternion xyzw."""
+    return np.asarray([wp.transform_inverse(wp.transformd(*f)) for f in frames])
+
+
+def _composite_mass(system: System) -> np.ndarray:
+    """(nb,) mass of each body and its descendants [kg]."""
+    mass = system.mass.copy()
+    for body in range(system.nb - 1, -1, -1):
+        if system.parent[body] >= 0:
+            mass[system.parent[body]] += mass[body]
+    return mass
+
+
+def _with_world(table: np.ndarray) -> np.ndarray:
+    """Prepend the world's row to a body table; it is never read."""
+    return np.concatenate([table[:1], table])
+
+
+def build_model(system: System, device: Any) -> Any:
+    """Copy a system to a device as a ``Model`` struct.
+
+    Args:
+        system: The system; its ``dtype`` chooses the kernels.
+        device: Warp device.
+
+    Returns:
+        The struct of :mod:`newton_qd.physics.kernels.structs`.
+    """
+    space = kernels(system.dtype)
+    package, tree = space.package, build_tree(system)
+    model = space.structs.Model()
+    robot, material = system.robot, system.robot.material
+
+    def put(name: str, values: Any, dtype: Any) -> None:
+        setattr(model, name, wp.array(np.asarray(values), dtype=dtype, device=device))
+
+    model.nb, model.nq, model.nv = system.nb, system.nq, system.nv
+    model.nu, model.nc = system.nu, len(system.contact_body)
+    model.free_root = int(system.joint_kind[0] == JointKind.FREE)
+    model.substeps = robot.substeps
+    model.h = robot.dt / robot.substeps
+    model.gravity = robot.gravity
+    _put_bodies(put, system, tree, package)
+    model.body_levels = len(tree.body_level[0]) - 1
+    model.dof_levels = len(tree.dof_level[0]) - 1
+    _put_dofs(put, system, tree)
+    model.limit_smoothing = material.limit_smoothing
+    _put_contacts(put, system, tree, package)
+    model.contact_stiffness = system.contact_stiffness
+    model.contact_smoothing = material.smoothing
+    model.friction = material.friction
+    model.slip_velocity = material.slip_velocity
+    model.dissipation = material.dissipation
+    return model
+
+
+def _put_bodies(put: Any, system: System, tree: Tree, p: Any) -> None:
+    put("body_parent", tree.body_parent, int)
+    put("joint_kind", _with_world(system.joint_kind), int)
+    put("q_start", _with_world(system.q_start), int)
+    put("v_start", _with_world(system.v_start), int)
+    put("joint_axis", _with_world(system.joint_axis), p.vec3)
+    put("parent_frame", _with_world(system.parent_frame), p.transform)
+    inverse = _frames_inverse(system.child_frame)
+    put("child_frame_inverse", _with_world(inverse), p.transform)
+    put("mass", _with_world(system.mass), p.real)
+    put("composite_mass", _with_world(_composite_mass(system)), p.real)
+    put("com", _with_world(system.com), p.vec3)
+    put("inertia", _with_world(system.inertia), p.mat33)
+    put("body_level_start", tree.body_level[0], int)
+    put("body_level", tree.body_level[1], int)
+    put("child_start", tree.child[0], int)
+    put("child", tree.child[1], int)
+    put("body_dof", tree.body_dof, int)
+
+
+def _put_dofs(put: Any, system: System, tree: Tree) -> None:
+    real = SCALARS[system.dtype]
+    control = np.full(system.nv, -1, np.int32)
+    control[system.control_dof] = np.arange(system.nu)
+    gear = np.zeros(system.nv)
+    gear[system.control_dof] = system.gear
+    put("dof_body", tree.dof_body, int)
+    put("dof_coordinate", tree.dof_coordinate, int)
+    put("dof_control", control, int)
+    for name, values in {
+        "gear": gear,
+        "armature": system.armature,
+        "damping": system.damping,
+        "stiffness": system.stiffness,
+        "spring_rest": system.spring_rest,
+        # far beyond any angle, and finite: infinity times zero stiffness is NaN
+        "limit_lower": np.clip(system.limit_lower, -1e9, 1e9),
+        "limit_upper": np.clip(system.limit_upper, -1e9, 1e9),
+        "limit_stiffness": system.limit_stiffness,
+    }.items():
+        put(name, values, real)
+    put("depth", tree.depth, int)
+    put("path", tree.path, int)
+    put("descendant_start", tree.descendant[0], int)
+    put("descendant", tree.descendant[1], int)
+    put("dof_level_start", tree.dof_level[0], int)
+    put("dof_level", tree.dof_level[1], int)
+
+
+def _put_contacts(put: Any, system: System, tree: Tree, p: Any) -> None:
+    put("contact_start", tree.contact, int)
+    put("contact_body", system.contact_body + 1, int)
+    put("contact_position", system.contact_position, p.vec3)
+    put("contact_radius", system.contact_radius, p.real)
+    put("contact_obstacle", system.contact_obstacle, int)
+    put("obstacle_kind", system.obstacle_kind, int)
+    put("obstacle_frame", system.obstacle_frame, p.transform)
+    put("obstacle_size", system.obstacle_size, p.vec3)
+
+
+def build_scratch(
+    system: System, slots: int, device: Any, *, adjoint: bool
+) -> SimpleNamespace:
+    """Allocate the intermediates of ``slots`` worlds in flight.
+
+    Args:
+        system: The system.
+        slots: Number of worlds that the scratch holds at once.
+        device: Warp device.
+        adjoint: Whether every substep is kept, with adjoints; otherwise the substeps
+            share their memory.
+
+    Returns:
+        ``values`` and ``adjoints`` (the latter ``values`` itself without adjoint),
+        two ``Scratch`` structs, and ``bytes_per_slot``.
+    """
+    space = kernels(system.dtype)
+    values, adjoints = space.structs.Scratch(), space.structs.Scratch()
+    depth = int(build_tree(system).depth.max())
+    n, nc = system.robot.substeps, max(len(system.contact_body), 1)
+    shapes: dict[str, tuple[int, ...]] = {
+        "q": (n + 1, system.nq),
+        "v": (n + 1, system.nv),
+        "ctrl": (max(system.nu, 1),),
+        **dict.fromkeys(_PER_BODY, (n, system.nb + 1)),
+        **dict.fromkeys(("axis_w", "axis_v"), (n, system.nv)),
+        **dict.fromkeys((*_PER_CONTACT, *_REPORTED), (n, nc)),
+        **dict.fromkeys(_PER_SOLVE_CONTACT, (2 * n, nc)),
+        **dict.fromkeys(_PER_SOLVE_BODY, (2 * n, system.nb + 1)),
+        **dict.fromkeys(("H", "L"), (2 * n, system.nv, depth)),
+        **dict.fromkeys(("b", "dv"), (2 * n, system.nv)),
+    }
+    kept = ("q", "v", "ctrl", *_REPORTED)
+    size = 0
+    for name, shape in shapes.items():
+        dtype = getattr(space.structs.Scratch.vars[name].type, "dtype", None)
+        shared = not adjoint and name not in kept
+        stored = (1, *shape[1:]) if shared else shape
+        array = wp.zeros(
+            (slots, *stored), dtype=dtype, device=device, requires_grad=adjoint
+        )
+        size += array.capacity // slots * (2 if adjoint else 1)
+        setattr(values, name, _repeat(array, shape[0]) if shared else array)
+        if adjoint:
+            setattr(adjoints, name, array.grad)
+    values.fault = wp.zeros(slots, dtype=int, device=device)
+    return SimpleNamespace(
+        values=values,
+        adjoints=adjoints if adjoint else values,
+        bytes_per_slot=size,
+    )
+
+
+def _repeat(array: Any, count: int) -> Any:
+    """View of ``array`` (slot, 1, ...) in which every substep is the one stored."""
+    view = wp.array(
+        ptr=array.ptr,
+        dtype=array.dtype,
+        shape=(array.shape[0], count, *array.shape[2:]),
+        strides=(array.strides[0], 0, *array.strides[2:]),
+        device=array.device,
+    )
+    view._owner = array  # keeps the memory alive
+    return view
+
+
+def slots_for(memory: int, bytes_per_slot: int) -> int:
+    """Number of slots that fit into ``memory`` bytes, a power of two, at least 32."""
+    return max(32, 2 ** int(math.log2(max(memory // bytes_per_slot, 1))))

@@ -1,0 +1,133 @@
+"""Functions for checking and control: kinematics, mass matrix, bias forces."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+
+from newton_qd.physics import bridge
+from newton_qd.physics.system import JointKind, System
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Kinematics:
+    """Where the bodies are and how they move, world axes.
+
+    Attributes:
+        position: (nb, 3) origin of the link frame [m].
+        rotation: (nb, 4) quaternion xyzw of the link frame.
+        com: (nb, 3) centre of mass [m].
+        linear_velocity: (nb, 3) of the centre of mass [m/s].
+        angular_velocity: (nb, 3) [rad/s].
+    """
+
+    position: jax.Array
+    rotation: jax.Array
+    com: jax.Array
+    linear_velocity: jax.Array
+    angular_velocity: jax.Array
+
+
+def _rotate(quaternion: jax.Array, vector: jax.Array) -> jax.Array:
+    """Rotate (..., 3) vectors by (..., 4) quaternions xyzw."""
+    axis, w = quaternion[..., :3], quaternion[..., 3:]
+    turned = 2.0 * jnp.cross(axis, vector)
+    return vector + w * turned + jnp.cross(axis, turned)
+
+
+def _checked(system: System, name: str, value: jax.Array, size: int) -> jax.Array:
+    value = jnp.asarray(value, jnp.dtype(system.dtype))
+    if value.shape != (size,):
+        raise ValueError(f"{name} has shape {value.shape}: expected ({size},)")
+    return value
+
+
+def forward_kinematics(system: System, q: jax.Array, v: jax.Array) -> Kinematics:
+    """Poses and velocities of every body.
+
+    Args:
+        system: The system.
+        q: (nq,) coordinates [m or rad].
+        v: (nv,) velocities [m/s or rad/s].
+
+    Returns:
+        The kinematics; differentiable in reverse mode.
+
+    Raises:
+        ValueError: ``q`` or ``v`` has another shape.
+    """
+    q = _checked(system, "q", q, system.nq)
+    v = _checked(system, "v", v, system.nv)
+    pose, twist = bridge.kinematics(system)(q, v)
+    at, rotation = pose[:, :3], pose[:, 3:]
+    local = jnp.asarray(system.com, q.dtype)
+    com = at + _rotate(rotation, local)
+    angular = twist[:, :3]
+    # the kernels work about O, the position of a free root
+    free = system.joint_kind[0] == JointKind.FREE
+    origin = q[:3] if free else jnp.zeros((3,), q.dtype)
+    return Kinematics(
+        position=at + origin,
+        rotation=rotation,
+        com=com + origin,
+        linear_velocity=twist[:, 3:] + jnp.cross(angular, com),
+        angular_velocity=angular,
+    )
+
+
+def mass_matrix(system: System, q: jax.Array) -> jax.Array:
+    """Joint-space inertia, armature included.
+
+    Args:
+        system: The system.
+        q: (nq,) coordinates [m or rad].
+
+    Returns:
+        (nv, nv) symmetric matrix M of M dv/dt + bias = force.
+
+    Raises:
+        ValueError: ``q`` has another shape.
+    """
+    q = _checked(system, "q", q, system.nq)
+    lower, _ = bridge.dynamics(system, q, jnp.zeros((system.nv,), q.dtype))
+    return lower + lower.T - jnp.diag(jnp.diagonal(lower))
+
+
+def bias_forces(system: System, q: jax.Array, v: jax.Array) -> jax.Array:
+    """Velocity-product and gravity forces, without damping, springs and contacts.
+
+    Args:
+        system: The system.
+        q: (nq,) coordinates [m or rad].
+        v: (nv,) velocities [m/s or rad/s].
+
+    Returns:
+        (nv,) generalized force [N or N m] that keeps dv/dt zero.
+
+    Raises:
+        ValueError: ``q`` or ``v`` has another shape.
+    """
+    q = _checked(system, "q", q, system.nq)
+    v = _checked(system, "v", v, system.nv)
+    return bridge.dynamics(system, q, v)[1]
+
+
+def lowest_contact(system: System, q: jax.Array) -> jax.Array:
+    """Height of the lowest point of all contact spheres [m].
+
+    Args:
+        system: The system.
+        q: (nq,) coordinates [m or rad].
+
+    Returns:
+        () height above z = 0 [m].
+    """
+    still = jnp.zeros((system.nv,), q.dtype)
+    kinematics = forward_kinematics(system, q, still)
+    bodies = system.contact_body
+    local = jnp.asarray(system.contact_position, q.dtype)
+    centre = kinematics.position[bodies] + _rotate(kinematics.rotation[bodies], local)
+    return jnp.min(centre[:, 2] - jnp.asarray(system.contact_radius, q.dtype))

@@ -1,0 +1,38 @@
+"""Kernel of one control step's adjoint: recompute the step, then walk back."""
+
+import warp as wp
+
+from .simulate import simulate
+from .structs import Model, Scratch
+from .world import Values, detect_fault, load_world, seed_world
+
+
+@wp.kernel
+def step_backward(
+    # system
+    m: Model,
+    first: int,
+    slot_first: int,
+    slot_stride: int,
+    lanes: int,
+    sc: Scratch,
+    g: Scratch,
+    # in
+    x: Values,
+    # in and out
+    x_bar: Values,
+):
+    """Launched with ``adjoint=True``: its forward part fills the scratch again.
+
+    ``g`` is the adjoint of ``sc``, all zero before and after; ``x_bar`` holds the
+    adjoints of the outputs and receives those of the inputs.
+    """
+    tid = wp.tid()
+    n = tid // lanes
+    lane = tid - n * lanes
+    slot = slot_first + n * slot_stride
+    w = first + n
+    load_world(m, sc, g, slot, x, x_bar, w, lane, lanes)
+    simulate(m, sc, g, slot, lane, lanes)
+    detect_fault(m, sc, slot, lane)
+    seed_world(m, sc, g, slot, x_bar, w, lane, lanes)

@@ -1,0 +1,33 @@
+"""Kernel of one control step, without adjoint."""
+
+import warp as wp
+
+from .simulate import simulate
+from .structs import Model, Scratch
+from .world import Values, detect_fault, load_world, store_world
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def step_forward(
+    # system
+    m: Model,
+    first: int,
+    slot_first: int,
+    slot_stride: int,
+    lanes: int,
+    sc: Scratch,
+    # in and out
+    x: Values,
+):
+    """One control step of the worlds from ``first`` on; thread = world * lanes + lane."""
+    tid = wp.tid()
+    n = tid // lanes
+    lane = tid - n * lanes
+    slot = slot_first + n * slot_stride
+    w = first + n
+    load_world(m, sc, sc, slot, x, x, w, lane, lanes)
+    simulate(m, sc, sc, slot, lane, lanes)
+    detect_fault(m, sc, slot, lane)
+    store_world(m, sc, slot, x, w, lane, lanes)

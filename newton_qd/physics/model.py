@@ -1,0 +1,347 @@
+"""Builds a System: the URDF file through Newton's model, and the robot's row.
+
+Newton decides the order of bodies and coordinates. It stores single precision, so
+once :mod:`newton_qd.physics.verify` has shown that its numbers are the file's, the
+System takes them in the file's double precision.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import TYPE_CHECKING
+
+import jax
+import numpy as np
+
+from newton_qd.assets import find_urdf
+from newton_qd.physics import reference
+from newton_qd.physics.description import (
+    UNLIMITED,
+    Body,
+    Description,
+    Shape,
+    read_description,
+)
+from newton_qd.physics.rest import rest_coordinates
+from newton_qd.physics.row import check_row, index_of
+from newton_qd.physics.system import JointKind, ObstacleKind, System
+from newton_qd.physics.verify import BuiltModel, ModelMismatchError, verify
+from newton_qd.physics.xml_reader import IDENTITY, RobotDescriptionError
+from newton_qd.robots import Robot
+
+if TYPE_CHECKING:
+    import newton
+
+__all__ = [
+    "ModelMismatchError",
+    "RobotDescriptionError",
+    "build_system",
+    "load_system",
+    "newton_builder",
+]
+
+_DTYPES = ("float32", "float64")
+_EARTH_GRAVITY = 9.81  # [m/s^2]
+_DEFAULT_GEAR = 100.0  # [N m]
+
+
+def newton_builder(path: str, floating: bool, gravity: float) -> newton.ModelBuilder:
+    """Imports a URDF file into a Newton builder, as the suite needs it.
+
+    Args:
+        path: The file.
+        floating: Whether the root link floats; else it is fixed to the world.
+        gravity: Downward acceleration [m/s^2].
+    """
+    import newton
+
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, -gravity))
+    # Links without <inertial> are massless, not as heavy as their colliders.
+    builder.default_shape_cfg.density = 0.0
+    builder.add_urdf(path, floating=floating, collapse_fixed_joints=True)
+    return builder
+
+
+def _read_shapes(model: newton.Model) -> tuple[tuple[Shape, ...], ...]:
+    """Returns the colliders of each body (nb,)."""
+    from newton import GeoType, ShapeFlags
+
+    kinds = {
+        GeoType.SPHERE: "sphere",
+        GeoType.CAPSULE: "capsule",
+        GeoType.CYLINDER: "cylinder",
+        GeoType.BOX: "box",
+        GeoType.MESH: "mesh",
+    }
+    shapes: list[list[Shape]] = [[] for _ in range(model.body_count)]
+    rows = zip(
+        _numpy(model.shape_body),
+        _numpy(model.shape_type),
+        _numpy(model.shape_flags),
+        _numpy(model.shape_transform).astype(np.float64),
+        _numpy(model.shape_scale).astype(np.float64),
+        strict=True,
+    )
+    for body, kind, flags, frame, size in rows:
+        if body >= 0 and flags & ShapeFlags.COLLIDE_SHAPES:
+            tag = kinds.get(GeoType(kind), GeoType(kind).name)
+            shapes[body].append(Shape("", tag, frame, size))
+    return tuple(tuple(found) for found in shapes)
+
+
+def _numpy(array: object) -> np.ndarray:
+    return array.numpy()  # type: ignore[attr-defined]
+
+
+def _joint_kinds(model: newton.Model, description: Description) -> np.ndarray:
+    """Returns the kind of every Newton joint (number of joints,)."""
+    from newton import JointType
+
+    kinds = {
+        JointType.FREE: JointKind.FREE,
+        JointType.REVOLUTE: JointKind.REVOLUTE,
+        JointType.PRISMATIC: JointKind.PRISMATIC,
+    }
+    found = []
+    for label, number in zip(model.joint_label, _numpy(model.joint_type), strict=True):
+        kind = JointType(number)
+        if kind not in kinds:
+            raise RobotDescriptionError(
+                f"{description.path}: joint {label!r} is of Newton's type "
+                f"{kind.name}; allowed: {', '.join(known.name for known in kinds)}"
+            )
+        found.append(kinds[kind])
+    return np.array(found, dtype=np.int32)
+
+
+def _read_newton(model: newton.Model, description: Description) -> BuiltModel:
+    """Copies the model into NumPy arrays ordered by body."""
+    prefix = f"{description.name}/" if description.name else ""
+    kinds = _joint_kinds(model, description)
+    child = _numpy(model.joint_child)
+    order = np.argsort(child, kind="stable")
+    if not np.array_equal(child[order], np.arange(model.body_count)):
+        raise ModelMismatchError(
+            f"{description.path}: Newton's joints move the bodies {child.tolist()}; "
+            f"allowed: each of the {model.body_count} bodies once"
+        )
+    v_start = _numpy(model.joint_qd_start)[:-1][order]
+    single = kinds[order] != JointKind.FREE
+
+    def per_joint(array: object, empty: float) -> np.ndarray:
+        rows = _numpy(array).astype(np.float64)[v_start]
+        rows[~single] = empty
+        return rows
+
+    def limits(array: object, empty: float) -> np.ndarray:
+        rows = per_joint(array, empty)
+        return np.where(np.abs(rows) >= UNLIMITED, np.sign(rows) * np.inf, rows)
+
+    joint_names = [model.joint_label[joint].removeprefix(prefix) for joint in order]
+    return BuiltModel(
+        body_names=tuple(label.removeprefix(prefix) for label in model.body_label),
+        joint_names=tuple(
+            name if one else "" for name, one in zip(joint_names, single, strict=True)
+        ),
+        parent=_numpy(model.joint_parent)[order].astype(np.int32),
+        joint_kind=kinds[order],
+        q_start=_numpy(model.joint_q_start)[:-1][order].astype(np.int32),
+        v_start=v_start.astype(np.int32),
+        parent_frame=_numpy(model.joint_X_p)[order].astype(np.float64),
+        child_frame=_numpy(model.joint_X_c)[order].astype(np.float64),
+        axis=per_joint(model.joint_axis, 0.0),
+        lower=limits(model.joint_limit_lower, -np.inf),
+        upper=limits(model.joint_limit_upper, np.inf),
+        damping=per_joint(model.joint_damping, 0.0),
+        mass=_numpy(model.body_mass).astype(np.float64),
+        com=_numpy(model.body_com).astype(np.float64),
+        inertia=_numpy(model.body_inertia).astype(np.float64),
+        shapes=_read_shapes(model),
+    )
+
+
+def _control(robot: Robot, built: BuiltModel) -> dict[str, np.ndarray]:
+    joints = [
+        index_of(robot, "actuators", joint, built.joint_names)
+        for joint, _ in robot.actuators
+    ]
+    return {
+        "control_dof": built.v_start[np.array(joints, dtype=np.int32)],
+        "gear": np.array([gear for _, gear in robot.actuators], dtype=np.float64),
+    }
+
+
+def _body_of(robot: Robot, field: str, link: str, bodies: list[Body]) -> int:
+    """Returns the body that holds a link which the row's field names."""
+    links = {name: i for i, body in enumerate(bodies) for name in body.links}
+    index_of(robot, field, link, tuple(links))
+    return links[link]
+
+
+def _body_arrays(bodies: list[Body]) -> dict[str, np.ndarray]:
+    """Returns the joint frames and the inertias, each (nb, ...)."""
+    joints = [body.joint for body in bodies]
+    return {
+        "joint_axis": np.array([j.axis if j else np.zeros(3) for j in joints]),
+        "parent_frame": np.array([j.frame if j else IDENTITY for j in joints]),
+        "child_frame": np.tile(IDENTITY, (len(bodies), 1)),
+        "mass": np.array([body.link.mass for body in bodies]),
+        "com": np.array([body.link.com for body in bodies]),
+        "inertia": np.array([body.link.inertia for body in bodies]),
+    }
+
+
+def _dof_arrays(
+    robot: Robot, built: BuiltModel, bodies: list[Body], control: dict
+) -> dict[str, np.ndarray]:
+    """Returns the joint springs, dampers and limits, each (nv,)."""
+    nv = int(sum(6 if kind == JointKind.FREE else 1 for kind in built.joint_kind))
+    lower, upper = np.full(nv, -np.inf), np.full(nv, np.inf)
+    damping = np.zeros(nv)
+    for start, body in zip(built.v_start, bodies, strict=True):
+        if body.joint is not None:
+            lower[start], upper[start] = body.joint.lower, body.joint.upper
+            damping[start] = body.joint.damping
+    gear = np.full(nv, control["gear"].max(initial=0.0) or _DEFAULT_GEAR)
+    gear[control["control_dof"]] = control["gear"]
+    limited = np.isfinite(lower) | np.isfinite(upper)
+    return {
+        "armature": np.zeros(nv),
+        "damping": damping,
+        "stiffness": np.zeros(nv),
+        "spring_rest": np.zeros(nv),
+        "limit_lower": lower,
+        "limit_upper": upper,
+        "limit_stiffness": np.where(
+            limited, gear / robot.material.limit_overshoot, 0.0
+        ),
+    }
+
+
+def _contact_sphere(shape: Shape, end: int) -> tuple[np.ndarray, float]:
+    """Returns centre (3,) in the body and radius of one end of a collider [m]."""
+    axis = reference.rotation_matrix(shape.frame[3:])[:, 2]
+    half_length = shape.size[1] if end else 0.0
+    return shape.frame[:3] + end * half_length * axis, float(shape.size[0])
+
+
+def _contacts(
+    robot: Robot, bodies: list[Body], obstacles: int
+) -> dict[str, np.ndarray]:
+    """Pairs every contact sphere with every obstacle, sorted by body."""
+    rows = []
+    for contact in robot.contacts:
+        name, kind = contact.link, "capsule" if contact.end else "sphere"
+        body = _body_of(robot, "contacts", name, bodies)
+        found = [s for s in bodies[body].shapes if s.link == name and s.kind == kind]
+        if len(found) != 1:
+            raise RobotDescriptionError(
+                f"robot {robot.name!r}, contacts: end={contact.end} of link {name!r} "
+                f"needs a {kind} collider and the link has {len(found)}; allowed: "
+                "exactly one, with end 0 for a sphere, 1 or -1 for a capsule"
+            )
+        centre, radius = _contact_sphere(found[0], contact.end)
+        rows += [(body, row, centre, radius) for row in range(obstacles)]
+    rows.sort(key=lambda row: row[0])
+    return {
+        "contact_body": np.array([row[0] for row in rows], dtype=np.int32),
+        "contact_obstacle": np.array([row[1] for row in rows], dtype=np.int32),
+        "contact_position": np.array([row[2] for row in rows]).reshape(-1, 3),
+        "contact_radius": np.array([row[3] for row in rows], dtype=np.float64),
+    }
+
+
+def _obstacles() -> dict[str, np.ndarray]:
+    """Returns the tables of what the robot may touch: the ground.
+
+    The walls of a scene become further rows here: capsules and boxes, with the
+    frames and sizes that :class:`System` documents.
+    """
+    return {
+        "obstacle_kind": np.array([ObstacleKind.PLANE], dtype=np.int32),
+        "obstacle_frame": IDENTITY[None].copy(),
+        "obstacle_size": np.zeros((1, 3)),
+    }
+
+
+def build_system(robot: Robot, dtype: str) -> System:
+    """Builds the immutable description of a robot on flat ground.
+
+    Args:
+        robot: The robot's row.
+        dtype: ``"float32"`` or ``"float64"``: precision of the kernels.
+
+    Raises:
+        AssetNotFoundError: The row's URDF file does not exist.
+        RobotDescriptionError: The file or the row is not one that physics can run.
+        ModelMismatchError: Newton's model differs from the file.
+        ValueError: ``dtype`` is not allowed, or needs JAX's 64-bit mode.
+    """
+    _check_dtype(dtype)
+    check_row(robot)
+    description = read_description(find_urdf(robot.urdf))
+    builder = newton_builder(str(description.path), description.floating, robot.gravity)
+    # The file's inertias are checked already; Newton would correct some silently.
+    model = builder.finalize(device="cpu", skip_validation_inertia=True)
+    built = _read_newton(model, description)
+    verify(built, description)
+    bodies = [description.bodies[name] for name in built.body_names]
+    control, obstacles = _control(robot, built), _obstacles()
+    total_mass = sum(body.link.mass for body in bodies)
+    weight = total_mass * (robot.gravity or _EARTH_GRAVITY)
+    material = robot.material
+    system = System(
+        robot=robot,
+        dtype=dtype,
+        body_names=built.body_names,
+        joint_names=built.joint_names,
+        parent=built.parent,
+        joint_kind=built.joint_kind,
+        q_start=built.q_start,
+        v_start=built.v_start,
+        contact_stiffness=weight / (material.support * material.static_penetration),
+        feet=np.array(
+            [_body_of(robot, "feet", foot, bodies) for foot in robot.feet],
+            dtype=np.int32,
+        ),
+        torso=_body_of(robot, "torso", robot.torso, bodies),
+        rest_q=np.zeros(int(model.joint_coord_count)),
+        **_body_arrays(bodies),
+        **_dof_arrays(robot, built, bodies, control),
+        **control,
+        **_contacts(robot, bodies, len(obstacles["obstacle_kind"])),
+        **obstacles,
+    )
+    return dataclasses.replace(system, rest_q=rest_coordinates(system))
+
+
+def _check_dtype(dtype: str) -> None:
+    if dtype not in _DTYPES:
+        raise ValueError(f"dtype={dtype!r}; allowed: {', '.join(_DTYPES)}")
+    if dtype == "float64" and not jax.config.read("jax_enable_x64"):
+        raise ValueError(
+            "dtype='float64' needs JAX's 64-bit mode; call "
+            "jax.config.update('jax_enable_x64', True) at the start, or use 'float32'"
+        )
+
+
+@functools.cache
+def _cached_system(robot: Robot, dtype: str) -> System:
+    return build_system(robot, dtype)
+
+
+def load_system(robot: Robot, dtype: str = "float32") -> System:
+    """Returns the system of a robot, built once per process and precision.
+
+    Args:
+        robot: The robot's row.
+        dtype: ``"float32"`` or ``"float64"``, which needs JAX's 64-bit mode.
+
+    Raises:
+        AssetNotFoundError: The row's URDF file does not exist.
+        RobotDescriptionError: The file or the row is not one that physics can run.
+        ValueError: ``dtype`` is not allowed, or needs JAX's 64-bit mode.
+    """
+    _check_dtype(dtype)
+    return _cached_system(robot, dtype)

@@ -1,0 +1,150 @@
+"""Plain NumPy kinematics in float64: slow, obvious, and independent of Warp.
+
+The default pose of a robot is found with it, and tests compare the kernels to it.
+Quaternions are (x, y, z, w).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from newton_qd.physics.system import JointKind, System
+
+
+def quaternion_product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Returns the rotation ``b`` followed by ``a``, both (4,)."""
+    vector = a[3] * b[:3] + b[3] * a[:3] + np.cross(a[:3], b[:3])
+    return np.append(vector, a[3] * b[3] - a[:3] @ b[:3])
+
+
+def rotation_matrix(quaternion: np.ndarray) -> np.ndarray:
+    """Returns the (3, 3) matrix of a unit quaternion (4,)."""
+    x, y, z, w = quaternion
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def axis_quaternion(axis: np.ndarray, angle: float) -> np.ndarray:
+    """Returns the rotation (4,) by ``angle`` [rad] about a unit axis (3,)."""
+    return np.append(np.sin(angle / 2) * axis, np.cos(angle / 2))
+
+
+def rpy_quaternion(roll: float, pitch: float, yaw: float) -> np.ndarray:
+    """Returns URDF's rotation (4,): about the fixed x, then y, then z axis [rad]."""
+    x, y, z = np.eye(3)
+    about_zy = quaternion_product(axis_quaternion(z, yaw), axis_quaternion(y, pitch))
+    return quaternion_product(about_zy, axis_quaternion(x, roll))
+
+
+def compose(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Returns frame ``b``, given in frame ``a``, in the frame that holds ``a``.
+
+    Args:
+        a: (7,) position [m] and quaternion.
+        b: (7,) position [m] and quaternion.
+    """
+    position = a[:3] + rotation_matrix(a[3:]) @ b[:3]
+    return np.concatenate([position, quaternion_product(a[3:], b[3:])])
+
+
+def inverse(a: np.ndarray) -> np.ndarray:
+    """Returns the inverse of a frame (7,)."""
+    conjugate = a[3:] * np.array([-1.0, -1.0, -1.0, 1.0])
+    return np.concatenate([-(rotation_matrix(conjugate) @ a[:3]), conjugate])
+
+
+def _joint_motion(system: System, joint: int, q: np.ndarray) -> np.ndarray:
+    """Returns the frame (7,) of a joint's child side in its parent side."""
+    kind = JointKind(system.joint_kind[joint])
+    start = system.q_start[joint]
+    axis = system.joint_axis[joint]
+    if kind == JointKind.FREE:
+        quaternion = q[start + 3 : start + 7]
+        return np.concatenate(
+            [q[start : start + 3], quaternion / np.linalg.norm(quaternion)]
+        )
+    if kind == JointKind.REVOLUTE:
+        return np.concatenate([np.zeros(3), axis_quaternion(axis, float(q[start]))])
+    return np.concatenate([axis * q[start], [0.0, 0.0, 0.0, 1.0]])
+
+
+def body_frames(system: System, q: np.ndarray) -> np.ndarray:
+    """Returns the world frames (nb, 7) of the bodies at coordinates ``q`` (nq,)."""
+    q = np.asarray(q, dtype=np.float64)
+    frames = np.empty((system.nb, 7))
+    for body, parent in enumerate(system.parent):
+        joint = compose(system.parent_frame[body], _joint_motion(system, body, q))
+        if parent >= 0:
+            joint = compose(frames[parent], joint)
+        frames[body] = compose(joint, inverse(system.child_frame[body]))
+    return frames
+
+
+def jacobians(system: System, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns how the bodies move with the degrees of freedom, in world axes.
+
+    Args:
+        system: The robot.
+        q: (nq,) coordinates.
+
+    Returns:
+        Velocity of the centre of mass (nb, 3, nv) and angular velocity
+        (nb, 3, nv) of every body for each unit velocity.
+    """
+    q = np.asarray(q, dtype=np.float64)
+    frames = body_frames(system, q)
+    linear = np.zeros((system.nb, 3, system.nv))
+    angular = np.zeros((system.nb, 3, system.nv))
+    for body in range(system.nb):
+        com = compose(frames[body], np.append(system.com[body], [0, 0, 0, 1.0]))[:3]
+        joint = body
+        while joint >= 0:
+            dof = system.v_start[joint]
+            side = compose(frames[joint], system.child_frame[joint])
+            arm = com - side[:3]
+            axis = rotation_matrix(side[3:]) @ system.joint_axis[joint]
+            if system.joint_kind[joint] == JointKind.FREE:
+                linear[body, :, dof : dof + 3] = np.eye(3)
+                # Column i of -[arm]x is e_i x arm.
+                linear[body, :, dof + 3 : dof + 6] = np.cross(np.eye(3), arm).T
+                angular[body, :, dof + 3 : dof + 6] = np.eye(3)
+            elif system.joint_kind[joint] == JointKind.REVOLUTE:
+                linear[body, :, dof] = np.cross(axis, arm)
+                angular[body, :, dof] = axis
+            else:
+                linear[body, :, dof] = axis
+            joint = system.parent[joint]
+    return linear, angular
+
+
+def mass_matrix(system: System, q: np.ndarray) -> np.ndarray:
+    """Returns the mass matrix (nv, nv) as the sum of every body's kinetic energy."""
+    linear, angular = jacobians(system, q)
+    frames = body_frames(system, q)
+    total = np.diag(system.armature).astype(np.float64)
+    for body in range(system.nb):
+        rotation = rotation_matrix(frames[body, 3:])
+        inertia = rotation @ system.inertia[body] @ rotation.T
+        total += system.mass[body] * linear[body].T @ linear[body]
+        total += angular[body].T @ inertia @ angular[body]
+    return total
+
+
+def lowest_contact(system: System, q: np.ndarray) -> float:
+    """Returns the height of the lowest contact sphere's bottom over z = 0 [m]."""
+    frames = body_frames(system, q)
+    heights = [
+        compose(frames[body], np.append(position, [0, 0, 0, 1.0]))[2] - radius
+        for body, position, radius in zip(
+            system.contact_body,
+            system.contact_position,
+            system.contact_radius,
+            strict=True,
+        )
+    ]
+    return float(min(heights))

@@ -1,0 +1,64 @@
+"""The default pose of a robot: its row's joint angles, standing on the ground."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from newton_qd.physics import reference
+from newton_qd.physics.row import index_of
+from newton_qd.physics.system import JointKind, System
+from newton_qd.physics.xml_reader import RobotDescriptionError
+
+
+def _height_coordinate(system: System) -> tuple[int, float] | None:
+    """Returns the coordinate that raises the torso, and its sign; None if none."""
+    frames = reference.body_frames(system, system.rest_q)
+    body = system.torso
+    while body >= 0:
+        start = int(system.q_start[body])
+        if system.joint_kind[body] == JointKind.FREE:
+            return start + 2, 1.0
+        side = reference.compose(frames[body], system.child_frame[body])
+        axis = reference.rotation_matrix(side[3:]) @ system.joint_axis[body]
+        vertical = system.joint_kind[body] == JointKind.PRISMATIC
+        if vertical and abs(axis[2]) > 1 - 1e-9:
+            return start, float(np.sign(axis[2]))
+        body = int(system.parent[body])
+    return None
+
+
+def rest_coordinates(system: System) -> np.ndarray:
+    """Returns the coordinates (nq,) of the row's default pose."""
+    robot = system.robot
+    q = np.array(system.rest_q)
+    q[[start + 6 for start in system.q_start[system.joint_kind == JointKind.FREE]]] = 1
+    for joint, angle in robot.rest_pose:
+        q[system.q_start[index_of(robot, "rest_pose", joint, system.joint_names)]] = (
+            angle
+        )
+    for body in np.flatnonzero(system.joint_kind != JointKind.FREE):
+        dof, angle = system.v_start[body], q[system.q_start[body]]
+        lower, upper = system.limit_lower[dof], system.limit_upper[dof]
+        if not lower - 1e-9 <= angle <= upper + 1e-9:
+            raise RobotDescriptionError(
+                f"robot {robot.name!r}, rest_pose: joint {system.joint_names[body]!r} "
+                f"rests at {angle:g}; allowed: {lower:g} to {upper:g}"
+            )
+    posed = dataclasses.replace(system, rest_q=q.copy())
+    height = _height_coordinate(posed)
+    if height is None:
+        if robot.rest_height is not None:
+            raise RobotDescriptionError(
+                f"robot {robot.name!r}, rest_height={robot.rest_height:g}: no "
+                "coordinate raises the torso; allowed: None"
+            )
+        return q
+    coordinate, sign = height
+    if robot.rest_height is not None:
+        torso = reference.body_frames(posed, q)[system.torso, 2]
+        q[coordinate] += sign * (robot.rest_height - torso)
+    elif robot.contacts:
+        q[coordinate] -= sign * reference.lowest_contact(posed, q)
+    return q

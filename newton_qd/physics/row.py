@@ -1,0 +1,85 @@
+"""Checks of a robot's row; every error names the field, its value, what is allowed."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+from newton_qd.physics.xml_reader import RobotDescriptionError
+from newton_qd.robots import Robot
+
+_MAY_BE_ZERO = ("gravity", "friction", "dissipation")
+
+
+def index_of(robot: Robot, field: str, name: str, allowed: tuple[str, ...]) -> int:
+    """Returns the position of a link's or joint's name in ``allowed``.
+
+    Raises:
+        RobotDescriptionError: The row's field names something that is not there.
+    """
+    if not name or name not in allowed:
+        known = ", ".join(known for known in allowed if known)
+        raise RobotDescriptionError(
+            f"robot {robot.name!r}, {field}: {name!r} is not in {robot.urdf}; "
+            f"allowed: {known}"
+        )
+    return allowed.index(name)
+
+
+def _check_number(robot: Robot, field: str, value: float, *, signed: bool) -> None:
+    zero = field.split(".")[-1] in _MAY_BE_ZERO
+    valid = math.isfinite(value) and (signed or value > 0 or (zero and value == 0))
+    if not valid:
+        allowed = "finite" if signed else "finite, " + ("0 or more" if zero else "> 0")
+        raise RobotDescriptionError(
+            f"robot {robot.name!r}, {field}={value!r}; allowed: {allowed}"
+        )
+
+
+def _check_unique(robot: Robot, field: str, names: list[str]) -> None:
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise RobotDescriptionError(
+            f"robot {robot.name!r}, {field}: {', '.join(twice)} named twice; "
+            "allowed: once"
+        )
+
+
+def check_row(robot: Robot) -> None:
+    """Checks the numbers of a row, and what can be checked without its file.
+
+    Raises:
+        RobotDescriptionError: A number is not finite or has the wrong sign, or a
+            name is given twice.
+    """
+    for field in ("dt", "gravity"):
+        _check_number(robot, field, getattr(robot, field), signed=False)
+    for field in dataclasses.fields(robot.material):
+        value = getattr(robot.material, field.name)
+        _check_number(robot, f"material.{field.name}", value, signed=False)
+    if robot.rest_height is not None:
+        _check_number(robot, "rest_height", robot.rest_height, signed=True)
+    for joint, gear in robot.actuators:
+        _check_number(robot, f"actuators: gear of {joint!r}", gear, signed=False)
+    for joint, angle in robot.rest_pose:
+        _check_number(robot, f"rest_pose: angle of {joint!r}", angle, signed=True)
+    if not isinstance(robot.substeps, int) or robot.substeps < 1:
+        raise RobotDescriptionError(
+            f"robot {robot.name!r}, substeps={robot.substeps!r}; allowed: 1, 2, ..."
+        )
+    for contact in robot.contacts:
+        if contact.end not in (-1, 0, 1):
+            raise RobotDescriptionError(
+                f"robot {robot.name!r}, contacts: end={contact.end!r} of link "
+                f"{contact.link!r}; allowed: -1, 0, 1"
+            )
+    _check_unique(robot, "actuators", [joint for joint, _ in robot.actuators])
+    _check_unique(robot, "rest_pose", [joint for joint, _ in robot.rest_pose])
+    _check_unique(robot, "feet", list(robot.feet))
+    touching = {contact.link for contact in robot.contacts}
+    for foot in robot.feet:
+        if foot not in touching:
+            raise RobotDescriptionError(
+                f"robot {robot.name!r}, feet: {foot!r} has no contact; allowed: "
+                f"{', '.join(sorted(touching)) or 'none, as contacts is empty'}"
+            )

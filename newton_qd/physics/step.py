@@ -1,0 +1,50 @@
+"""One control step as a pure JAX function."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from newton_qd.physics import bridge
+from newton_qd.physics.system import PhysicsState, System
+
+
+def initial_state(system: System, q: jax.Array, v: jax.Array) -> PhysicsState:
+    """A state at rest with its contacts: impulses are zero before the first step.
+
+    Args:
+        system: The system.
+        q: (nq,) coordinates [m or rad].
+        v: (nv,) velocities [m/s or rad/s].
+
+    Returns:
+        The state.
+    """
+    dtype = jnp.dtype(system.dtype)
+    return PhysicsState(
+        q=jnp.asarray(q, dtype),
+        v=jnp.asarray(v, dtype),
+        impulse=jnp.zeros((system.nb, 6), dtype),
+        normal_impulse=jnp.zeros((system.nb,), dtype),
+    )
+
+
+def step(
+    system: System, state: PhysicsState, control: jax.Array
+) -> tuple[PhysicsState, jax.Array]:
+    """Advance one world by one control step.
+
+    Args:
+        system: The system.
+        state: State of the world.
+        control: (nu,) actions [-]; scaled by the gear, never clipped.
+
+    Returns:
+        The next state, and the fault () int32: 0, or 1 where anything was not
+        finite; then ``q`` and ``v`` are the given ones, the impulses are zero and
+        every gradient through the step is exactly zero.
+    """
+    q, v, impulse, normal_impulse, fault = bridge.control_step(system)(
+        state.q, state.v, control
+    )
+    return PhysicsState(q, v, impulse, normal_impulse), fault.astype(jnp.int32)

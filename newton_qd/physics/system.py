@@ -1,0 +1,170 @@
+"""The immutable description of one robot in one scene, and the physics state."""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+
+import jax
+import numpy as np
+
+from newton_qd.robots import Robot
+
+
+class JointKind(enum.IntEnum):
+    """Joint types that the kernels know; the values are read by the kernels."""
+
+    FREE = 0
+    REVOLUTE = 1
+    PRISMATIC = 2
+
+
+class ObstacleKind(enum.IntEnum):
+    """Shapes that a robot's spheres may touch; the values are read by the kernels."""
+
+    PLANE = 0
+    CAPSULE = 1
+    BOX = 2
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class System:
+    """One world: the kinematic tree, its material and its scene.
+
+    All arrays are float64 or int32 NumPy arrays, read-only; the kernels read a
+    copy in the precision ``dtype``. Systems compare and hash by identity.
+    Bodies are ordered parents first; joint ``i`` connects body ``i`` to its
+    parent. Quaternions are (x, y, z, w) here and in the kernels, and in ``q``.
+
+    Attributes:
+        robot: The row that the system was built from.
+        dtype: ``"float32"`` or ``"float64"``: precision of the kernels.
+        body_names: (nb,) URDF link names.
+        joint_names: (nb,) URDF joint names; the root's is the empty string when
+            Newton made the joint.
+        parent: (nb,) parent body, -1 for the world.
+        joint_kind: (nb,) see :class:`JointKind`.
+        q_start: (nb,) first coordinate of a joint in ``q``.
+        v_start: (nb,) first degree of freedom of a joint in ``v``.
+        joint_axis: (nb, 3) axis in the joint frame [-].
+        parent_frame: (nb, 7) joint frame in the parent body, position [m] and
+            quaternion.
+        child_frame: (nb, 7) joint frame in the child body, position [m] and
+            quaternion.
+        mass: (nb,) [kg].
+        com: (nb, 3) centre of mass in the body frame [m].
+        inertia: (nb, 3, 3) about the centre of mass, body axes [kg m^2].
+        armature: (nv,) rotor inertia [kg m^2 or kg].
+        damping: (nv,) viscous joint damping [N m s/rad or N s/m].
+        stiffness: (nv,) joint spring [N m/rad or N/m].
+        spring_rest: (nv,) rest angle of the joint spring [rad or m].
+        limit_lower: (nv,) [rad or m]; -inf where there is none.
+        limit_upper: (nv,) [rad or m]; +inf where there is none.
+        limit_stiffness: (nv,) [N m/rad or N/m]; 0 where there is no limit.
+        control_dof: (nu,) degree of freedom that each action drives.
+        gear: (nu,) generalized force of a unit action [N m or N].
+        contact_body: (nc,) body of each contact sphere, ascending.
+        contact_position: (nc, 3) centre in the body frame [m].
+        contact_radius: (nc,) [m].
+        contact_obstacle: (nc,) row of the obstacle tables.
+        obstacle_kind: (no,) see :class:`ObstacleKind`.
+        obstacle_frame: (no, 7) world pose; a plane's normal and a capsule's
+            axis are the local z axis.
+        obstacle_size: (no, 3) capsule: radius, half length, 0; box: half
+            extents [m]; plane: zeros.
+        contact_stiffness: [N/m].
+        feet: (nf,) body index of each foot.
+        torso: Body index of the torso.
+        rest_q: (nq,) coordinates of the default pose, ``v`` being 0.
+    """
+
+    robot: Robot
+    dtype: str
+    body_names: tuple[str, ...]
+    joint_names: tuple[str, ...]
+    parent: np.ndarray
+    joint_kind: np.ndarray
+    q_start: np.ndarray
+    v_start: np.ndarray
+    joint_axis: np.ndarray
+    parent_frame: np.ndarray
+    child_frame: np.ndarray
+    mass: np.ndarray
+    com: np.ndarray
+    inertia: np.ndarray
+    armature: np.ndarray
+    damping: np.ndarray
+    stiffness: np.ndarray
+    spring_rest: np.ndarray
+    limit_lower: np.ndarray
+    limit_upper: np.ndarray
+    limit_stiffness: np.ndarray
+    control_dof: np.ndarray
+    gear: np.ndarray
+    contact_body: np.ndarray
+    contact_position: np.ndarray
+    contact_radius: np.ndarray
+    contact_obstacle: np.ndarray
+    obstacle_kind: np.ndarray
+    obstacle_frame: np.ndarray
+    obstacle_size: np.ndarray
+    contact_stiffness: float
+    feet: np.ndarray
+    torso: int
+    rest_q: np.ndarray
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, np.ndarray):
+                value.setflags(write=False)
+
+    @property
+    def nb(self) -> int:
+        """Number of bodies."""
+        return len(self.parent)
+
+    @property
+    def nq(self) -> int:
+        """Number of coordinates."""
+        return len(self.rest_q)
+
+    @property
+    def nv(self) -> int:
+        """Number of degrees of freedom."""
+        return len(self.damping)
+
+    @property
+    def nu(self) -> int:
+        """Number of actions."""
+        return len(self.gear)
+
+    @property
+    def total_mass(self) -> float:
+        """Mass of the robot [kg]."""
+        return float(self.mass.sum())
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class PhysicsState:
+    """State of a world, and what the last control step reported.
+
+    A free root has coordinates (position of the root origin, quaternion xyzw)
+    and velocities (linear velocity of the root origin, angular velocity), all
+    in world axes.
+
+    Attributes:
+        q: (nq,) coordinates [m or rad].
+        v: (nv,) velocities [m/s or rad/s].
+        impulse: (nb, 6) contact impulse on each body over the control step,
+            friction included: linear [N s], then angular about the body's
+            centre of mass [N m s], world axes.
+        normal_impulse: (nb,) sum of the normal contact impulses on each body
+            over the control step [N s]; never negative.
+    """
+
+    q: jax.Array
+    v: jax.Array
+    impulse: jax.Array
+    normal_impulse: jax.Array

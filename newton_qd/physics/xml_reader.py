@@ -1,0 +1,131 @@
+"""Reads attributes of an XML file; every error names file, line and element."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from xml.etree import ElementTree
+from xml.parsers import expat
+
+import numpy as np
+
+from newton_qd.physics.reference import rpy_quaternion
+
+IDENTITY = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+IDENTITY.setflags(write=False)
+
+
+class RobotDescriptionError(ValueError):
+    """A robot's URDF file or its row is not one that the physics can run."""
+
+
+class XmlReader:
+    """Reads attributes of one file; its errors name the file, line and element."""
+
+    def __init__(self, path: Path):
+        self.path = path
+        self.lines: dict[ElementTree.Element, int] = {}
+        self.root = self._parse()
+
+    def _parse(self) -> ElementTree.Element:
+        # ElementTree's own parser does not say on which line an element starts.
+        tree = ElementTree.TreeBuilder()
+        parser = expat.ParserCreate()
+        parser.buffer_text = True
+        opened: list[str] = []
+
+        def start(tag: str, attributes: dict[str, str]) -> None:
+            self.lines[tree.start(tag, attributes)] = parser.CurrentLineNumber
+            opened.append(tag)
+
+        def end(tag: str) -> None:
+            tree.end(tag)
+            opened.pop()
+
+        parser.StartElementHandler = start
+        parser.EndElementHandler = end
+        parser.CharacterDataHandler = tree.data
+        try:
+            parser.Parse(self.path.read_bytes(), True)
+        except expat.ExpatError as error:
+            where = f"in <{opened[-1]}>" if opened else "outside any element"
+            raise RobotDescriptionError(
+                f"{self.path}, line {error.lineno}, {where}: malformed XML: "
+                f"{expat.errors.messages[error.code]}"
+            ) from error
+        except LookupError as error:
+            raise RobotDescriptionError(
+                f"{self.path}, line 1, outside any element: malformed XML: {error}"
+            ) from error
+        return tree.close()
+
+    def error(self, element: ElementTree.Element, text: str) -> RobotDescriptionError:
+        """Returns an error that names the file, the line and the element."""
+        name = element.get("name")
+        label = f"<{element.tag} name={name!r}>" if name else f"<{element.tag}>"
+        return RobotDescriptionError(
+            f"{self.path}, line {self.lines[element]}, {label}: {text}"
+        )
+
+    def text(self, element: ElementTree.Element, key: str) -> str:
+        """Returns an attribute that must be there and not be empty."""
+        value = element.get(key)
+        if not value:
+            raise self.error(element, f"attribute {key!r} is missing")
+        return value
+
+    def child(self, element: ElementTree.Element, tag: str) -> ElementTree.Element:
+        """Returns the first child element of a tag; there must be one."""
+        found = element.find(tag)
+        if found is None:
+            raise self.error(element, f"element <{tag}> is missing")
+        return found
+
+    def numbers(
+        self,
+        element: ElementTree.Element,
+        key: str,
+        count: int,
+        default: str | None = None,
+        *,
+        finite: bool = True,
+    ) -> np.ndarray:
+        """Returns the ``count`` numbers of an attribute."""
+        text = element.get(key, default)
+        if text is None:
+            raise self.error(element, f"attribute {key!r} is missing")
+        try:
+            values = np.array([float(part) for part in text.split()])
+        except ValueError:
+            values = np.empty(0)
+        valid = np.isfinite(values) if finite else ~np.isnan(values)
+        if len(values) != count or not valid.all():
+            raise self.error(
+                element, f"{key}={text!r}; allowed: {count} finite number(s)"
+            )
+        return values
+
+    def number(
+        self, element: ElementTree.Element, key: str, default: str | None = None
+    ) -> float:
+        """Returns an attribute that is one finite number."""
+        return float(self.numbers(element, key, 1, default)[0])
+
+    def positive(
+        self, element: ElementTree.Element, key: str, count: int
+    ) -> np.ndarray:
+        """Returns the ``count`` numbers of an attribute, all above zero."""
+        values = self.numbers(element, key, count)
+        if not (values > 0).all():
+            raise self.error(
+                element, f"{key}={element.get(key)!r}; allowed: positive numbers"
+            )
+        return values
+
+    def frame(self, element: ElementTree.Element) -> np.ndarray:
+        """Returns the frame (7,) of the element's ``<origin>``."""
+        origin = element.find("origin")
+        if origin is None:
+            return IDENTITY
+        position = self.numbers(origin, "xyz", 3, "0 0 0")
+        roll, pitch, yaw = self.numbers(origin, "rpy", 3, "0 0 0")
+        return np.concatenate([position, rpy_quaternion(roll, pitch, yaw)])

@@ -1,0 +1,116 @@
+"""Robots as data: everything about a robot that its URDF file cannot hold.
+
+Masses, inertias, joint frames, limits, damping and colliders are in ``urdf/``;
+gears, the contact material and the time steps are in the rows below.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+
+@dataclasses.dataclass(frozen=True)
+class Contact:
+    """One sphere of a robot that may touch the scene.
+
+    Attributes:
+        link: URDF link whose collider carries the sphere.
+        end: Which end of a capsule's axis: ``+1`` or ``-1`` along the local z
+            axis of the collider; ``0`` for a sphere.
+    """
+
+    link: str
+    end: int = 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Material:
+    """Contact and joint-limit softness, scaled to the robot.
+
+    Attributes:
+        friction: Coulomb coefficient of a pair [-].
+        static_penetration: Penetration that the robot's weight causes when it
+            rests on ``support`` contacts [m]; sets the stiffness.
+        support: Number of contacts that carry the weight at rest [-].
+        smoothing: Half width of the zone in which a contact switches on [m].
+        slip_velocity: Velocity below which friction is viscous [m/s].
+        dissipation: Hunt-Crossley dissipation [s/m].
+        limit_overshoot: Angle by which a joint's full gear passes its limit
+            [rad]; sets the stiffness of the limits.
+        limit_smoothing: Half width of the zone in which a limit switches on
+            [rad].
+    """
+
+    friction: float = 1.0
+    static_penetration: float = 0.003
+    support: int = 4
+    smoothing: float = 0.02
+    slip_velocity: float = 0.1
+    dissipation: float = 0.5
+    limit_overshoot: float = 0.1
+    limit_smoothing: float = 0.05
+
+
+@dataclasses.dataclass(frozen=True)
+class Robot:
+    """One robot of the suite.
+
+    Attributes:
+        name: Name of the robot.
+        urdf: File name inside ``urdf/``, or a path.
+        torso: Link whose position is the robot's position.
+        feet: Links whose contacts make the feet-contact descriptor, in order.
+        actuators: ``(joint, gear)`` in the order of the action; gear is the
+            torque of a unit action [N m].
+        contacts: Spheres that may touch the ground.
+        rest_pose: ``(joint, angle)`` of the default pose [rad]; joints that
+            are not named rest at 0.
+        rest_height: Height of the root in the default pose [m]; ``None`` puts
+            the lowest contact on the ground.
+        dt: Duration of a control step [s].
+        substeps: Physics steps in a control step [-].
+        gravity: Downward acceleration [m/s^2].
+        material: Softness of contacts and limits.
+    """
+
+    name: str
+    urdf: str
+    torso: str
+    feet: tuple[str, ...]
+    actuators: tuple[tuple[str, float], ...]
+    contacts: tuple[Contact, ...]
+    rest_pose: tuple[tuple[str, float], ...]
+    dt: float
+    substeps: int
+    rest_height: float | None = None
+    gravity: float = 9.81
+    material: Material = Material()
+
+
+_DEGREE = 3.141592653589793 / 180.0
+_ANT_LEGS = ("1", "2", "3", "4")
+
+ANT = Robot(
+    name="ant",
+    urdf="ant.urdf",
+    torso="torso",
+    feet=tuple(f"foot_{leg}" for leg in _ANT_LEGS),
+    actuators=tuple(
+        (f"{joint}_{leg}", 350.0) for leg in _ANT_LEGS for joint in ("hip", "ankle")
+    ),
+    contacts=(
+        Contact("torso"),
+        *(Contact(f"foot_{leg}", end=-1) for leg in _ANT_LEGS),
+    ),
+    rest_pose=(
+        ("ankle_1", 50 * _DEGREE),
+        ("ankle_2", -50 * _DEGREE),
+        ("ankle_3", -50 * _DEGREE),
+        ("ankle_4", 50 * _DEGREE),
+    ),
+    dt=0.05,
+    substeps=5,
+    gravity=9.8,
+)
+
+ROBOTS = {robot.name: robot for robot in (ANT,)}
