@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,7 +12,7 @@ from newton_qd.physics.precision import SCALARS, kernels
 from newton_qd.physics.system import JointKind, System
 from newton_qd.physics.tree import Tree, build_tree
 
-# Scratch arrays by what they count: (slot, substep or solve, item).
+# Scratch arrays by what they hold an entry for.
 _PER_BODY = ("pose", "twist_w", "twist_v", "bias_w", "bias_v", "inertia", "moment")
 _PER_BODY += ("wrench_w", "wrench_v")
 _PER_CONTACT = ("point", "arm", "normal", "velocity", "load")
@@ -62,12 +61,13 @@ def build_model(system: System, device: Any) -> Any:
     model.nb, model.nq, model.nv = system.nb, system.nq, system.nv
     model.nu, model.nc = system.nu, len(system.contact_body)
     model.free_root = int(system.joint_kind[0] == JointKind.FREE)
-    model.substeps = robot.substeps
+    model.substeps, model.passes = robot.substeps, 2
     model.h = robot.dt / robot.substeps
     model.gravity = robot.gravity
     _put_bodies(put, system, tree, package)
     model.body_levels = len(tree.body_level[0]) - 1
     model.dof_levels = len(tree.dof_level[0]) - 1
+    model.width = tree.path.shape[1]
     _put_dofs(put, system, tree)
     model.limit_smoothing = material.limit_smoothing
     _put_contacts(put, system, tree, package)
@@ -121,7 +121,7 @@ def _put_dofs(put: Any, system: System, tree: Tree) -> None:
     }.items():
         put(name, values, real)
     put("depth", tree.depth, int)
-    put("path", tree.path, int)
+    put("path", tree.path.ravel(), int)
     put("descendant_start", tree.descendant[0], int)
     put("descendant", tree.descendant[1], int)
     put("dof_level_start", tree.dof_level[0], int)
@@ -157,54 +157,36 @@ def build_scratch(
     """
     space = kernels(system.dtype)
     values, adjoints = space.structs.Scratch(), space.structs.Scratch()
-    depth = int(build_tree(system).depth.max())
+    depth = build_tree(system).path.shape[1]
     n, nc = system.robot.substeps, max(len(system.contact_body), 1)
-    shapes: dict[str, tuple[int, ...]] = {
-        "q": (n + 1, system.nq),
-        "v": (n + 1, system.nv),
-        "ctrl": (max(system.nu, 1),),
-        **dict.fromkeys(_PER_BODY, (n, system.nb + 1)),
-        **dict.fromkeys(("axis_w", "axis_v"), (n, system.nv)),
-        **dict.fromkeys((*_PER_CONTACT, *_REPORTED), (n, nc)),
-        **dict.fromkeys(_PER_SOLVE_CONTACT, (2 * n, nc)),
-        **dict.fromkeys(_PER_SOLVE_BODY, (2 * n, system.nb + 1)),
-        **dict.fromkeys(("H", "L"), (2 * n, system.nv, depth)),
-        **dict.fromkeys(("b", "dv"), (2 * n, system.nv)),
+    steps, solves = (n, 2 * n) if adjoint else (1, 1)
+    counts = {
+        "q": (n + 1) * system.nq,
+        "v": (n + 1) * system.nv,
+        "ctrl": max(system.nu, 1),
+        **dict.fromkeys(_PER_BODY, steps * (system.nb + 1)),
+        **dict.fromkeys(("axis_w", "axis_v"), steps * system.nv),
+        **dict.fromkeys(_PER_CONTACT, steps * nc),
+        **dict.fromkeys(_REPORTED, n * nc),
+        **dict.fromkeys(_PER_SOLVE_CONTACT, solves * nc),
+        **dict.fromkeys(_PER_SOLVE_BODY, solves * (system.nb + 1)),
+        **dict.fromkeys(("H", "L"), solves * system.nv * depth),
+        **dict.fromkeys(("b", "dv"), solves * system.nv),
     }
-    kept = ("q", "v", "ctrl", *_REPORTED)
     size = 0
-    for name, shape in shapes.items():
-        dtype = getattr(space.structs.Scratch.vars[name].type, "dtype", None)
-        shared = not adjoint and name not in kept
-        stored = (1, *shape[1:]) if shared else shape
+    for name, count in counts.items():
+        dtype = space.structs.Scratch.vars[name].type.dtype
         array = wp.zeros(
-            (slots, *stored), dtype=dtype, device=device, requires_grad=adjoint
+            slots * count, dtype=dtype, device=device, requires_grad=adjoint
         )
-        size += array.capacity // slots * (2 if adjoint else 1)
-        setattr(values, name, _repeat(array, shape[0]) if shared else array)
+        setattr(values, name, array)
+        size += array.capacity // slots
         if adjoint:
             setattr(adjoints, name, array.grad)
+            size += array.capacity // slots
     values.fault = wp.zeros(slots, dtype=int, device=device)
     return SimpleNamespace(
         values=values,
         adjoints=adjoints if adjoint else values,
         bytes_per_slot=size,
     )
-
-
-def _repeat(array: Any, count: int) -> Any:
-    """View of ``array`` (slot, 1, ...) in which every substep is the one stored."""
-    view = wp.array(
-        ptr=array.ptr,
-        dtype=array.dtype,
-        shape=(array.shape[0], count, *array.shape[2:]),
-        strides=(array.strides[0], 0, *array.strides[2:]),
-        device=array.device,
-    )
-    view._owner = array  # keeps the memory alive
-    return view
-
-
-def slots_for(memory: int, bytes_per_slot: int) -> int:
-    """Number of slots that fit into ``memory`` bytes, a power of two, at least 32."""
-    return max(32, 2 ** int(math.log2(max(memory // bytes_per_slot, 1))))

@@ -3,7 +3,7 @@
 import warp as wp
 
 from .simulate import simulate
-from .structs import Model, Scratch
+from .structs import Model, Scratch, row_at
 from .world import Values, detect_fault, load_world, seed_world
 
 
@@ -32,7 +32,7 @@ def step_backward(
     lane = tid - n * lanes
     slot = slot_first + n * slot_stride
     w = first + n
-    load_world(m, sc, g, slot, x, x_bar, w, lane, lanes)
-    simulate(m, sc, g, slot, lane, lanes)
+    load_world(m, sc, g, row_at(m, slot, 1, 0, 0), slot, x, x_bar, w, lane, lanes)
+    simulate(m, sc, g, slot, 1, lane, lanes)
     detect_fault(m, sc, slot, lane)
     seed_world(m, sc, g, slot, x_bar, w, lane, lanes)

@@ -3,7 +3,7 @@
 import warp as wp
 
 from .simulate import simulate
-from .structs import Model, Scratch
+from .structs import Model, Scratch, row_at
 from .world import Values, detect_fault, load_world, store_world
 
 wp.set_module_options({"enable_backward": False})
@@ -27,7 +27,7 @@ def step_forward(
     lane = tid - n * lanes
     slot = slot_first + n * slot_stride
     w = first + n
-    load_world(m, sc, sc, slot, x, x, w, lane, lanes)
-    simulate(m, sc, sc, slot, lane, lanes)
+    load_world(m, sc, sc, row_at(m, slot, 0, 0, 0), slot, x, x, w, lane, lanes)
+    simulate(m, sc, sc, slot, 0, lane, lanes)
     detect_fault(m, sc, slot, lane)
     store_world(m, sc, slot, x, w, lane, lanes)

@@ -3,28 +3,29 @@
 import warp as wp
 
 from . import mat33, real, stage, vec3
-from .structs import Model, Scratch
+from .memory import constant, load, store
+from .structs import Model, Row, Scratch
 
 
 @stage
-def rigid_inertia(m: Model, sc: Scratch, slot: int, s: int, i: int):
+def rigid_inertia(m: Model, sc: Scratch, row: Row, i: int):
     """Composite inertia about O and bias wrench of body ``i`` and its descendants.
 
     A rigid inertia is (rotational inertia about O, first mass moment, mass); the bias
     wrench is I a + v x* I v (Featherstone 2008, eq. 5.14 and 6.2).
     """
-    x = sc.pose[slot, s, i]
+    x = load(sc.pose, row.body + i)
     r = wp.quat_to_matrix(wp.transform_get_rotation(x))
-    c = wp.transform_point(x, m.com[i])
-    mass = m.mass[i]
+    c = wp.transform_point(x, constant(m.com, i))
+    mass = constant(m.mass, i)
     hm = mass * c
-    io = r * m.inertia[i] * wp.transpose(r) + (
+    io = r * constant(m.inertia, i) * wp.transpose(r) + (
         wp.dot(hm, c) * wp.identity(n=3, dtype=real) - wp.outer(hm, c)
     )
-    w = sc.twist_w[slot, s, i]
-    v = sc.twist_v[slot, s, i]
-    aw = sc.bias_w[slot, s, i]
-    av = sc.bias_v[slot, s, i]
+    w = load(sc.twist_w, row.body + i)
+    v = load(sc.twist_v, row.body + i)
+    aw = load(sc.bias_w, row.body + i)
+    av = load(sc.bias_v, row.body + i)
     angular = io * w + wp.cross(hm, v)
     linear = mass * v - wp.cross(hm, w)
     n = io * aw + wp.cross(hm, av) + wp.cross(w, angular) + wp.cross(v, linear)
@@ -34,30 +35,30 @@ def rigid_inertia(m: Model, sc: Scratch, slot: int, s: int, i: int):
     hm_sum = vec3()
     n_sum = vec3()
     f_sum = vec3()
-    for j in range(m.child_start[i], m.child_start[i + 1]):
-        child = m.child[j]
-        io_sum = io_sum + sc.inertia[slot, s, child]
-        hm_sum = hm_sum + sc.moment[slot, s, child]
-        n_sum = n_sum + sc.wrench_w[slot, s, child]
-        f_sum = f_sum + sc.wrench_v[slot, s, child]
-    sc.inertia[slot, s, i] = io + io_sum
-    sc.moment[slot, s, i] = hm + hm_sum
-    sc.wrench_w[slot, s, i] = n + n_sum
-    sc.wrench_v[slot, s, i] = f + f_sum
+    for j in range(load(m.child_start, i), load(m.child_start, i + 1)):
+        child = load(m.child, j)
+        io_sum = io_sum + load(sc.inertia, row.body + child)
+        hm_sum = hm_sum + load(sc.moment, row.body + child)
+        n_sum = n_sum + load(sc.wrench_w, row.body + child)
+        f_sum = f_sum + load(sc.wrench_v, row.body + child)
+    store(sc.inertia, row.body + i, io + io_sum)
+    store(sc.moment, row.body + i, hm + hm_sum)
+    store(sc.wrench_w, row.body + i, n + n_sum)
+    store(sc.wrench_v, row.body + i, f + f_sum)
 
 
 @wp.func
-def point_weight(sc: Scratch, slot: int, s: int, t: int, c: int):
+def point_weight(sc: Scratch, row: Row, c: int):
     """3 x 3 weight of a contact: impulse per change of contact velocity [kg]."""
-    n = sc.normal[slot, s, c]
-    wt = sc.weight_t[slot, t, c]
-    return (sc.weight_n[slot, t, c] - wt) * wp.outer(n, n) + wt * wp.identity(
+    n = load(sc.normal, row.contact + c)
+    wt = load(sc.weight_t, row.solve_contact + c)
+    return (load(sc.weight_n, row.solve_contact + c) - wt) * wp.outer(n, n) + wt * wp.identity(
         n=3, dtype=real
     )
 
 
 @stage
-def contact_inertia(m: Model, sc: Scratch, slot: int, s: int, t: int, i: int):
+def contact_inertia(m: Model, sc: Scratch, row: Row, i: int):
     """Contact weights of body ``i`` and its descendants as a spatial inertia about O.
 
     With R = [r]x: ww = R^T W R, wv = -(W R)^T, vv = W; and the push as a wrench.
@@ -67,26 +68,26 @@ def contact_inertia(m: Model, sc: Scratch, slot: int, s: int, t: int, i: int):
     vv = mat33()
     n = vec3()
     f = vec3()
-    for c in range(m.contact_start[i], m.contact_start[i + 1]):
-        r = sc.point[slot, s, c]
-        w_ = point_weight(sc, slot, s, t, c)
+    for c in range(load(m.contact_start, i), load(m.contact_start, i + 1)):
+        r = load(sc.point, row.contact + c)
+        w_ = point_weight(sc, row, c)
         r_ = wp.skew(r)
         wr = w_ * r_
-        p = sc.push[slot, t, c]
+        p = load(sc.push, row.solve_contact + c)
         ww = ww - r_ * wr
         wv = wv - wp.transpose(wr)
         vv = vv + w_
         n = n + wp.cross(r, p)
         f = f + p
-    for j in range(m.child_start[i], m.child_start[i + 1]):
-        child = m.child[j]
-        ww = ww + sc.added_ww[slot, t, child]
-        wv = wv + sc.added_wv[slot, t, child]
-        vv = vv + sc.added_vv[slot, t, child]
-        n = n + sc.push_w[slot, t, child]
-        f = f + sc.push_v[slot, t, child]
-    sc.added_ww[slot, t, i] = ww
-    sc.added_wv[slot, t, i] = wv
-    sc.added_vv[slot, t, i] = vv
-    sc.push_w[slot, t, i] = n
-    sc.push_v[slot, t, i] = f
+    for j in range(load(m.child_start, i), load(m.child_start, i + 1)):
+        child = load(m.child, j)
+        ww = ww + load(sc.added_ww, row.solve_body + child)
+        wv = wv + load(sc.added_wv, row.solve_body + child)
+        vv = vv + load(sc.added_vv, row.solve_body + child)
+        n = n + load(sc.push_w, row.solve_body + child)
+        f = f + load(sc.push_v, row.solve_body + child)
+    store(sc.added_ww, row.solve_body + i, ww)
+    store(sc.added_wv, row.solve_body + i, wv)
+    store(sc.added_vv, row.solve_body + i, vv)
+    store(sc.push_w, row.solve_body + i, n)
+    store(sc.push_v, row.solve_body + i, f)

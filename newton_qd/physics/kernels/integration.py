@@ -3,36 +3,37 @@
 import warp as wp
 
 from . import quat, real, stage
-from .structs import Model, Scratch
+from .memory import constant, load, store
+from .structs import Model, Row, Scratch
 
 
 @stage
-def new_velocity(m: Model, sc: Scratch, slot: int, s: int, k: int):
+def new_velocity(sc: Scratch, row: Row, k: int):
     """Velocity after the corrector solve."""
-    sc.v[slot, s + 1, k] = sc.v[slot, s, k] + sc.dv[slot, 2 * s + 1, k]
+    store(sc.v, row.v_next + k, load(sc.v, row.v + k) + load(sc.dv, row.solve_dof + k))
 
 
 @stage
-def new_coordinates(m: Model, sc: Scratch, slot: int, s: int, i: int):
+def new_coordinates(m: Model, sc: Scratch, row: Row, i: int):
     """Coordinates of joint ``i``; a rotation moves by the exponential map."""
     h = m.h
-    a = m.q_start[i]
-    k = m.v_start[i]
-    if m.joint_kind[i] == 0:
+    a = load(m.q_start, i)
+    k = load(m.v_start, i)
+    if load(m.joint_kind, i) == 0:
         for j in range(3):
-            sc.q[slot, s + 1, a + j] = sc.q[slot, s, a + j] + h * sc.v[slot, s + 1, k + j]
+            store(sc.q, row.q_next + a + j, load(sc.q, row.q + a + j) + h * load(sc.v, row.v_next + k + j))
         turn = wp.vector(
-            h * sc.v[slot, s + 1, k + 3],
-            h * sc.v[slot, s + 1, k + 4],
-            h * sc.v[slot, s + 1, k + 5],
+            h * load(sc.v, row.v_next + k + 3),
+            h * load(sc.v, row.v_next + k + 4),
+            h * load(sc.v, row.v_next + k + 5),
         )
         # sin(x/2)/x by its argument squared: smooth at rest, no division by zero
         half = real(0.25) * wp.dot(turn, turn)
         r = quat(
-            sc.q[slot, s, a + 3],
-            sc.q[slot, s, a + 4],
-            sc.q[slot, s, a + 5],
-            sc.q[slot, s, a + 6],
+            load(sc.q, row.q + a + 3),
+            load(sc.q, row.q + a + 4),
+            load(sc.q, row.q + a + 5),
+            load(sc.q, row.q + a + 6),
         )
         scale = real(0.5) * sinc_of_square(half)
         step = quat(
@@ -40,9 +41,9 @@ def new_coordinates(m: Model, sc: Scratch, slot: int, s: int, i: int):
         )
         r1 = wp.normalize(step * r)
         for j in range(4):
-            sc.q[slot, s + 1, a + 3 + j] = r1[j]
+            store(sc.q, row.q_next + a + 3 + j, r1[j])
     else:
-        sc.q[slot, s + 1, a] = sc.q[slot, s, a] + h * sc.v[slot, s + 1, k]
+        store(sc.q, row.q_next + a, load(sc.q, row.q + a) + h * load(sc.v, row.v_next + k))
 
 
 @wp.func

@@ -20,6 +20,7 @@ class Model:
     nc: int
     free_root: int  # 1: the origin O follows the position of the first joint
     substeps: int
+    passes: int  # solves of a substep: predictor and corrector
     h: real  # [s]
     gravity: real  # [m/s^2]
     # bodies, (nb + 1)
@@ -53,8 +54,9 @@ class Model:
     limit_upper: wp.array[real]
     limit_stiffness: wp.array[real]
     limit_smoothing: real
+    width: int  # entries of a row of path, H and L
     depth: wp.array[int]  # number of dofs on the way from the root, itself included
-    path: wp.array2d[int]  # (nv, depth): dofs from the root to k
+    path: wp.array[int]  # (nv, width): dofs from the root to k
     descendant_start: wp.array[int]
     descendant: wp.array[int]
     dof_levels: int
@@ -80,49 +82,100 @@ class Model:
 class Scratch:
     """Intermediates of one control step; also the layout of their adjoints.
 
-    First index: slot (a world in flight). Second: substep ``s``, or solve
-    ``2 s + pass`` where a substep has two (predictor 0, corrector 1).
+    Contiguous, one-dimensional; :class:`Row` says where a substep's entries begin.
     """
 
-    q: wp.array3d[real]  # (slot, substeps + 1, nq)
-    v: wp.array3d[real]  # (slot, substeps + 1, nv)
-    ctrl: wp.array2d[real]  # (slot, nu)
-    fault: wp.array[int]  # (slot,)
-    # per substep and body; world axes, spatial vectors about O
-    pose: wp.array3d[transform]
-    twist_w: wp.array3d[vec3]
-    twist_v: wp.array3d[vec3]
-    bias_w: wp.array3d[vec3]
-    bias_v: wp.array3d[vec3]
-    inertia: wp.array3d[mat33]
-    moment: wp.array3d[vec3]
-    wrench_w: wp.array3d[vec3]
-    wrench_v: wp.array3d[vec3]
-    # per substep and dof
-    axis_w: wp.array3d[vec3]
-    axis_v: wp.array3d[vec3]
-    # per substep and contact
-    point: wp.array3d[vec3]
-    arm: wp.array3d[vec3]
-    normal: wp.array3d[vec3]
-    velocity: wp.array3d[vec3]
-    load: wp.array3d[real]
-    impulse: wp.array3d[vec3]
-    angular_impulse: wp.array3d[vec3]
-    normal_impulse: wp.array3d[real]
-    # per solve and contact
-    push: wp.array3d[vec3]
-    weight_n: wp.array3d[real]
-    weight_t: wp.array3d[real]
-    slip: wp.array3d[vec3]
-    # per solve and body: contact weights as added inertia, and contact push
-    added_ww: wp.array3d[mat33]
-    added_wv: wp.array3d[mat33]
-    added_vv: wp.array3d[mat33]
-    push_w: wp.array3d[vec3]
-    push_v: wp.array3d[vec3]
-    # per solve and dof
-    H: wp.array4d[real]  # (slot, solve, nv, depth), along the path
-    L: wp.array4d[real]
-    b: wp.array3d[real]
-    dv: wp.array3d[real]
+    q: wp.array[real]
+    v: wp.array[real]
+    ctrl: wp.array[real]
+    fault: wp.array[int]  # (slots,)
+    # bodies; world axes, spatial vectors about O
+    pose: wp.array[transform]
+    twist_w: wp.array[vec3]
+    twist_v: wp.array[vec3]
+    bias_w: wp.array[vec3]
+    bias_v: wp.array[vec3]
+    inertia: wp.array[mat33]
+    moment: wp.array[vec3]
+    wrench_w: wp.array[vec3]
+    wrench_v: wp.array[vec3]
+    # degrees of freedom
+    axis_w: wp.array[vec3]
+    axis_v: wp.array[vec3]
+    # contacts
+    point: wp.array[vec3]
+    arm: wp.array[vec3]
+    normal: wp.array[vec3]
+    velocity: wp.array[vec3]
+    load: wp.array[real]
+    impulse: wp.array[vec3]
+    angular_impulse: wp.array[vec3]
+    normal_impulse: wp.array[real]
+    # contacts, per solve
+    push: wp.array[vec3]
+    weight_n: wp.array[real]
+    weight_t: wp.array[real]
+    slip: wp.array[vec3]
+    # bodies, per solve: contact weights as added inertia, and contact push
+    added_ww: wp.array[mat33]
+    added_wv: wp.array[mat33]
+    added_vv: wp.array[mat33]
+    push_w: wp.array[vec3]
+    push_v: wp.array[vec3]
+    # degrees of freedom, per solve
+    H: wp.array[real]
+    L: wp.array[real]
+    b: wp.array[real]
+    dv: wp.array[real]
+
+
+@wp.struct
+class Row:
+    """Where the entries of one substep and one solve begin in the scratch arrays."""
+
+    q: int
+    q_next: int
+    v: int
+    v_next: int
+    ctrl: int
+    body: int
+    dof: int
+    contact: int
+    report: int
+    predictor: int  # contacts of the substep's first solve
+    solve_body: int
+    solve_dof: int
+    solve_contact: int
+    matrix: int
+
+
+@wp.func
+def row_at(m: Model, slot: int, keep: int, s: int, p: int):
+    """Row of substep ``s`` and solve ``p``.
+
+    ``keep`` is 1 where every substep has entries of its own, as the adjoint needs, and
+    0 where a slot's substeps share them.
+    """
+    step = slot
+    solve = slot
+    first = slot
+    if keep == 1:
+        step = slot * m.substeps + s
+        first = 2 * step
+        solve = first + p
+    r = Row()
+    r.q = (slot * (m.substeps + 1) + s) * m.nq
+    r.q_next = r.q + m.nq
+    r.v = (slot * (m.substeps + 1) + s) * m.nv
+    r.v_next = r.v + m.nv
+    r.ctrl = slot * m.nu
+    r.body = step * (m.nb + 1)
+    r.dof = step * m.nv
+    r.contact = step * m.nc
+    r.report = (slot * m.substeps + s) * m.nc
+    r.predictor = first * m.nc
+    r.solve_body = solve * (m.nb + 1)
+    r.solve_dof = solve * m.nv
+    r.solve_contact = solve * m.nc
+    r.matrix = solve * m.nv * m.width
+    return r
