@@ -1,0 +1,79 @@
+"""Differentiable-physics environments for Quality-Diversity in JAX.
+
+The facade:
+
+- ``create(name, ...)``, ``create_fn(name, ...)``: an environment by its name
+- ``registered_envs()``, ``register(name, base, ...)``: the names; a new one
+- ``Env``, ``State``: what ``create`` returns; what ``reset`` and ``step`` return
+- ``check(state)``: raises ``FaultError`` where a world was frozen
+- ``behavior_descriptor_extractor``, ``descriptor_extractor``, ``reward_offset``:
+  tables by environment name
+
+Importing the package imports none of its parts: each name is loaded when it is
+first used.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from newton_qd.envs.base import Env, State, check
+    from newton_qd.errors import FaultError, MissingExtra, UnknownEnvironment
+    from newton_qd.registry import (
+        behavior_descriptor_extractor,
+        create,
+        create_fn,
+        descriptor_extractor,
+        register,
+        registered_envs,
+        reward_offset,
+    )
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "Env",
+    "FaultError",
+    "MissingExtra",
+    "State",
+    "UnknownEnvironment",
+    "behavior_descriptor_extractor",
+    "check",
+    "create",
+    "create_fn",
+    "descriptor_extractor",
+    "register",
+    "registered_envs",
+    "reward_offset",
+]
+
+_HOME = {
+    "Env": "newton_qd.envs.base",
+    "FaultError": "newton_qd.errors",
+    "MissingExtra": "newton_qd.errors",
+    "State": "newton_qd.envs.base",
+    "UnknownEnvironment": "newton_qd.errors",
+    "behavior_descriptor_extractor": "newton_qd.registry",
+    "check": "newton_qd.envs.base",
+    "create": "newton_qd.registry",
+    "create_fn": "newton_qd.registry",
+    "descriptor_extractor": "newton_qd.registry",
+    "register": "newton_qd.registry",
+    "registered_envs": "newton_qd.registry",
+    "reward_offset": "newton_qd.registry",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Loads a name of the facade when it is first used."""
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(_HOME[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -1,0 +1,6 @@
+"""Environments: observation, reward and end of an episode over the physics."""
+
+from newton_qd.envs.ant import Ant
+from newton_qd.envs.base import Env, PhysicsEnv, QDEnv, State, check
+
+__all__ = ["Ant", "Env", "PhysicsEnv", "QDEnv", "State", "check"]

@@ -1,0 +1,159 @@
+"""Ant: run along x on four legs."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from newton_qd.envs.base import PhysicsEnv, ordered_sum
+from newton_qd.physics.system import PhysicsState, System
+from newton_qd.robots import ANT
+from newton_qd.types import Action, Metrics
+
+_CONTACT_CLIP = 1.0  # contact velocity changes are seen up to this [m/s or rad/s]
+_ROOT_Q, _ROOT_V = 7, 6  # a free root has 7 coordinates and 6 velocities
+
+
+class Ant(PhysicsEnv):
+    """A torso on four legs of two joints, rewarded for velocity along x.
+
+    Observation: ``observation_layout``. Reward: velocity along x, plus a bonus for
+    being healthy, minus costs of control and of contact. Done when unhealthy.
+    """
+
+    def __init__(
+        self,
+        *,
+        ctrl_cost_weight: float = 0.5,
+        use_contact_forces: bool = True,
+        contact_cost_weight: float = 5e-4,
+        healthy_reward: float = 1.0,
+        terminate_when_unhealthy: bool = True,
+        healthy_z_range: tuple[float, float] = (0.2, 1.0),
+        reset_noise_scale: float = 0.1,
+        exclude_current_positions_from_observation: bool = True,
+        dtype: str = "float32",
+    ) -> None:
+        """Loads the ant.
+
+        Args:
+            ctrl_cost_weight: Cost of the sum of squared actions [-].
+            use_contact_forces: Whether the observation ends with the contact
+                velocity changes of every body and of the ground (always 0).
+            contact_cost_weight: Cost of the sum of squared contact velocity changes,
+                clipped as in the observation [-].
+            healthy_reward: Bonus of a step [-].
+            terminate_when_unhealthy: Whether an unhealthy torso ends the episode;
+                if not, it loses the bonus instead.
+            healthy_z_range: Lowest and highest healthy height of the torso [m].
+            reset_noise_scale: Half width of the uniform noise on joint angles [rad]
+                and joint velocities [rad/s] at a reset.
+            exclude_current_positions_from_observation: Whether the observation
+                omits x and y of the torso.
+            dtype: ``"float32"``, or ``"float64"`` with JAX x64 on.
+        """
+        self._ctrl_cost_weight = ctrl_cost_weight
+        self._use_contact_forces = use_contact_forces
+        self._contact_cost_weight = contact_cost_weight
+        self._healthy_reward = healthy_reward
+        self._terminate_when_unhealthy = terminate_when_unhealthy
+        self._healthy_z_range = healthy_z_range
+        self._omit_xy = exclude_current_positions_from_observation
+        super().__init__(ANT, reset_noise_scale=reset_noise_scale, dtype=dtype)
+
+    def _observe(self, state: PhysicsState) -> dict[str, jax.Array]:
+        """Returns the blocks of the observation."""
+        q, v = state.q, state.v
+        blocks = {} if self._omit_xy else {"torso position x y [m]": q[:2]}
+        blocks |= {
+            "torso height [m]": q[2:3],
+            "torso orientation w x y z": jnp.concatenate([q[6:7], q[3:6]]),
+            "joint angles [rad]": q[_ROOT_Q:],
+            "torso velocity x y z [m/s]": v[:3],
+            "torso angular velocity x y z [rad/s]": v[3:_ROOT_V],
+            "joint velocities [rad/s]": v[_ROOT_V:],
+        }
+        if self._use_contact_forces:
+            linear = _linear_changes(self.system, state)
+            angular = _angular_changes(self.system, state)
+            blocks["contact velocity changes, bodies and ground [m/s]"] = _rows(linear)
+            blocks["contact angular velocity changes, bodies and ground [rad/s]"] = (
+                _rows(angular)
+            )
+        return blocks
+
+    def _outcome(
+        self, before: PhysicsState, after: PhysicsState, action: Action
+    ) -> tuple[jax.Array, jax.Array, Metrics]:
+        """Returns reward, done and metrics of a step."""
+        position = after.q[:3]
+        velocity = (position[:2] - before.q[:2]) / self.dt
+        low, high = self._healthy_z_range
+        healthy = ((position[2] >= low) & (position[2] <= high)).astype(self.dtype)
+        if self._terminate_when_unhealthy:
+            bonus, done = jnp.full_like(healthy, self._healthy_reward), 1 - healthy
+        else:
+            bonus, done = self._healthy_reward * healthy, jnp.zeros_like(healthy)
+        control = self._ctrl_cost_weight * ordered_sum(jnp.square(action))
+        contact = self._contact_cost_weight * self._contact_effort(after)
+        reward = velocity[0] + bonus - control - contact
+        metrics = {
+            "reward_forward": velocity[0],
+            "forward_reward": velocity[0],
+            "reward_survive": bonus,
+            "reward_ctrl": -control,
+            "reward_contact": -contact,
+            "x_position": position[0],
+            "y_position": position[1],
+            "distance_from_origin": _length(position),
+            "x_velocity": velocity[0],
+            "y_velocity": velocity[1],
+        }
+        return reward, done, metrics
+
+    def _contact_effort(self, state: PhysicsState) -> jax.Array:
+        """Returns the sum of squared contact velocity changes [m^2/s^2]."""
+        # The other bodies cannot touch anything: their terms are zero.
+        touching = np.unique(self.system.contact_body).astype(np.int32)
+        changes = _linear_changes(self.system, state)[touching]
+        return ordered_sum(jnp.square(changes).reshape(-1))
+
+
+def _linear_changes(system: System, state: PhysicsState) -> jax.Array:
+    """Returns contact impulse over mass, clipped, (nb, 3) [m/s]."""
+    mass = np.asarray(system.mass, system.dtype)[:, None]
+    return jnp.clip(state.impulse[:, :3] / mass, -_CONTACT_CLIP, _CONTACT_CLIP)
+
+
+def _angular_changes(system: System, state: PhysicsState) -> jax.Array:
+    """Returns angular contact impulse over inertia, clipped, (nb, 3) [rad/s]."""
+    inertia = np.asarray(_isotropic_inertia(system), system.dtype)[:, None]
+    return jnp.clip(state.impulse[:, 3:] / inertia, -_CONTACT_CLIP, _CONTACT_CLIP)
+
+
+def _isotropic_inertia(system: System) -> np.ndarray:
+    """Returns the one moment of inertia (nb,) of each body [kg m^2]."""
+    moment = system.inertia[:, 0, 0]
+    isotropic = moment[:, None, None] * np.eye(3)
+    if not np.allclose(system.inertia, isotropic, rtol=1e-6, atol=0.0):
+        raise ValueError(
+            f"use_contact_forces=True: a body of {system.robot.urdf!r} has an inertia "
+            "that depends on the axis; allowed: False, or isotropic inertias"
+        )
+    return moment
+
+
+def _rows(changes: jax.Array) -> jax.Array:
+    """Returns the rows of the bodies (nb, 3) and of the ground, flat (3 nb + 3,)."""
+    # The ground never moves; its row is kept for the layout that policies know.
+    ground = jnp.zeros((1, 3), changes.dtype)
+    return jnp.concatenate([changes, ground]).reshape(-1)
+
+
+def _length(vector: jax.Array) -> jax.Array:
+    """Returns the norm of (n,), with gradient 0 instead of nan at 0."""
+    square = ordered_sum(jnp.square(vector))
+    positive = square > 0
+    root = jnp.sqrt(jnp.where(positive, square, jnp.ones_like(square)))
+    return jnp.where(positive, root, jnp.zeros_like(root))

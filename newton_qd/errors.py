@@ -1,0 +1,49 @@
+"""The errors that the package defines; all derive from built-in ones."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+
+class UnknownEnvironment(NotImplementedError):  # noqa: N818 - a name, not an event
+    """No environment of this name is registered.
+
+    Attributes:
+        name: Name that was asked for.
+        known: Names that exist.
+    """
+
+    def __init__(self, name: object, known: Sequence[str]) -> None:
+        super().__init__(name, tuple(known))
+        self.name = name
+        self.known = tuple(known)
+
+    def __str__(self) -> str:
+        return (
+            f"This environment name does not exist! env_name is {self.name!r}; "
+            f"known names: {', '.join(self.known)}."
+        )
+
+
+class FaultError(FloatingPointError):
+    """A world met a value that is not finite and was frozen."""
+
+
+class MissingExtra(ImportError):  # noqa: N818 - likewise
+    """An optional dependency is not installed.
+
+    Attributes:
+        package: Package that could not be imported.
+        extra: Extra of ``newton_qd`` that installs it.
+    """
+
+    def __init__(self, package: str, extra: str) -> None:
+        super().__init__(package, extra)
+        self.package = package
+        self.extra = extra
+
+    def __str__(self) -> str:
+        return (
+            f"This needs {self.package}, which is not installed. "
+            f"Install it with: pip install 'newton_qd[{self.extra}]'"
+        )

@@ -1,0 +1,73 @@
+"""Quality-Diversity on the environments: settings, loop and results.
+
+- ``evolve(EvolveConfig(...), out=...)``: MAP-Elites on a registered environment
+- ``load_archive(folder)``, ``plot_archive(...)``: what a run has found
+- ``make_task``, ``make_policy``, ``make_scoring_function``: the parts, for other
+  algorithms of QDax
+
+Importing this package imports none of its parts: each name is loaded when it is
+first used. QDax and matplotlib (extra ``qd``) are imported by the functions that
+need them.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from newton_qd.qd.checkpoint import CheckpointError
+    from newton_qd.qd.config import ConfigError, EvolveConfig
+    from newton_qd.qd.evolve import EvolveResult, evolve
+    from newton_qd.qd.folder import Archive, load_archive
+    from newton_qd.qd.plot import plot_archive
+    from newton_qd.qd.rollout import Policy, make_policy, make_scoring_function
+    from newton_qd.qd.search import SearchError
+    from newton_qd.qd.task import Task, make_task
+
+__all__ = [
+    "Archive",
+    "CheckpointError",
+    "ConfigError",
+    "EvolveConfig",
+    "EvolveResult",
+    "Policy",
+    "SearchError",
+    "Task",
+    "evolve",
+    "load_archive",
+    "make_policy",
+    "make_scoring_function",
+    "make_task",
+    "plot_archive",
+]
+
+_HOME = {
+    "Archive": "folder",
+    "CheckpointError": "checkpoint",
+    "ConfigError": "config",
+    "EvolveConfig": "config",
+    "EvolveResult": "evolve",
+    "Policy": "rollout",
+    "SearchError": "search",
+    "Task": "task",
+    "evolve": "evolve",
+    "load_archive": "folder",
+    "make_policy": "rollout",
+    "make_scoring_function": "rollout",
+    "make_task": "task",
+    "plot_archive": "plot",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Loads a name of this package when it is first used."""
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -1,0 +1,112 @@
+"""Files that are either whole or absent, and the checkpoint of a run.
+
+A checkpoint is one file: a line with a format number and the SHA-256 of the rest,
+then a NumPy archive. The digest turns every kind of damage into one clear error.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import io
+import os
+from pathlib import Path
+
+import numpy as np
+
+_MAGIC = b"newton_qd checkpoint 1 "
+
+
+class CheckpointError(RuntimeError):
+    """A checkpoint is damaged or belongs to another run."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Checkpoint:
+    """State of an evolution between two generations.
+
+    Attributes:
+        settings: Settings of the run as JSON; guards against mixed folders.
+        iteration: Generations that are finished.
+        genotypes: (cells, parameters) policy weights, zero in empty cells.
+        fitnesses: (cells,) returns, ``-inf`` in empty cells.
+        descriptors: (cells, D) descriptors, zero in empty cells.
+        centroids: (cells, D) centres of the cells.
+        metrics: (iteration + 1, columns) rows of ``metrics.csv``.
+    """
+
+    settings: str
+    iteration: int
+    genotypes: np.ndarray
+    fitnesses: np.ndarray
+    descriptors: np.ndarray
+    centroids: np.ndarray
+    metrics: np.ndarray
+
+
+def temporary_name(path: Path) -> Path:
+    """Name under which a file is written before it replaces ``path``."""
+    return path.with_name(f".{path.name}.tmp")
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Writes a file so that a reader sees the old or the new one, never a part.
+
+    Args:
+        path: File to write or replace.
+        content: Everything that the file shall hold.
+    """
+    temporary = temporary_name(path)
+    with open(temporary, "wb") as file:
+        file.write(content)
+        file.flush()
+        # Without this a power cut after the rename can leave an empty file.
+        os.fsync(file.fileno())
+    os.replace(temporary, path)
+
+
+def npz_bytes(**arrays: np.ndarray) -> bytes:
+    """Packs arrays into the bytes of an uncompressed ``.npz`` file."""
+    buffer = io.BytesIO()
+    np.savez(buffer, allow_pickle=False, **arrays)
+    return buffer.getvalue()
+
+
+def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
+    """Writes a checkpoint atomically."""
+    fields = {
+        field.name: np.asarray(getattr(checkpoint, field.name))
+        for field in dataclasses.fields(checkpoint)
+    }
+    payload = npz_bytes(**fields)
+    digest = hashlib.sha256(payload).hexdigest().encode()
+    write_atomically(path, _MAGIC + digest + b"\n" + payload)
+
+
+def load_checkpoint(path: Path) -> Checkpoint:
+    """Reads a checkpoint.
+
+    Args:
+        path: File written by ``save_checkpoint``.
+
+    Raises:
+        CheckpointError: The file is damaged or of another kind.
+    """
+    content = path.read_bytes()
+    head, separator, payload = content.partition(b"\n")
+    if not separator or not head.startswith(_MAGIC):
+        raise CheckpointError(
+            f"{path} is not a checkpoint of this version of newton_qd, or its "
+            "beginning is damaged; delete it to start the run again"
+        )
+    if hashlib.sha256(payload).hexdigest().encode() != head[len(_MAGIC) :]:
+        raise CheckpointError(
+            f"{path} is damaged (checksum differs); delete it to start the run again"
+        )
+    with np.load(io.BytesIO(payload), allow_pickle=False) as arrays:
+        fields = {
+            field.name: arrays[field.name] for field in dataclasses.fields(Checkpoint)
+        }
+    fields["settings"] = str(fields["settings"])
+    fields["iteration"] = int(fields["iteration"])
+    return Checkpoint(**fields)

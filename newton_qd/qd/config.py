@@ -1,0 +1,240 @@
+"""Settings of an evolution: one frozen dataclass, and the file that holds it."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.metadata
+import json
+import math
+import platform
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+FORMAT = 1
+MAX_CELLS = 1_000_000
+DEFAULT_GRIDS = {1: (64,), 2: (32, 32), 3: (9, 9, 9), 4: (5, 5, 5, 5)}
+"""Cells per descriptor dimension when the user asks for nothing."""
+
+_PACKAGES = (
+    "newton_qd",
+    "newton",
+    "warp-lang",
+    "jax",
+    "jaxlib",
+    "numpy",
+    "qdax",
+    "flax",
+)
+
+
+class ConfigError(ValueError):
+    """A setting is wrong, unknown, or not the one of the run to resume."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class EvolveConfig:
+    """Everything that determines the result of an evolution.
+
+    Attributes:
+        env_name: Registered name of a Quality-Diversity environment.
+        seed: Seed of every random number, ``0`` to ``2**32 - 1``.
+        iterations: Generations after the initial population.
+        batch_size: Individuals evaluated in one generation.
+        episode_length: Control steps of one evaluation.
+        hidden: Widths of the hidden layers of the policy.
+        grid: Cells along each descriptor dimension. ``None`` takes the default
+            grid of the descriptor's length unless ``centroids`` is given.
+        centroids: Number of cells of a centroidal Voronoi tessellation instead
+            of a grid.
+        iso_sigma: Standard deviation of the isotropic part of a variation, in
+            units of policy weights [-].
+        line_sigma: Standard deviation of the step towards the second parent,
+            relative to the distance of the parents [-].
+    """
+
+    env_name: str = "ant_uni"
+    seed: int = 0
+    iterations: int = 200
+    batch_size: int = 128
+    episode_length: int = 100
+    hidden: tuple[int, ...] = (32,)
+    grid: tuple[int, ...] | None = None
+    centroids: int | None = None
+    iso_sigma: float = 0.05
+    line_sigma: float = 0.5
+
+    def __post_init__(self) -> None:
+        """Normalizes sequences to tuples and checks every value."""
+        for name in ("hidden", "grid"):
+            value = getattr(self, name)
+            if isinstance(value, list):
+                object.__setattr__(self, name, tuple(value))
+        self._check()
+
+    def _check(self) -> None:
+        if not isinstance(self.env_name, str) or not self.env_name:
+            raise ConfigError(f"env_name must be a name, got {self.env_name!r}")
+        _check_integer("seed", self.seed, 0, 2**32 - 1)
+        _check_integer("iterations", self.iterations, 0)
+        _check_integer("batch_size", self.batch_size, 1)
+        _check_integer("episode_length", self.episode_length, 1)
+        _check_integers("hidden", self.hidden, 1)
+        for name in ("iso_sigma", "line_sigma"):
+            value = getattr(self, name)
+            number = isinstance(value, int | float) and not isinstance(value, bool)
+            if not number or not math.isfinite(value) or value < 0:
+                raise ConfigError(
+                    f"{name} must be a finite number of at least 0, got {value!r}"
+                )
+        if self.grid is not None and self.centroids is not None:
+            raise ConfigError(
+                f"grid {self.grid} and centroids {self.centroids} exclude each other"
+            )
+        if self.grid is not None:
+            _check_integers("grid", self.grid, 1)
+            if not self.grid:
+                raise ConfigError("grid must name at least one dimension, got ()")
+            _check_integer("grid's number of cells", math.prod(self.grid), 2, MAX_CELLS)
+        if self.centroids is not None:
+            _check_integer("centroids", self.centroids, 2, MAX_CELLS)
+
+    def resolve(self, descriptor_length: int) -> EvolveConfig:
+        """Fills in the grid and checks it against the descriptor.
+
+        Args:
+            descriptor_length: Number of components of the descriptor.
+
+        Returns:
+            Settings in which exactly one of ``grid`` and ``centroids`` is given.
+        """
+        if self.centroids is not None:
+            return self
+        if self.grid is None:
+            if descriptor_length not in DEFAULT_GRIDS:
+                raise ConfigError(
+                    f"a descriptor of {descriptor_length} components has no default "
+                    "grid: give centroids (a number of cells)"
+                )
+            return dataclasses.replace(self, grid=DEFAULT_GRIDS[descriptor_length])
+        if len(self.grid) != descriptor_length:
+            raise ConfigError(
+                f"grid {'x'.join(map(str, self.grid))} has {len(self.grid)} "
+                f"dimensions; the descriptor of {self.env_name!r} has "
+                f"{descriptor_length}"
+            )
+        return self
+
+    def replace(self, **changes: Any) -> EvolveConfig:
+        """Returns a copy with some settings changed."""
+        known = {field.name for field in dataclasses.fields(self)}
+        unknown = sorted(set(changes) - known)
+        if unknown:
+            raise ConfigError(
+                f"unknown setting {unknown[0]!r}; known: {', '.join(sorted(known))}"
+            )
+        return dataclasses.replace(self, **changes)
+
+    def differences(self, other: EvolveConfig) -> list[tuple[str, Any, Any]]:
+        """Lists ``(name, own value, other's value)`` of settings that differ."""
+        pairs = (
+            (field.name, getattr(self, field.name), getattr(other, field.name))
+            for field in dataclasses.fields(self)
+        )
+        return [row for row in pairs if row[1] != row[2]]
+
+
+def _check_integer(name: str, value: Any, low: int, high: int | None = None) -> None:
+    bad_type = not isinstance(value, int) or isinstance(value, bool)
+    if bad_type or value < low or (high is not None and value > high):
+        allowed = f"at least {low}" if high is None else f"{low} to {high}"
+        raise ConfigError(f"{name} must be an integer, {allowed}; got {value!r}")
+
+
+def _check_integers(name: str, values: Any, low: int) -> None:
+    if not isinstance(values, tuple):
+        raise ConfigError(f"{name} must be a tuple of integers, got {values!r}")
+    for value in values:
+        _check_integer(f"every entry of {name}", value, low)
+
+
+def environment_facts() -> dict[str, Any]:
+    """Describes what a bit-exact repetition of a run needs besides its settings."""
+    import jax
+
+    return {
+        "python": platform.python_version(),
+        "machine": platform.machine(),
+        "backend": jax.default_backend(),
+        "x64": bool(jax.config.read("jax_enable_x64")),
+        "packages": {name: _version(name) for name in _PACKAGES},
+    }
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def config_to_json(config: EvolveConfig, facts: dict[str, Any]) -> str:
+    """Writes settings and the facts of the machine as readable JSON."""
+    document = {
+        "format": FORMAT,
+        "settings": dataclasses.asdict(config),
+        "environment": facts,
+    }
+    return json.dumps(document, indent=2) + "\n"
+
+
+def settings_text(config: EvolveConfig) -> str:
+    """Settings as one line that is equal for equal settings."""
+    return json.dumps(dataclasses.asdict(config), sort_keys=True)
+
+
+def read_config(path: Path) -> tuple[EvolveConfig, dict[str, Any]]:
+    """Reads a ``config.json``.
+
+    Args:
+        path: File to read.
+
+    Returns:
+        Settings and the facts of the machine that wrote them (maybe empty).
+
+    Raises:
+        ConfigError: The file is missing, is not such a file, or holds a bad
+            setting.
+    """
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"cannot read {path}: {error.strerror}") from error
+    except ValueError as error:
+        raise ConfigError(f"{path} is not valid JSON: {error}") from error
+    if not isinstance(document, dict) or "settings" not in document:
+        raise ConfigError(f"{path} is not a newton-qd config: no 'settings'")
+    if document.get("format") != FORMAT:
+        raise ConfigError(
+            f"{path} has format {document.get('format')!r}; this version of "
+            f"newton_qd reads format {FORMAT}"
+        )
+    settings = document["settings"]
+    if not isinstance(settings, dict):
+        raise ConfigError(f"{path}: 'settings' must be an object, got {settings!r}")
+    facts = document.get("environment", {})
+    try:
+        return EvolveConfig().replace(**settings), dict(facts)
+    except (ConfigError, TypeError, ValueError) as error:
+        raise ConfigError(f"{path}: {error}") from error
+
+
+def changed_facts(
+    old: dict[str, Any], new: dict[str, Any]
+) -> Iterable[tuple[str, Any, Any]]:
+    """Yields ``(name, old, new)`` of machine facts that differ between two runs."""
+    old_flat = {**old, **old.get("packages", {})}
+    new_flat = {**new, **new.get("packages", {})}
+    for name in new_flat:
+        if name != "packages" and old_flat.get(name) != new_flat[name]:
+            yield name, old_flat.get(name), new_flat[name]

@@ -1,0 +1,200 @@
+"""The loop over generations: progress, checkpoints, interrupts and results."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+
+from newton_qd.physics import interrupts
+from newton_qd.qd.checkpoint import Checkpoint
+from newton_qd.qd.config import EvolveConfig, environment_facts
+from newton_qd.qd.extras import require_extra
+from newton_qd.qd.folder import COLUMNS, Archive, RunFolder
+from newton_qd.qd.interrupt import StopFlag, graceful_stop
+from newton_qd.qd.plot import archive_png
+from newton_qd.qd.progress import Progress
+from newton_qd.qd.search import Search, SearchState
+from newton_qd.qd.task import Task, make_task
+
+
+@dataclasses.dataclass(frozen=True)
+class EvolveResult:
+    """What an evolution has found.
+
+    Attributes:
+        config: Settings with the grid filled in.
+        archive: The individuals, one row per cell.
+        metrics: Name of each column of ``metrics.csv`` to its values
+            (iteration + 1,).
+        iteration: Generations that are finished; -1 if a signal came before the
+            initial population.
+        interrupted: Whether a signal ended the run before its last generation.
+        out: Results folder, if there is one.
+        seconds: Time that this call took [s].
+    """
+
+    config: EvolveConfig
+    archive: Archive
+    metrics: dict[str, np.ndarray]
+    iteration: int
+    interrupted: bool
+    out: Path | None
+    seconds: float
+
+
+def evolve(
+    config: EvolveConfig,
+    *,
+    out: str | os.PathLike[str] | None = None,
+    resume: bool = False,
+    progress: bool = True,
+    checkpoint_seconds: float = 5.0,
+    task_factory: Callable[[EvolveConfig], Task] = make_task,
+) -> EvolveResult:
+    """Evolves an archive of policies with MAP-Elites.
+
+    SIGINT and SIGTERM end the run after the current generation; its state is saved
+    and ``interrupted`` is true in the result.
+
+    Args:
+        config: Settings.
+        out: Results folder to create; ``None`` writes no files.
+        resume: Continue the run in ``out``; starts it if there is none yet.
+        progress: Whether to show progress on standard error.
+        checkpoint_seconds: Least time between two checkpoints [s]; does not change
+            the result.
+        task_factory: Makes the task; the default takes registered environments.
+
+    Returns:
+        Archive and metrics.
+
+    Raises:
+        ConfigError: A setting is wrong, the folder is not free, or the run to resume
+            has other settings.
+        CheckpointError: The checkpoint of the run to resume is damaged.
+        MissingExtra: QDax or matplotlib is not installed.
+        SearchError: No individual of the initial population can be kept.
+    """
+    begin = time.monotonic()
+    folder = None if out is None else RunFolder(out)
+    if folder is not None:
+        folder.check(resume=resume)
+        require_extra("matplotlib", "viz")
+    require_extra("qdax", "qd")
+    # First, so that it is what remains after the run: loading the physics inside
+    # the block would find another handler and leave Ctrl-C unprotected later.
+    interrupts.install()
+    with ExitStack() as stack:
+        stop = stack.enter_context(graceful_stop())
+        task = task_factory(config)
+        config = config.resolve(task.descriptor_length)
+        search = Search(config, task)
+        display = Progress(config.env_name, config.iterations, enabled=progress)
+        stack.callback(display.close)
+        checkpoint = None
+        if folder is not None:
+            stack.enter_context(folder.lock())
+            checkpoint = _open(folder, config, resume, display)
+        state = search.empty() if checkpoint is None else search.restore(checkpoint)
+        save = _Saver(search, folder, checkpoint_seconds)
+        state = _loop(search, state, config.iterations, display, stop, save)
+        result = _result(config, search.checkpoint(state), folder, begin)
+        if folder is not None and state.iteration >= 0:
+            save.now(state)
+            picture = archive_png(result.archive, config, task, state.iteration)
+            folder.save_archive(result.archive, picture)
+        return result
+
+
+def _open(
+    folder: RunFolder, config: EvolveConfig, resume: bool, display: Progress
+) -> Checkpoint | None:
+    """Starts a new run in the folder or reads the state of the one in it."""
+    # Another process may have started a run here since the first check.
+    folder.check(resume=resume)
+    facts = environment_facts()
+    if not folder.has_config:
+        if resume:
+            display.note(f"no run in {folder.path} yet: starting it")
+        folder.start(config, facts)
+        return None
+    checkpoint, warnings = folder.restore(config, facts)
+    for warning in warnings:
+        display.note(warning)
+    done = 0 if checkpoint is None else checkpoint.iteration
+    display.note(
+        f"resuming {folder.path} after generation {done} of {config.iterations}"
+    )
+    return checkpoint
+
+
+class _Saver:
+    """Writes checkpoints, but not more often than asked for."""
+
+    def __init__(
+        self, search: Search, folder: RunFolder | None, least_seconds: float
+    ) -> None:
+        self._search = search
+        self._folder = folder
+        self._least_seconds = least_seconds
+        self._saved_at = time.monotonic()
+
+    def sometimes(self, state: SearchState) -> None:
+        """Saves if the last checkpoint is old enough."""
+        if time.monotonic() - self._saved_at >= self._least_seconds:
+            self.now(state)
+
+    def now(self, state: SearchState) -> None:
+        """Saves."""
+        if self._folder is not None:
+            self._folder.save(self._search.checkpoint(state))
+        self._saved_at = time.monotonic()
+
+
+def _loop(
+    search: Search,
+    state: SearchState,
+    iterations: int,
+    display: Progress,
+    stop: StopFlag,
+    save: _Saver,
+) -> SearchState:
+    """Advances until the last generation or a signal."""
+    if state.iteration < iterations:
+        display.note("compiling the physics and the rollout (longer on a first start)")
+    while state.iteration < iterations and not stop.requested:
+        state = search.advance(state)
+        display.update(
+            state.iteration, dict(zip(COLUMNS, state.metrics[-1], strict=True))
+        )
+        save.sometimes(state)
+    return state
+
+
+def _result(
+    config: EvolveConfig,
+    checkpoint: Checkpoint,
+    folder: RunFolder | None,
+    begin: float,
+) -> EvolveResult:
+    columns = checkpoint.metrics.T
+    return EvolveResult(
+        config=config,
+        archive=Archive(
+            genotypes=checkpoint.genotypes,
+            fitnesses=checkpoint.fitnesses,
+            descriptors=checkpoint.descriptors,
+            centroids=checkpoint.centroids,
+        ),
+        metrics=dict(zip(COLUMNS, columns, strict=True)),
+        iteration=checkpoint.iteration,
+        interrupted=checkpoint.iteration < config.iterations,
+        out=None if folder is None else folder.path,
+        seconds=time.monotonic() - begin,
+    )

@@ -1,0 +1,238 @@
+"""The results folder of a run: what is in it, and who may write to it.
+
+``config.json`` (settings), ``checkpoint.bin`` (state to resume from),
+``metrics.csv`` (one row per generation), ``archive.npz`` and ``archive.png``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from newton_qd.qd.checkpoint import (
+    Checkpoint,
+    CheckpointError,
+    load_checkpoint,
+    npz_bytes,
+    save_checkpoint,
+    temporary_name,
+    write_atomically,
+)
+from newton_qd.qd.config import (
+    ConfigError,
+    EvolveConfig,
+    changed_facts,
+    config_to_json,
+    read_config,
+    settings_text,
+)
+
+CONFIG = "config.json"
+CHECKPOINT = "checkpoint.bin"
+METRICS = "metrics.csv"
+ARCHIVE = "archive.npz"
+PICTURE = "archive.png"
+_FILES = (CONFIG, CHECKPOINT, METRICS, ARCHIVE, PICTURE)
+
+COLUMNS = (
+    "iteration",
+    "evaluations",
+    "env_steps",
+    "qd_score",
+    "coverage",
+    "max_fitness",
+)
+_WHOLE_COLUMNS = 3
+
+
+@dataclasses.dataclass(frozen=True)
+class Archive:
+    """The individuals that an evolution has kept, one row per cell.
+
+    Attributes:
+        genotypes: (cells, parameters) policy weights, zero in empty cells.
+        fitnesses: (cells,) returns, ``-inf`` in empty cells.
+        descriptors: (cells, D) descriptors, zero in empty cells.
+        centroids: (cells, D) centres of the cells.
+    """
+
+    genotypes: np.ndarray
+    fitnesses: np.ndarray
+    descriptors: np.ndarray
+    centroids: np.ndarray
+
+    @property
+    def filled(self) -> np.ndarray:
+        """(cells,) whether a cell holds an individual."""
+        return np.isfinite(self.fitnesses)
+
+
+def load_archive(folder: str | os.PathLike[str]) -> Archive:
+    """Reads ``archive.npz`` of a results folder.
+
+    Args:
+        folder: Results folder of ``evolve``.
+    """
+    with np.load(Path(folder) / ARCHIVE, allow_pickle=False) as arrays:
+        return Archive(**{f.name: arrays[f.name] for f in dataclasses.fields(Archive)})
+
+
+class RunFolder:
+    """A results folder that one process writes to.
+
+    Attributes:
+        path: The folder.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        """Names the folder; touches nothing.
+
+        Args:
+            path: Folder, which need not exist yet.
+        """
+        self.path = Path(path)
+
+    @property
+    def has_config(self) -> bool:
+        """Whether a run was started here."""
+        return (self.path / CONFIG).is_file()
+
+    def check(self, *, resume: bool) -> None:
+        """Refuses a folder that is not free, or not a run to resume.
+
+        Args:
+            resume: Whether an earlier run shall be continued.
+
+        Raises:
+            ConfigError: The folder cannot be used like this.
+        """
+        if self.path.exists() and not self.path.is_dir():
+            raise ConfigError(f"out: {self.path} is a file, not a folder")
+        if not self._occupied():
+            return
+        if not resume:
+            raise ConfigError(
+                f"out: {self.path} is not empty; add --resume to continue the run in "
+                "it, or choose another folder"
+            )
+        if not self.has_config:
+            raise ConfigError(f"out: {self.path} holds no run to resume ({CONFIG})")
+
+    def _occupied(self) -> bool:
+        """Whether anything but the unfinished files of a killed run is here."""
+        if not self.path.exists():
+            return False
+        ignored = {temporary_name(Path(name)).name for name in _FILES}
+        return any(entry.name not in ignored for entry in self.path.iterdir())
+
+    @contextlib.contextmanager
+    def lock(self) -> Iterator[None]:
+        """Creates the folder and keeps other processes from writing to it.
+
+        Raises:
+            ConfigError: The folder cannot be made, or another run writes to it.
+        """
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ConfigError(
+                f"out: cannot create {self.path}: {error.strerror}"
+            ) from error
+        try:
+            import fcntl
+        except ImportError:  # Windows: a second writer is the user's affair
+            yield
+            return
+        # The kernel frees this lock when the process dies, however it dies.
+        descriptor = os.open(self.path, os.O_RDONLY)
+        try:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise ConfigError(
+                    f"out: another process is writing to {self.path}"
+                ) from error
+            yield
+        finally:
+            os.close(descriptor)
+
+    def start(self, config: EvolveConfig, facts: dict[str, Any]) -> None:
+        """Writes the settings of a new run."""
+        content = config_to_json(config, facts)
+        write_atomically(self.path / CONFIG, content.encode())
+
+    def restore(
+        self, config: EvolveConfig, facts: dict[str, Any]
+    ) -> tuple[Checkpoint | None, list[str]]:
+        """Reads the state of a run that was stopped.
+
+        Args:
+            config: Settings that the run is expected to have.
+            facts: Facts of this machine.
+
+        Returns:
+            The checkpoint (``None`` if the run was stopped before the first) and
+            warnings about a machine that differs.
+
+        Raises:
+            ConfigError: A setting differs from the run's.
+            CheckpointError: The checkpoint is damaged or of another run.
+        """
+        stored, old_facts = read_config(self.path / CONFIG)
+        for name, old, new in stored.differences(config):
+            raise ConfigError(
+                f"{name}: the run in {self.path} has {old!r}, not {new!r}; resume with "
+                "the same setting, or start a new run in another folder"
+            )
+        warnings = []
+        for name, old, new in changed_facts(old_facts, facts):
+            if name == "x64":
+                raise ConfigError(
+                    f"jax_enable_x64: the run in {self.path} has {old!r}, not {new!r}"
+                )
+            warnings.append(
+                f"warning: {name} was {old} when the run began and is {new} now; "
+                "the result may differ from an uninterrupted run"
+            )
+        path = self.path / CHECKPOINT
+        if not path.exists():
+            return None, warnings
+        checkpoint = load_checkpoint(path)
+        if checkpoint.settings != settings_text(config):
+            raise CheckpointError(
+                f"{path} belongs to a run with other settings than {CONFIG}"
+            )
+        return checkpoint, warnings
+
+    def save(self, checkpoint: Checkpoint) -> None:
+        """Writes the checkpoint, then the metrics up to it."""
+        save_checkpoint(self.path / CHECKPOINT, checkpoint)
+        text = metrics_to_csv(checkpoint.metrics)
+        write_atomically(self.path / METRICS, text.encode())
+
+    def save_archive(self, archive: Archive, picture: bytes) -> None:
+        """Writes the archive and its picture."""
+        arrays = {f.name: getattr(archive, f.name) for f in dataclasses.fields(archive)}
+        write_atomically(self.path / ARCHIVE, npz_bytes(**arrays))
+        write_atomically(self.path / PICTURE, picture)
+
+
+def metrics_to_csv(metrics: np.ndarray) -> str:
+    """Formats metrics.
+
+    Args:
+        metrics: (rows, columns) in the order of ``COLUMNS``.
+    """
+    lines = [",".join(COLUMNS)]
+    for row in metrics:
+        whole = [str(int(value)) for value in row[:_WHOLE_COLUMNS]]
+        # The metrics are single precision: more digits would be noise.
+        rest = [str(np.float32(value)) for value in row[_WHOLE_COLUMNS:]]
+        lines.append(",".join(whole + rest))
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,91 @@
+"""Ctrl-C and SIGTERM as a flag that long loops look at.
+
+An exception raised by a signal could surface inside a callback of the physics
+and be lost there, or end the interpreter; a flag cannot.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+import signal
+import threading
+from collections.abc import Iterator
+from types import FrameType
+
+INTERRUPTED = 130
+"""Exit code of a run that a signal has ended, as shells count it."""
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_NOTICE = b"\nstopping after this generation, then saving (a second signal quits now)\n"
+
+
+@dataclasses.dataclass
+class StopFlag:
+    """Says whether somebody asked the loop to stop."""
+
+    requested: bool = False
+
+
+@contextlib.contextmanager
+def graceful_stop() -> Iterator[StopFlag]:
+    """Turns SIGINT and SIGTERM into a flag while the block runs.
+
+    A second signal ends the process at once with exit code 130. Outside the main
+    thread Python allows no handlers: then the flag stays unset. A signal that the
+    process was told to ignore stays ignored.
+    """
+    flag = StopFlag()
+    if threading.current_thread() is not threading.main_thread():
+        yield flag
+        return
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        del number, frame
+        flag.requested = True
+
+    previous = {number: signal.getsignal(number) for number in _SIGNALS}
+    active = [n for n in _SIGNALS if previous[n] is not signal.SIG_IGN]
+    with _answer_at_once(active):
+        for number in active:
+            signal.signal(number, handle)
+        try:
+            yield flag
+        finally:
+            for number in active:
+                signal.signal(number, previous[number] or signal.SIG_DFL)
+
+
+@contextlib.contextmanager
+def _answer_at_once(numbers: list[signal.Signals]) -> Iterator[None]:
+    """Lets a thread answer to signals.
+
+    Python runs handlers between two of its own instructions only, which can be a
+    minute away while a compiler works. The thread hears of a signal at once.
+
+    Args:
+        numbers: Signals to answer to.
+    """
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+
+    def listen() -> None:
+        seen = 0
+        while received := os.read(reader, 1):
+            seen += received[0] in numbers
+            if seen > 1:
+                os._exit(INTERRUPTED)
+            if received[0] in numbers:
+                # Not through sys.stderr: its buffer may be in use.
+                with contextlib.suppress(OSError):
+                    os.write(2, _NOTICE)
+        os.close(reader)
+
+    before = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+    threading.Thread(target=listen, name="signals", daemon=True).start()
+    try:
+        yield
+    finally:
+        signal.set_wakeup_fd(before)
+        os.close(writer)  # ends the thread

@@ -1,0 +1,126 @@
+"""Progress of an evolution: one redrawn line on a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import time
+from typing import TextIO
+
+_PLAIN_SECONDS = 10.0
+_REDRAW_SECONDS = 0.1
+_BAR_WIDTH = 20
+_COMPILING_UPDATES = 2  # their time says nothing about the generations to come
+
+
+class Progress:
+    """Shows how far a run is and what it has found.
+
+    Attributes:
+        total: Generations of the whole run.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        total: int,
+        *,
+        stream: TextIO | None = None,
+        enabled: bool = True,
+    ) -> None:
+        """Prepares the display; shows nothing yet.
+
+        Args:
+            name: Label at the beginning of every line.
+            total: Generations of the whole run.
+            stream: Where to write; standard error by default.
+            enabled: ``False`` shows nothing at all.
+        """
+        self.total = total
+        self._name = name
+        self._stream = sys.stderr if stream is None else stream
+        self._enabled = enabled
+        self._tty = enabled and self._stream.isatty()
+        self._begin = time.monotonic()
+        self._updates = 0
+        self._paced_from = (0, self._begin)
+        self._shown_at = -float("inf")
+        self._open_line = False
+
+    def note(self, text: str) -> None:
+        """Writes one plain line, below the bar if there is one."""
+        if not self._enabled:
+            return
+        self.close()
+        self._write(text + "\n")
+
+    def update(self, iteration: int, row: dict[str, float]) -> None:
+        """Shows the state after a generation.
+
+        Args:
+            iteration: Generations that are finished.
+            row: Metrics with ``qd_score``, ``coverage`` [%], ``max_fitness``.
+        """
+        if not self._enabled:
+            return
+        now = time.monotonic()
+        self._updates += 1
+        if self._updates <= _COMPILING_UPDATES:
+            self._paced_from = (iteration, now)
+        pause = _REDRAW_SECONDS if self._tty else _PLAIN_SECONDS
+        if now - self._shown_at < pause and iteration < self.total:
+            return
+        self._shown_at = now
+        text = self._line(iteration, row, now)
+        if self._tty:
+            self._write("\r" + text + "\x1b[K")
+            self._open_line = True
+        else:
+            self._write(text + "\n")
+
+    def close(self) -> None:
+        """Ends the redrawn line so that later text starts on its own line."""
+        if self._open_line:
+            self._write("\n")
+            self._open_line = False
+
+    def _line(self, iteration: int, row: dict[str, float], now: float) -> str:
+        fraction = iteration / self.total if self.total else 1.0
+        first, since = self._paced_from
+        left = None
+        if iteration > first:
+            left = (self.total - iteration) * (now - since) / (iteration - first)
+        head = f"{self._name} {fraction:4.0%}"
+        tail = (
+            f"{iteration}/{self.total}  QD score {row['qd_score']:,.0f}  "
+            f"coverage {row['coverage']:.1f}%  best {row['max_fitness']:.1f}  "
+            f"{_clock(now - self._begin)}<{_clock(left)}"
+        )
+        if not self._tty:
+            return f"{head}  {tail}"
+        # One column is left free: a full line would wrap on some terminals.
+        columns = shutil.get_terminal_size().columns - 1
+        room = columns - len(head) - len(tail) - 3
+        bar = f" {self._bar(fraction, min(room, _BAR_WIDTH))}" if room > 0 else ""
+        return f"{head}{bar}  {tail}"[:columns]
+
+    def _bar(self, fraction: float, width: int) -> str:
+        filled = round(fraction * width)
+        encoding = (self._stream.encoding or "ascii").lower()
+        full, empty = ("█", "░") if "utf" in encoding else ("#", ".")
+        return full * filled + empty * (width - filled)
+
+    def _write(self, text: str) -> None:
+        self._stream.write(text)
+        self._stream.flush()
+
+
+def _clock(seconds: float | None) -> str:
+    """Formats a duration [s] as minutes and seconds."""
+    if seconds is None:
+        return "-:--"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    if hours:
+        return f"{hours}:{minutes:02d}:{rest:02d}"
+    return f"{minutes}:{rest:02d}"

@@ -1,0 +1,82 @@
+"""What an evolution optimizes: an environment, its descriptor and their names."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+from newton_qd.qd.config import ConfigError, EvolveConfig
+
+
+@dataclasses.dataclass(frozen=True)
+class Task:
+    """A Quality-Diversity task.
+
+    Attributes:
+        env: Environment with unbatched ``reset`` and ``step`` and without
+            auto-reset.
+        descriptor_extractor: Maps ``(data, mask)`` to descriptors (N, D), with
+            ``data.state_desc`` (N, T, D) and ``mask`` (N, T) equal to 1 after the
+            end of an episode.
+        limits: Lowest and highest descriptor, (D,) each.
+        labels: D names for the axes of plots.
+        reward_offset: Number per control step that makes returns positive; used by
+            the QD score only.
+    """
+
+    env: Any
+    descriptor_extractor: Callable[[Any, jax.Array], jax.Array]
+    limits: tuple[np.ndarray, np.ndarray]
+    labels: tuple[str, ...]
+    reward_offset: float
+
+    @property
+    def descriptor_length(self) -> int:
+        """Number of components of the descriptor."""
+        return len(self.labels)
+
+
+def make_task(config: EvolveConfig) -> Task:
+    """Creates the registered task of a configuration.
+
+    Args:
+        config: Settings; ``env_name`` and ``episode_length`` matter here.
+
+    Raises:
+        UnknownEnvironment: No environment of this name is registered.
+        ConfigError: The environment has no descriptor.
+    """
+    # The registry imports every environment; the settings alone stay light.
+    import newton_qd
+
+    name = config.env_name
+    if name not in newton_qd.registered_envs():
+        raise newton_qd.UnknownEnvironment(name, newton_qd.registered_envs())
+    tasks = sorted(newton_qd.descriptor_extractor)
+    if name not in tasks:
+        raise ConfigError(
+            f"env_name: {name!r} has no descriptor; evolve takes {', '.join(tasks)}"
+        )
+    env: Any = newton_qd.create(
+        name, episode_length=config.episode_length, auto_reset=False
+    )
+    low, high = (np.asarray(x, np.float32) for x in env.descriptor_limits)
+    return Task(
+        env=env,
+        descriptor_extractor=newton_qd.descriptor_extractor[name],
+        limits=(low, high),
+        labels=_labels(env, len(low)),
+        reward_offset=float(newton_qd.reward_offset[name]),
+    )
+
+
+def _labels(env: Any, length: int) -> tuple[str, ...]:
+    if env.state_descriptor_name == "feet_contact":
+        return tuple(f"{foot} contact" for foot in env.unwrapped.robot.feet)
+    if env.state_descriptor_name == "xy_position" and length == 2:
+        return ("final x [m]", "final y [m]")
+    return tuple(f"descriptor {index + 1}" for index in range(length))

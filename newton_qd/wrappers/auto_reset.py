@@ -1,0 +1,51 @@
+"""Worlds that begin again by themselves."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+
+from newton_qd.envs.base import State, select
+from newton_qd.types import Action, Params, RNGKey
+from newton_qd.wrappers.base import Wrapper
+
+
+class AutoResetWrapper(Wrapper):
+    """Returns a finished world to its first state.
+
+    Where a step is done, the returned simulation state, observation and state
+    descriptor are those of the last explicit reset; reward, done, truncation,
+    metrics, steps and fault are of the step. The next step counts from 0 and clears
+    the fault.
+    """
+
+    def reset(self, rng: RNGKey) -> State:
+        """Begins an episode and remembers its first state."""
+        state = self.env.reset(rng)
+        first = {
+            "first_pipeline_state": state.pipeline_state,
+            "first_obs": state.obs,
+        }
+        if "state_descriptor" in state.info:
+            first["first_state_descriptor"] = state.info["state_descriptor"]
+        return state.replace(info={**state.info, **first})
+
+    def step(self, state: State, action: Action, params: Params = None) -> State:
+        """Advances by one step, then returns the finished worlds."""
+        begins = state.done > 0
+        counters = {key: state.info[key] for key in _COUNTERS if key in state.info}
+        zeros = {key: jnp.zeros_like(value) for key, value in counters.items()}
+        info = {**state.info, **select(begins, zeros, counters)}
+        state = state.replace(done=jnp.zeros_like(state.done), info=info)
+        state = self.env.step(state, action, params)
+        current = {"pipeline_state": state.pipeline_state, "obs": state.obs}
+        if "state_descriptor" in state.info:
+            current["state_descriptor"] = state.info["state_descriptor"]
+        first = {key: state.info[f"first_{key}"] for key in current}
+        returned = select(state.done > 0, first, current)
+        changes = {"pipeline_state": returned.pop("pipeline_state")}
+        return state.replace(
+            obs=returned.pop("obs"), info={**state.info, **returned}, **changes
+        )
+
+
+_COUNTERS = ("steps", "fault")

@@ -1,0 +1,69 @@
+"""The wrapper that changes nothing."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from newton_qd.envs.base import Env, State
+from newton_qd.types import Action, Params, RNGKey
+
+
+class Wrapper(Env):
+    """An environment around another one; forwards what it does not change.
+
+    Attributes:
+        env: The environment inside.
+    """
+
+    def __init__(self, env: Env) -> None:
+        self.env = env
+
+    def reset(self, rng: RNGKey) -> State:
+        """Begins an episode."""
+        return self.env.reset(rng)
+
+    def step(self, state: State, action: Action, params: Params = None) -> State:
+        """Advances by one step."""
+        return self.env.step(state, action, params)
+
+    @property
+    def observation_size(self) -> int:
+        """Length of an observation."""
+        return self.env.observation_size
+
+    @property
+    def action_size(self) -> int:
+        """Length of an action."""
+        return self.env.action_size
+
+    @property
+    def dtype(self) -> np.dtype:
+        """Type of every floating-point array of a state, and of the actions."""
+        return self.env.dtype
+
+    @property
+    def dt(self) -> float:
+        """Duration of a step [s]."""
+        return self.env.dt
+
+    @property
+    def name(self) -> str:
+        """Name of the robot or of the task."""
+        return self.env.name
+
+    @property
+    def unwrapped(self) -> Env:
+        """The environment inside all wrappers."""
+        return self.env.unwrapped
+
+    def __getattr__(self, name: str) -> Any:
+        """Looks in the environment inside: ``batch_size``, descriptors, ``system``."""
+        # Private names stay private, and while a copy is being made ``env`` is not
+        # there yet: asking for it here would never end.
+        if name.startswith("_") or name == "env":
+            raise AttributeError(
+                f"{type(self).__name__!r} object has no attribute {name!r}"
+            )
+        return getattr(self.env, name)

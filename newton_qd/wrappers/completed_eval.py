@@ -1,0 +1,75 @@
+"""Sums over all completed episodes of each world."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+
+from newton_qd.envs.base import State
+from newton_qd.types import Action, Metrics, Params, RNGKey
+from newton_qd.wrappers.base import Wrapper
+from newton_qd.wrappers.evaluation import require_steps, with_reward_metric
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
+class CompletedEvalMetrics:
+    """Sums over completed episodes, world by world.
+
+    Attributes:
+        current_episode_metrics: () sums over the running episode.
+        completed_episodes_metrics: () sums over the completed episodes.
+        completed_episodes: () number of completed episodes.
+        completed_episodes_steps: () their steps together.
+    """
+
+    current_episode_metrics: Metrics
+    completed_episodes_metrics: Metrics
+    completed_episodes: jax.Array
+    completed_episodes_steps: jax.Array
+
+
+class CompletedEvalWrapper(Wrapper):
+    """Sums the metrics of every episode that ends.
+
+    Each world has its own sums, as every leaf of a batched state has the batch axis
+    in front; add them over that axis for the totals of a batch.
+    """
+
+    STATE_INFO_KEY = "completed_eval_metrics"
+
+    def reset(self, rng: RNGKey) -> State:
+        """Begins an episode with empty sums."""
+        state = with_reward_metric(self.env.reset(rng))
+        require_steps(state, type(self).__name__)
+        sums = CompletedEvalMetrics(
+            current_episode_metrics=jax.tree.map(jnp.zeros_like, state.metrics),
+            completed_episodes_metrics=jax.tree.map(jnp.zeros_like, state.metrics),
+            completed_episodes=jnp.zeros_like(state.done),
+            completed_episodes_steps=jnp.zeros_like(state.done),
+        )
+        return state.replace(info={**state.info, self.STATE_INFO_KEY: sums})
+
+    def step(self, state: State, action: Action, params: Params = None) -> State:
+        """Advances by one step; an episode that ends is added to the completed."""
+        sums = state.info[self.STATE_INFO_KEY]
+        if not isinstance(sums, CompletedEvalMetrics):
+            raise ValueError(f"Incorrect type for state_metrics: {type(sums)}")
+        state = with_reward_metric(self.env.step(state, action, params))
+        done = state.done
+        current = jax.tree.map(jnp.add, sums.current_episode_metrics, state.metrics)
+        sums = CompletedEvalMetrics(
+            current_episode_metrics=jax.tree.map(lambda x: x * (1 - done), current),
+            completed_episodes_metrics=jax.tree.map(
+                lambda total, value: total + value * done,
+                sums.completed_episodes_metrics,
+                current,
+            ),
+            completed_episodes=sums.completed_episodes + done,
+            completed_episodes_steps=(
+                sums.completed_episodes_steps + state.info["steps"] * done
+            ),
+        )
+        return state.replace(info={**state.info, self.STATE_INFO_KEY: sums})

@@ -1,0 +1,88 @@
+"""Episodes of a given length."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from newton_qd.envs.base import Env, State
+from newton_qd.types import Action, Params, RNGKey
+from newton_qd.wrappers.base import Wrapper
+
+
+class EpisodeWrapper(Wrapper):
+    """Counts steps, ends long episodes, and repeats actions.
+
+    ``info["steps"]`` counts the control steps of the environment inside; it stands
+    still once a world is at fault. ``info["truncation"]`` is 1 where the length
+    alone ended the episode.
+
+    Attributes:
+        episode_length: Control steps after which an episode ends.
+        action_repeat: Control steps for each action.
+    """
+
+    def __init__(self, env: Env, episode_length: int, action_repeat: int) -> None:
+        for name, value in (
+            ("episode_length", episode_length),
+            ("action_repeat", action_repeat),
+        ):
+            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+                raise ValueError(f"{name}={value!r}: allowed: integers from 1")
+        super().__init__(env)
+        self.episode_length = episode_length
+        self.action_repeat = action_repeat
+
+    def reset(self, rng: RNGKey) -> State:
+        """Begins an episode at step 0."""
+        state = self.env.reset(rng)
+        counts = {
+            "steps": jnp.zeros_like(state.done),
+            "truncation": jnp.zeros_like(state.done),
+        }
+        return state.replace(info={**state.info, **counts})
+
+    def step(self, state: State, action: Action, params: Params = None) -> State:
+        """Repeats the action; the rewards are summed, the rest is of the last."""
+        nstate, steps = state, state.info["steps"]
+        if self.action_repeat == 1:
+            steps = steps + _moving(state)
+            nstate = self.env.step(state, action, params)
+        else:
+            nstate, steps = self._repeat(state, action, params)
+        over = steps >= self.episode_length
+        one = jnp.ones_like(nstate.done)
+        info = {
+            **nstate.info,
+            "steps": steps,
+            "truncation": jnp.where(over, one - nstate.done, jnp.zeros_like(one)),
+        }
+        return nstate.replace(done=jnp.where(over, one, nstate.done), info=info)
+
+    def _repeat(
+        self, state: State, action: Action, params: Params
+    ) -> tuple[State, jax.Array]:
+        def once(
+            carry: tuple[State, jax.Array, jax.Array], _: None
+        ) -> tuple[tuple[State, jax.Array, jax.Array], None]:
+            state, steps, reward = carry
+            nstate = self.env.step(state, action, params)
+            carry = (nstate, steps + _moving(state), reward + nstate.reward)
+            return carry, None
+
+        start = (state, state.info["steps"], jnp.zeros_like(state.reward))
+        last, _ = jax.lax.scan(once, start, None, length=self.action_repeat)
+        nstate, steps, reward = last
+        return nstate.replace(reward=reward), steps
+
+    @property
+    def dt(self) -> float:
+        """Duration of a step: that of all repetitions [s]."""
+        return self.env.dt * self.action_repeat
+
+
+def _moving(state: State) -> jax.Array:
+    """Returns 1 where the next step counts: where the world is not at fault."""
+    if "fault" not in state.info:
+        return jnp.ones_like(state.done)
+    return (state.info["fault"] == 0).astype(state.done.dtype)

@@ -1,0 +1,79 @@
+"""Sums over the first episode of each world."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+
+from newton_qd.envs.base import State
+from newton_qd.types import Action, Metrics, Params, RNGKey
+from newton_qd.wrappers.base import Wrapper
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
+class EvalMetrics:
+    """Sums over the first episode.
+
+    Attributes:
+        episode_metrics: () sum of each metric, the reward among them.
+        active_episodes: () 1 while the first episode lasts, then 0.
+        episode_steps: () length of the episode so far.
+    """
+
+    episode_metrics: Metrics
+    active_episodes: jax.Array
+    episode_steps: jax.Array
+
+
+class EvalWrapper(Wrapper):
+    """Sums the metrics of the first episode after a reset."""
+
+    STATE_INFO_KEY = "eval_metrics"
+
+    def reset(self, rng: RNGKey) -> State:
+        """Begins an episode with empty sums."""
+        state = with_reward_metric(self.env.reset(rng))
+        require_steps(state, type(self).__name__)
+        sums = EvalMetrics(
+            episode_metrics=jax.tree.map(jnp.zeros_like, state.metrics),
+            active_episodes=jnp.ones_like(state.done),
+            episode_steps=jnp.zeros_like(state.done),
+        )
+        return state.replace(info={**state.info, self.STATE_INFO_KEY: sums})
+
+    def step(self, state: State, action: Action, params: Params = None) -> State:
+        """Advances by one step and adds its metrics while the episode lasts."""
+        sums = state.info[self.STATE_INFO_KEY]
+        if not isinstance(sums, EvalMetrics):
+            raise ValueError(f"Incorrect type for state_metrics: {type(sums)}")
+        state = with_reward_metric(self.env.step(state, action, params))
+        active = sums.active_episodes
+        sums = EvalMetrics(
+            episode_metrics=jax.tree.map(
+                lambda total, value: total + value * active,
+                sums.episode_metrics,
+                state.metrics,
+            ),
+            active_episodes=active * (1 - state.done),
+            episode_steps=jnp.where(
+                active > 0, state.info["steps"], sums.episode_steps
+            ),
+        )
+        return state.replace(info={**state.info, self.STATE_INFO_KEY: sums})
+
+
+def with_reward_metric(state: State) -> State:
+    """Returns the state with its reward among the metrics."""
+    return state.replace(metrics={**state.metrics, "reward": state.reward})
+
+
+def require_steps(state: State, wrapper: str) -> None:
+    """Raises where no ``EpisodeWrapper`` counts steps."""
+    if "steps" not in state.info:
+        raise ValueError(
+            f"info['steps'] is missing: {wrapper} needs an EpisodeWrapper inside "
+            "(episode_length given to create)"
+        )

@@ -1,0 +1,79 @@
+"""Feet contact as the state descriptor."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from newton_qd.envs.base import Env, PhysicsEnv, QDEnv, State
+from newton_qd.envs.feet import feet_contact, smooth_feet_contact
+from newton_qd.types import Action, Descriptor, Params, RNGKey
+from newton_qd.wrappers.base import Wrapper
+
+
+class FeetContactWrapper(Wrapper, QDEnv):
+    """Writes which feet touched the ground into ``info["state_descriptor"]``.
+
+    Contacts are impulses over a control step, so after a reset no foot touches.
+    With repeated actions the last repetition counts.
+    """
+
+    def __init__(
+        self, env: Env, env_name: str, smooth_width: float | None = None
+    ) -> None:
+        """Wraps a robot with feet.
+
+        Args:
+            env: The environment.
+            env_name: Its name, for the error.
+            smooth_width: ``None``: 0 or 1 without a gradient; else the width of
+                :func:`~newton_qd.envs.feet.smooth_feet_contact`, above 0.
+        """
+        robot = env.unwrapped
+        if not isinstance(robot, PhysicsEnv) or not len(robot.system.feet):
+            raise NotImplementedError(
+                f"This wrapper does not support {env_name} yet. Allowed: simulated "
+                "robots with feet"
+            )
+        if smooth_width is not None and not smooth_width > 0:
+            raise ValueError(
+                f"smooth_width={smooth_width!r}: allowed: None, or above 0"
+            )
+        super().__init__(env)
+        self._system = robot.system
+        self._smooth_width = smooth_width
+
+    def reset(self, rng: RNGKey) -> State:
+        """Begins an episode."""
+        return self._described(self.env.reset(rng))
+
+    def step(self, state: State, action: Action, params: Params = None) -> State:
+        """Advances by one step."""
+        return self._described(self.env.step(state, action, params))
+
+    def _described(self, state: State) -> State:
+        descriptor = self._read(state)
+        return state.replace(info={**state.info, "state_descriptor": descriptor})
+
+    def _read(self, state: State) -> Descriptor:
+        if self._smooth_width is None:
+            return feet_contact(self._system, state.pipeline_state)
+        return smooth_feet_contact(
+            self._system, state.pipeline_state, self._smooth_width
+        )
+
+    @property
+    def state_descriptor_length(self) -> int:
+        """Number of feet."""
+        return len(self._system.feet)
+
+    @property
+    def state_descriptor_name(self) -> str:
+        """What a state descriptor measures."""
+        return "feet_contact"
+
+    @property
+    def state_descriptor_limits(self) -> tuple[jax.Array, jax.Array]:
+        """Lower and upper limits, (nf,) each."""
+        size = (self.state_descriptor_length,)
+        return jnp.zeros(size, self.dtype), jnp.ones(size, self.dtype)

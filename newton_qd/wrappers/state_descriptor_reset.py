@@ -1,0 +1,33 @@
+"""State descriptors that follow an auto-reset."""
+
+from __future__ import annotations
+
+from newton_qd.envs.base import State, select
+from newton_qd.types import Action, Params, RNGKey
+from newton_qd.wrappers.base import Wrapper
+
+
+class StateDescriptorResetWrapper(Wrapper):
+    """Returns the state descriptor of a finished world to its first value.
+
+    ``AutoResetWrapper`` does so already; this is for worlds that another wrapper
+    resets. The observation stays as it is.
+    """
+
+    def reset(self, rng: RNGKey) -> State:
+        """Begins an episode and remembers its first state descriptor."""
+        state = self.env.reset(rng)
+        if "state_descriptor" not in state.info:
+            raise KeyError(
+                "info['state_descriptor'] is missing: StateDescriptorResetWrapper "
+                "needs a descriptor wrapper inside, such as FeetContactWrapper"
+            )
+        first = state.info["state_descriptor"]
+        return state.replace(info={**state.info, "first_state_descriptor": first})
+
+    def step(self, state: State, action: Action, params: Params = None) -> State:
+        """Advances by one step, then returns the descriptors of finished worlds."""
+        state = self.env.step(state, action, params)
+        first = state.info["first_state_descriptor"]
+        descriptor = select(state.done > 0, first, state.info["state_descriptor"])
+        return state.replace(info={**state.info, "state_descriptor": descriptor})

@@ -1,0 +1,232 @@
+"""The command line: what it accepts, refuses, prints and writes."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_evolve import SMALL, point_task
+
+import newton_qd
+from newton_qd import cli
+from newton_qd.qd.folder import load_archive
+
+# QDax and what it imports warn about their own use of other packages.
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
+
+ROOT = Path(__file__).resolve().parent.parent
+POINT = ["evolve", "point", "--quiet", "--iterations", "3", "--batch-size", "16"]
+POINT += ["--episode-length", "9", "--hidden", "4", "--grid", "4x4"]
+
+
+def call(*arguments: object) -> int:
+    return cli.main([str(a) for a in arguments], task_factory=point_task)
+
+
+def test_evolve_reports_what_it_did(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    assert call(*POINT, "--out", out) == cli.OK
+    captured = capsys.readouterr()
+    assert captured.err == ""
+    assert "point: 64 evaluations in 3 generations" in captured.out
+    assert f"results in {out}" in captured.out
+    settings = json.loads((out / "config.json").read_text())["settings"]
+    assert settings["grid"] == [4, 4] and settings["hidden"] == [4]
+    assert settings["iterations"] == 3 and settings["iso_sigma"] == SMALL.iso_sigma
+
+
+def test_a_config_file_reproduces_the_run(tmp_path: Path) -> None:
+    first, again, other = (tmp_path / name for name in ("first", "again", "other"))
+    assert call(*POINT, "--out", first) == cli.OK
+    config = ["evolve", "--quiet", "--config", first / "config.json"]
+    assert call(*config, "--out", again) == cli.OK
+    for name in ("archive.npz", "archive.png", "metrics.csv", "config.json"):
+        assert (again / name).read_bytes() == (first / name).read_bytes(), name
+    assert call(*config, "--seed", 7, "--centroids", 9, "--out", other) == cli.OK
+    assert len(load_archive(other).fitnesses) == 9
+    settings = json.loads((other / "config.json").read_text())["settings"]
+    assert settings["seed"] == 7 and settings["grid"] is None
+
+
+def test_default_folder_and_resume(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert call(*POINT, "--seed", 3) == cli.OK
+    out = tmp_path / "results" / "point-seed3"
+    before = {entry.name: entry.read_bytes() for entry in out.iterdir()}
+    assert call(*POINT, "--seed", 3) == cli.BAD_ARGUMENTS
+    assert "add --resume" in capsys.readouterr().err
+    # The settings come from the folder, so none need be repeated.
+    assert call("evolve", "--resume", "--quiet", "--out", out) == cli.OK
+    resume = ["evolve", "point", "--resume", "--quiet", "--seed", 3]
+    assert call(*resume) == cli.OK
+    assert call(*resume, "--batch-size", 17) == cli.BAD_ARGUMENTS
+    assert "batch_size: the run in" in capsys.readouterr().err
+    assert call(*resume, "--centroids", 5) == cli.BAD_ARGUMENTS
+    assert {entry.name: entry.read_bytes() for entry in out.iterdir()} == before
+
+
+def test_resume_starts_a_run_that_was_killed_too_early(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    assert call(*POINT, "--resume", "--out", out) == cli.OK
+    assert (out / "archive.npz").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["evolve"], "name an environment"),
+        (["evolve", "--resume"], "name an environment"),
+        (["evolve", "--resume", "--out", "nowhere"], "name an environment"),
+        (["evolve", "ant_unicorn"], "known names: ant, ant_uni"),
+        (["evolve", "ant"], "has no descriptor; evolve takes ant_uni"),
+        (["evolve", "ant_uni", "--batch-size", "0"], "batch_size must be"),
+        (["evolve", "ant_uni", "--seed", "-3"], "seed must be"),
+        (["evolve", "ant_uni", "--grid", "5x5"], "5x5 has 2 dimensions"),
+        (["evolve", "ant_uni", "--iso-sigma", "nan"], "iso_sigma must be"),
+        (["evolve", "ant_uni", "--checkpoint-seconds", "nan"], "checkpoint_seconds"),
+        (["evolve", "--config", "none.json"], "cannot read none.json"),
+    ],
+)
+def test_bad_arguments_write_nothing(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    message: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(arguments) == cli.BAD_ARGUMENTS
+    captured = capsys.readouterr()
+    assert message in captured.err and "results" not in captured.out
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "COMMAND"),
+        (["fly"], "invalid choice: 'fly'"),
+        (["evolve", "ant_uni", "--seed", "one"], "invalid int value: 'one'"),
+        (["evolve", "ant_uni", "--grid", "5,5"], "expected integers like 8x8"),
+        (["evolve", "ant_uni", "--hidden", "8x8"], "expected integers like 8,8"),
+        (["evolve", "a", "--grid", "5x5", "--centroids", "9"], "not allowed with"),
+        (["evolve", "ant_uni", "--bogus"], "--bogus"),
+    ],
+)
+def test_arguments_that_cannot_be_parsed(
+    capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        cli.main(arguments)
+    assert ended.value.code == cli.BAD_ARGUMENTS
+    assert message in capsys.readouterr().err
+
+
+def test_a_damaged_checkpoint_is_a_failure(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    assert call(*POINT, "--out", out) == cli.OK
+    (out / "checkpoint.bin").write_bytes(b"newton_qd checkpoint 1 0\n")
+    assert call("evolve", "--resume", "--quiet", "--out", out) == cli.FAILED
+    assert "checkpoint.bin is damaged" in capsys.readouterr().err
+
+
+def test_a_missing_extra_is_a_failure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "qdax", None)
+    out = tmp_path / "run"
+    assert call(*POINT, "--out", out) == cli.FAILED
+    assert "pip install 'newton_qd[qd]'" in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_a_full_disk_is_a_failure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(descriptor: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    assert call(*POINT, "--out", tmp_path / "run") == cli.FAILED
+    assert "No space left on device" in capsys.readouterr().err
+
+
+def test_help_is_quick_and_light() -> None:
+    code = (
+        "import sys\n"
+        "from newton_qd import cli\n"
+        "try:\n"
+        "    cli.main(['evolve', '--help'])\n"
+        "except SystemExit as ended:\n"
+        "    assert ended.code == 0\n"
+        "heavy = {'jax', 'warp', 'newton', 'qdax', 'matplotlib'} & set(sys.modules)\n"
+        "assert not heavy, heavy\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "--resume" in done.stdout
+
+
+# --- the real thing --------------------------------------------------------
+
+
+def test_envs_lists_every_environment(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["envs"]) == cli.OK
+    table = [line.split() for line in capsys.readouterr().out.splitlines()]
+    rows = {row[0]: row[1:] for row in table[1:]}
+    assert set(rows) == set(newton_qd.registered_envs())
+    assert rows["ant_uni"] == ["87", "8", "feet_contact", "(4)", "3.24"]
+    assert rows["ant"] == ["87", "8", "-", "-"]
+
+
+@pytest.mark.slow
+def test_ant_uni_evolves_and_resumes(tmp_path: Path) -> None:
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    small = ["evolve", "ant_uni", "--quiet", "--batch-size", "16"]
+    small += ["--episode-length", "20", "--iterations", "6"]
+    assert cli.main([*small, "--out", str(whole)]) == cli.OK
+    code = (
+        "import os, signal, sys\n"
+        "from newton_qd import cli\n"
+        "from newton_qd.qd.folder import RunFolder\n"
+        "save = RunFolder.save\n"
+        "def save_and_die(self, checkpoint):\n"
+        "    save(self, checkpoint)\n"
+        "    if checkpoint.iteration == 2:\n"
+        "        os.kill(os.getpid(), signal.SIGKILL)\n"
+        "RunFolder.save = save_and_die\n"
+        "cli.main(sys.argv[1:])\n"
+    )
+    arguments = [*small, "--checkpoint-seconds", "0", "--out", str(parts)]
+    killed = subprocess.run(
+        [sys.executable, "-c", code, *arguments],
+        cwd=ROOT,
+        capture_output=True,
+        check=False,
+        timeout=300,
+    )
+    assert killed.returncode == -9
+    assert not (parts / "archive.npz").exists()
+    assert cli.main(["evolve", "--quiet", "--resume", "--out", str(parts)]) == cli.OK
+    for name in ("archive.npz", "archive.png", "metrics.csv", "config.json"):
+        assert (parts / name).read_bytes() == (whole / name).read_bytes(), name
+    archive = load_archive(parts)
+    assert archive.centroids.shape == (625, 4)
+    assert np.all(archive.descriptors >= 0) and np.all(archive.descriptors <= 1)

@@ -1,0 +1,208 @@
+"""A URDF file or a row that physics cannot run is refused, saying what and where."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from pathlib import Path
+
+import pytest
+from urdf_text import joint, link, row, write
+
+from newton_qd.assets import AssetNotFoundError, find_urdf
+from newton_qd.physics.model import RobotDescriptionError, build_system, load_system
+from newton_qd.robots import ANT, Contact, Robot
+
+ANT_TEXT = find_urdf("ant.urdf").read_text(encoding="utf-8")
+FEET = ("foot_1", "foot_2", "foot_3", "foot_4")
+
+
+def edited(folder: Path, old: str, new: str) -> Robot:
+    """The ant with the first occurrence of a text in its file replaced."""
+    assert old in ANT_TEXT
+    return dataclasses.replace(ANT, urdf=write(folder, ANT_TEXT.replace(old, new, 1)))
+
+
+BAD_FILES = {
+    "not XML": ("</robot>", "</robt>", r"line \d+, in <robot>: malformed XML: mism"),
+    "cut off": ("</robot>", "", r"in <robot>: malformed XML: no element found"),
+    "not a robot": (
+        ANT_TEXT[ANT_TEXT.index("<robot") :],
+        "<sdf/>",
+        r"<sdf>: allowed as the outermost element: <robot>",
+    ),
+    "NaN": ('value="10.0"', 'value="nan"', r"line 18, <mass>: value='nan'; allowed"),
+    "text": ('xyz="0.2 0.2 0.0"', 'xyz="0.2 a 0.0"', r"<origin>: xyz='0.2 a 0.0'"),
+    "short": ('xyz="0.2 0.2 0.0"', 'xyz="0.2 0.0"', r"allowed: 3 finite"),
+    "negative mass": (
+        'value="10.0"',
+        'value="-1"',
+        r"<mass>: value='-1'; allowed: pos",
+    ),
+    "zero mass": ('value="10.0"', 'value="0"', r"<mass>: value='0'; allowed: positive"),
+    "no mass": ('<mass value="10.0"/>', "", r"<inertial>: element <mass> is missing"),
+    "no moment": ('iyy="1.0"', "", r"<inertia>: attribute 'iyy' is missing"),
+    "inertia": ('izz="1.0"', 'izz="3.0"', r"<inertia>: principal moments 1, 1, 3;"),
+    "no radius": ('radius="0.25"', "", r"<sphere>: attribute 'radius' is missing"),
+    "no height": (
+        'height="0.28284272" ',
+        "",
+        r"line \d+, <capsule>: attribute 'height' is missing",
+    ),
+    "two lengths": ('length="0.28284272"', 'length="0.4"', r"must be equal"),
+    "shape": ('<sphere radius="0.25"/>', "<cone/>", r"<geometry>: holds cone; allowed"),
+    "joint type": (
+        'type="revolute"',
+        'type="floating"',
+        r"line 32, <joint name='hip_1'>: type='floating' not supported; allowed: rev",
+    ),
+    "no link": (
+        '<child link="aux_1"/>',
+        '<child link="x"/>',
+        r"child 'x' unknown; lin",
+    ),
+    "second parent": (
+        '<child link="aux_2"/>',
+        '<child link="foot_1"/>',
+        r"link 'foot_1' already has a parent",
+    ),
+    "two trees": (
+        "</robot>",
+        link("stray") + "</robot>",
+        r"2 links without a parent \(torso, stray\)",
+    ),
+    "loop": (
+        "</robot>",
+        link("a")
+        + link("b")
+        + joint("u", "revolute", "a", "b")
+        + joint("w", "revolute", "b", "a")
+        + "</robot>",
+        r"links in a loop: a, b; allowed: one tree",
+    ),
+    "same name": (
+        'name="hip_2"',
+        'name="hip_1"',
+        r"<joint name='hip_1'>: second joint",
+    ),
+    "axis": (
+        '<axis xyz="0.0 0.0 1.0"/>',
+        '<axis xyz="0 0 0"/>',
+        r"<axis>: xyz is zero",
+    ),
+    "limits": ('upper="0.5', 'upper="-1.5', r"<limit>: lower -0.523599 is above upper"),
+    "half a limit": (
+        'lower="-0.5235987755982988"',
+        "",
+        r"<limit>: .*'lower' is missing",
+    ),
+    "damping": ('damping="20.0"', 'damping="-1"', r"<dynamics>: damping=-1; allowed"),
+    "friction": ('damping="20.0"', 'friction="1"', r"joint friction is not supported"),
+    "mimic": ("<dynamics", '<mimic joint="hip_2"/><dynamics', r"<mimic> is not supp"),
+    "massless leaf": (
+        "</robot>",
+        '<link name="tip"/>' + joint("t", "revolute", "torso", "tip") + "</robot>",
+        r"link 'tip' and all that hangs on it have no mass",
+    ),
+    "welded mass": (
+        "</robot>",
+        link("pack") + joint("t", "fixed", "torso", "pack") + "</robot>",
+        r"link 'pack' has mass and is fixed to 'torso'; allowed: give the mass",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD_FILES)
+def test_bad_file(case: str, tmp_path: Path) -> None:
+    old, new, message = BAD_FILES[case]
+    robot = edited(tmp_path, old, new)
+    with pytest.raises(RobotDescriptionError, match=message) as caught:
+        build_system(robot, "float32")
+    assert robot.urdf in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "line 1, outside any element: malformed XML: no element found"),
+        ('<?xml version="1.0" encoding="x"?><robot/>', "unknown encoding: x"),
+        ("<robot/>", "line 1, <robot>: element <link> is missing"),
+        ("<robot><link/></robot>", "line 1, <link>: attribute 'name' is missing"),
+        ('<robot><link name="world"/></robot>', "<robot>: nothing in it moves"),
+    ],
+)
+def test_file_without_a_robot(text: str, message: str, tmp_path: Path) -> None:
+    path = write(tmp_path, text)
+    with pytest.raises(RobotDescriptionError, match=message):
+        build_system(row(path, "torso"), "float32")
+
+
+def changed(**changes: object) -> Robot:
+    return dataclasses.replace(ANT, **changes)
+
+
+def soft(**changes: object) -> Robot:
+    return changed(material=dataclasses.replace(ANT.material, **changes))
+
+
+LINKS = "allowed: torso, aux_1, foot_1, "
+JOINTS = "allowed: hip_1, ankle_1, hip_2, "
+NAN = math.nan
+BAD_ROWS = {
+    "torso": (changed(torso="chest"), f"torso: 'chest' is not in ant.urdf; {LINKS}"),
+    "contact": (
+        changed(contacts=(Contact("x"),), feet=()),
+        f"contacts: 'x' .* {LINKS}",
+    ),
+    "actuator": (changed(actuators=(("x", 1.0),)), f"actuators: 'x' .* {JOINTS}"),
+    "unnamed": (changed(actuators=(("", 1.0),)), f"actuators: '' .* {JOINTS}"),
+    "rest": (changed(rest_pose=(("x", 1.0),)), f"rest_pose: 'x' .* {JOINTS}"),
+    "foot": (changed(feet=("aux_1",)), "feet: 'aux_1' has no contact; allowed: foot_1"),
+    "twice": (changed(feet=FEET + FEET), "feet: foot_1, .* named twice"),
+    "sphere end": (changed(contacts=(Contact("aux_1"),), feet=()), "needs a sphere"),
+    "capsule end": (
+        changed(contacts=(Contact("torso", 1),), feet=()),
+        "end=1 of link 'torso' needs a capsule collider and the link has 0",
+    ),
+    "end": (changed(contacts=(Contact("foot_1", 2),), feet=()), "end=2 .* -1, 0, 1"),
+    "rest in limits": (changed(rest_pose=()), "'ankle_1' rests at 0; allowed: 0.523"),
+    "dt": (changed(dt=NAN), "dt=nan; allowed: finite, > 0"),
+    "no dt": (changed(dt=0.0), "dt=0.0; allowed: finite, > 0"),
+    "gravity": (changed(gravity=-9.8), "gravity=-9.8; allowed: finite, 0 or more"),
+    "substeps": (changed(substeps=0), "substeps=0; allowed: 1, 2"),
+    "half substep": (changed(substeps=2.5), "substeps=2.5; allowed: 1, 2"),
+    "gear": (changed(actuators=(("hip_1", NAN),)), "gear of 'hip_1'=nan; allowed"),
+    "rest NaN": (changed(rest_pose=(("hip_1", NAN),)), "angle of 'hip_1'=nan; allowed"),
+    "height": (changed(rest_height=math.inf), "rest_height=inf; allowed: finite"),
+    "friction": (soft(friction=NAN), "material.friction=nan; allowed: finite, 0 or"),
+    "support": (soft(support=0), "material.support=0; allowed: finite, > 0"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_ROWS)
+def test_bad_row(case: str) -> None:
+    robot, message = BAD_ROWS[case]
+    with pytest.raises(RobotDescriptionError, match=f"robot 'ant', .*{message}"):
+        build_system(robot, "float32")
+
+
+def test_rest_height_without_a_height(tmp_path: Path) -> None:
+    text = f"""<robot name="fixed"><link name="world"/>{link("arm")}
+    {joint("hinge", "revolute", "world", "arm")}</robot>"""
+    path = write(tmp_path, text)
+    assert build_system(row(path, "arm"), "float32").rest_q.tolist() == [0.0]
+    with pytest.raises(RobotDescriptionError, match="no coordinate raises the torso"):
+        build_system(row(path, "arm", rest_height=1.0), "float32")
+
+
+def test_missing_file(tmp_path: Path) -> None:
+    with pytest.raises(AssetNotFoundError, match=r"'nt.urdf'.*allowed: .*ant.urdf"):
+        load_system(changed(urdf="nt.urdf"))
+    absent = tmp_path / "absent.urdf"
+    with pytest.raises(FileNotFoundError, match=re.escape(str(absent))):
+        load_system(changed(urdf=str(absent)))
+    with pytest.raises(AssetNotFoundError):
+        find_urdf(tmp_path)
+    with pytest.raises(AssetNotFoundError):
+        find_urdf("")

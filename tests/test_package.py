@@ -1,0 +1,325 @@
+"""The package as a whole: import arrows, light import, wheel, README."""
+
+from __future__ import annotations
+
+import ast
+import email
+import itertools
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+import tarfile
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import newton_qd
+
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGE = ROOT / "newton_qd"
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+# A module may import those of its own name and those before it.
+LAYERS = (
+    "errors",
+    "types",
+    "assets",
+    "robots",
+    "scenes",
+    "physics",
+    "envs",
+    "wrappers",
+    "extractors",
+    "registry",
+    "__init__",
+)
+# Leaves read every layer, and these leaves.
+LEAVES: dict[str, set[str]] = {
+    "qd": set(),
+    "compat": {"qd"},
+    "viewers": set(),
+    "cli": {"qd", "compat", "viewers"},
+    "__main__": {"cli"},
+}
+# Where a package that is not of the standard library may be imported.
+EVERYWHERE = {"jax", "numpy", "newton_qd"}
+HOMES = {
+    "warp": ("physics/", "viewers/"),
+    "newton": (
+        "physics/model.py",
+        "physics/verify.py",
+        "physics/solver.py",
+        "viewers/",
+    ),
+}
+LEAF_HOMES = ("qd/", "viewers/", "compat/", "cli.py")
+# Never loaded by `import newton_qd`.
+HEAVY = {
+    "brax",
+    "flax",
+    "matplotlib",
+    "mujoco",
+    "newton._src.viewer",
+    "newton.viewer",
+    "qdax",
+    "ribs",
+    "tqdm",
+}
+CORE_DEPENDENCIES = {"jax", "newton", "numpy", "warp-lang"}
+
+
+def modules() -> dict[str, Path]:
+    """Dotted name of every module of the package, and its file."""
+    found = {}
+    for path in sorted(PACKAGE.rglob("*.py")):
+        parts = path.relative_to(ROOT).with_suffix("").parts
+        if parts[-1] == "__init__":
+            parts = parts[:-1]
+        found[".".join(parts)] = path
+    return found
+
+
+MODULES = modules()
+
+
+def imports(name: str) -> Iterator[tuple[int, str]]:
+    """Line and dotted name of everything that a module imports, at any depth."""
+    path = MODULES[name]
+    package = name if path.name == "__init__.py" else name.rpartition(".")[0]
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from ((node.lineno, alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            source = node.module or ""
+            if node.level:
+                above = package.split(".")[: len(package.split(".")) - node.level + 1]
+                source = ".".join([*above, *filter(None, [source])])
+            for alias in node.names:
+                member = f"{source}.{alias.name}"
+                yield node.lineno, member if member in MODULES else source
+
+
+def layer(name: str) -> str:
+    """First name below the package; ``__init__`` for the facade."""
+    return name.split(".")[1] if "." in name else "__init__"
+
+
+def may_import(importer: str, imported: str) -> bool:
+    """Whether an arrow between two layers points the right way."""
+    if importer == imported:
+        return True
+    if importer in LEAVES:
+        return imported in LAYERS or imported in LEAVES[importer]
+    return imported in LAYERS and LAYERS.index(imported) < LAYERS.index(importer)
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_arrows_point_one_way(name: str) -> None:
+    own = layer(name)
+    assert own in LAYERS or own in LEAVES, f"give {name} a place in LAYERS or LEAVES"
+    wrong = [
+        f"{name}:{line} imports {target}"
+        for line, target in imports(name)
+        if target.split(".")[0] == "newton_qd" and not may_import(own, layer(target))
+    ]
+    assert not wrong
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_packages_stay_in_their_home(name: str) -> None:
+    path = MODULES[name].relative_to(PACKAGE).as_posix()
+    wrong = []
+    for line, target in imports(name):
+        root = target.split(".")[0]
+        if root in EVERYWHERE or root in sys.stdlib_module_names:
+            continue
+        if not path.startswith(HOMES.get(root, LEAF_HOMES)):
+            wrong.append(f"{name}:{line} imports {target}")
+        if root == "newton" and ".viewer" in target and not path.startswith("viewers/"):
+            wrong.append(f"{name}:{line} imports {target}")
+    if path.startswith("physics/kernels/"):
+        wrong += [
+            f"{name}:{line} imports {target}; kernels do not know JAX"
+            for line, target in imports(name)
+            if target.split(".")[0] == "jax"
+        ]
+    assert not wrong
+
+
+def test_no_import_cycles() -> None:
+    graph = {
+        name: {target for _, target in imports(name) if target in MODULES} - {name}
+        for name in MODULES
+    }
+    finished: set[str] = set()
+
+    def visit(name: str, path: tuple[str, ...]) -> None:
+        assert name not in path, f"import cycle: {' -> '.join([*path, name])}"
+        if name not in finished:
+            for target in sorted(graph[name]):
+                visit(target, (*path, name))
+            finished.add(name)
+
+    for name in graph:
+        visit(name, ())
+
+
+def run_python(
+    code: str, cwd: Path, **variables: str
+) -> subprocess.CompletedProcess[str]:
+    """Run code in a fresh interpreter in which a warning is an error."""
+    return subprocess.run(
+        [sys.executable, "-W", "error", "-c", code],
+        cwd=cwd,
+        env={**os.environ, **variables},
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+    )
+
+
+def test_import_is_light(tmp_path: Path) -> None:
+    code = "import sys, newton_qd, json; print(json.dumps(sorted(sys.modules)))"
+    cache = tmp_path / "kernels"
+    cache.mkdir()
+    result = run_python(
+        code, tmp_path, PYTHONPATH=str(ROOT), WARP_CACHE_PATH=str(cache)
+    )
+    assert result.returncode == 0, result.stderr
+    # One line: nothing greets the user, Warp's start-up banner included.
+    assert result.stdout.count("\n") == 1, result.stdout
+    assert not HEAVY.intersection(json.loads(result.stdout))
+    assert not list(cache.rglob("*")), "importing compiled or loaded kernels"
+
+
+def test_facade() -> None:
+    names = {
+        "Env",
+        "State",
+        "check",
+        "create",
+        "create_fn",
+        "register",
+        "registered_envs",
+    }
+    assert names <= set(newton_qd.__all__)
+    assert all(hasattr(newton_qd, name) for name in newton_qd.__all__)
+
+
+@pytest.fixture(scope="module")
+def distributions(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with the wheel and the source distribution of this checkout."""
+    folder = tmp_path_factory.mktemp("distributions")
+    subprocess.run(
+        [sys.executable, "-m", "hatchling", "build", "-d", str(folder)],
+        cwd=ROOT,
+        check=True,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        timeout=300,
+    )
+    return folder
+
+
+def urdf_names() -> set[str]:
+    """File names of the suite's robots and scenes."""
+    return {path.name for path in (ROOT / "urdf").glob("*.urdf")}
+
+
+def test_wheel_holds_the_robots(distributions: Path, tmp_path: Path) -> None:
+    (wheel,) = distributions.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        held = {
+            name.removeprefix("newton_qd/urdf/")
+            for name in archive.namelist()
+            if name.startswith("newton_qd/urdf/")
+        }
+        archive.extractall(tmp_path)
+    assert "ant.urdf" in held
+    assert urdf_names() <= held
+    code = "from newton_qd.assets import find_urdf; print(find_urdf('ant.urdf'))"
+    result = run_python(code, tmp_path, PYTHONPATH=str(tmp_path))
+    assert result.returncode == 0, result.stderr
+    found = Path(result.stdout.strip()).resolve()
+    assert found == (tmp_path / "newton_qd" / "urdf" / "ant.urdf").resolve()
+
+
+def test_source_distribution_holds_the_robots(distributions: Path) -> None:
+    (sdist,) = distributions.glob("*.tar.gz")
+    with tarfile.open(sdist) as archive:
+        held = {name.partition("/")[2] for name in archive.getnames()}
+    assert {f"urdf/{name}" for name in urdf_names()} <= held
+    assert {"LICENSE", "README.md", "pyproject.toml"} <= held
+
+
+def test_core_dependencies(distributions: Path) -> None:
+    (wheel,) = distributions.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        (name,) = (n for n in archive.namelist() if n.endswith("/METADATA"))
+        metadata = email.message_from_bytes(archive.read(name))
+        scripts = archive.read(name.replace("METADATA", "entry_points.txt")).decode()
+    required = metadata.get_all("Requires-Dist", [])
+    core = [requirement for requirement in required if "extra ==" not in requirement]
+    assert all(">=" in requirement for requirement in core), "no lower bound"
+    assert {re.split(r"[^\w-]", entry)[0] for entry in core} == CORE_DEPENDENCIES
+    extras = set(metadata.get_all("Provides-Extra", []))
+    assert {"qd", "viz", "docs", "dev", "all"} <= extras
+    assert "newton-qd = newton_qd.cli:main" in scripts
+
+
+def readme_blocks(language: str) -> list[str]:
+    """Code blocks of the README in one language."""
+    return re.findall(rf"^```{language}\n(.*?)^```$", README, re.M | re.S)
+
+
+def readme_commands() -> list[str]:
+    """Commands of the README."""
+    lines = itertools.chain.from_iterable(
+        block.splitlines() for block in readme_blocks("bash")
+    )
+    return [line.strip() for line in lines if line.strip()]
+
+
+def test_ci_runs_the_test_command_of_the_readme() -> None:
+    (command,) = [line for line in readme_commands() if "pytest" in line][:1]
+    script = (ROOT / ".ci" / "run").read_text(encoding="utf-8").splitlines()
+    assert command in script
+
+
+def test_readme_names_commands_that_exist() -> None:
+    from newton_qd import cli
+
+    (command,) = [line for line in readme_commands() if "newton-qd evolve" in line][:1]
+    arguments = shlex.split(command.partition("newton-qd ")[2])
+    with pytest.raises(SystemExit) as ended:
+        cli.main([*arguments, "--help"])
+    assert ended.value.code == 0
+
+
+@pytest.mark.parametrize("index", range(len(readme_blocks("python"))))
+def test_readme_examples_run(index: int) -> None:
+    # A later block goes on where the one before it ended.
+    source = "\n".join(readme_blocks("python")[: index + 1])
+    namespace: dict[str, object] = {}
+    exec(compile(source, "README.md", "exec"), namespace)
+    assert "state" in namespace
+
+
+def test_readme_table_of_environments() -> None:
+    rows = re.findall(
+        r"^\| `(\w+)` \| (\d+) \| (\d+) \| (\d+|-) \|", README, re.MULTILINE
+    )
+    assert {row[0] for row in rows} == set(newton_qd.registered_envs())
+    for name, observation, action, descriptor in rows:
+        env = newton_qd.create(name)
+        assert env.observation_size == int(observation)
+        assert env.action_size == int(action)
+        length = getattr(env, "descriptor_length", None)
+        assert length == (None if descriptor == "-" else int(descriptor))

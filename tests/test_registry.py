@@ -1,0 +1,233 @@
+"""Names, what ``create`` builds from them, the tables, and the errors."""
+
+from __future__ import annotations
+
+import pickle
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import newton_qd
+from newton_qd import registry
+from newton_qd.envs.ant import Ant
+from newton_qd.envs.base import Env
+from newton_qd.extractors import (
+    folded_sum,
+    get_feet_contact_proportion,
+    get_final_xy_position,
+)
+from newton_qd.wrappers import (
+    AutoResetWrapper,
+    CompletedEvalWrapper,
+    EpisodeWrapper,
+    EvalWrapper,
+    FeetContactWrapper,
+    FixedInitialStateWrapper,
+    VectorWrapper,
+)
+
+
+def layers(env: Env) -> list[type]:
+    """Types from the outside to the inside."""
+    found = [type(env)]
+    while "env" in vars(env):
+        env = vars(env)["env"]
+        found.append(type(env))
+    return found
+
+
+@pytest.fixture
+def rows(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Registrations that the test makes are forgotten after it."""
+    monkeypatch.setattr(registry, "_ROWS", dict(registry._ROWS))
+    yield
+
+
+def test_names() -> None:
+    assert newton_qd.registered_envs() == ("ant", "ant_uni")
+
+
+def test_wrappers_are_stacked_in_order() -> None:
+    assert layers(newton_qd.create("ant")) == [AutoResetWrapper, EpisodeWrapper, Ant]
+    everything = newton_qd.create(
+        "ant_uni", batch_size=2, eval_metrics=True, fixed_init_state=True
+    )
+    assert layers(everything) == [
+        CompletedEvalWrapper,
+        EvalWrapper,
+        AutoResetWrapper,
+        VectorWrapper,
+        EpisodeWrapper,
+        FeetContactWrapper,
+        FixedInitialStateWrapper,
+        Ant,
+    ]
+    bare = newton_qd.create("ant", episode_length=None, auto_reset=False, batch_size=0)
+    assert layers(bare) == [Ant]
+
+
+def test_arguments_keep_their_positions() -> None:
+    env: Any = newton_qd.create("ant_uni", 7, 2, True, 3, True, True, [{}])
+    assert (env.episode_length, env.action_repeat, env.batch_size) == (7, 2, 3)
+    assert newton_qd.create("ant").episode_length == 1000  # pyright: ignore
+
+
+def test_keywords_reach_the_environment() -> None:
+    env = newton_qd.create("ant", use_contact_forces=False)
+    assert env.observation_size == 27
+    env = newton_qd.create("ant", exclude_current_positions_from_observation=False)
+    assert env.observation_size == 89
+    with pytest.raises(TypeError, match="legacy_spring"):
+        newton_qd.create("ant", legacy_spring=True)
+
+
+def test_create_fn_is_lazy() -> None:
+    make = newton_qd.create_fn("ant_uni", episode_length=5)
+    assert make(batch_size=2).batch_size == 2  # pyright: ignore
+    newton_qd.create_fn("nothing")
+
+
+@pytest.mark.parametrize("name", ["nothing", "", "Ant", None, 3, ["ant"]])
+def test_unknown_name(name: Any) -> None:
+    with pytest.raises(NotImplementedError) as caught:
+        newton_qd.create(name)
+    message = str(caught.value)
+    assert message.startswith("This environment name does not exist!")
+    assert "ant, ant_uni" in message and repr(name) in message
+    assert isinstance(caught.value, newton_qd.UnknownEnvironment)
+
+
+def test_wrapper_kwargs_must_match_the_wrappers() -> None:
+    newton_qd.create("ant_uni", qdax_wrappers_kwargs=[{}])
+    newton_qd.create("ant", qdax_wrappers_kwargs=[])
+    for given in ([], [{}, {}]):
+        with pytest.raises(ValueError, match=r"entries; .*1 for 'ant_uni' \(FeetCo"):
+            newton_qd.create("ant_uni", qdax_wrappers_kwargs=given)
+    with pytest.raises(ValueError, match=r"1 entries; .*0 for 'ant' \(no wrapper"):
+        newton_qd.create("ant", qdax_wrappers_kwargs=[{}])
+
+
+@pytest.mark.parametrize("options", [{"eval_metrics": True}, {"action_repeat": 2}])
+def test_no_episode_with_what_needs_one(options: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="episode_length=None with"):
+        newton_qd.create("ant", episode_length=None, **options)
+
+
+@pytest.mark.parametrize("dtype", ["float16", "int32", "float"])
+def test_unknown_dtype(dtype: str) -> None:
+    with pytest.raises(ValueError, match=f"{dtype}"):
+        newton_qd.create("ant", dtype=dtype)
+
+
+def test_float64_needs_x64() -> None:
+    with pytest.raises(ValueError, match="float64"):
+        newton_qd.create("ant", dtype="float64")
+
+
+def test_tables_are_columns_of_the_rows() -> None:
+    extractors = newton_qd.behavior_descriptor_extractor
+    assert dict(extractors) == {"ant_uni": get_feet_contact_proportion}
+    assert newton_qd.descriptor_extractor is extractors
+    assert dict(newton_qd.reward_offset) == {"ant_uni": 3.24}
+    assert len(newton_qd.reward_offset) == 1 and "ant" not in newton_qd.reward_offset
+    assert "ant_uni" in repr(newton_qd.reward_offset)
+    with pytest.raises(KeyError, match="'ant' has no reward_offset; known: ant_uni"):
+        newton_qd.reward_offset["ant"]
+
+
+def test_register(rows: None) -> None:
+    newton_qd.register(
+        "my_ant",
+        Ant,
+        base_name="ant",
+        wrappers=[registry.WrapperRow(FeetContactWrapper, {"smooth_width": 0.1})],
+        descriptor_extractor=get_feet_contact_proportion,
+        reward_offset=0.0,
+    )
+    assert newton_qd.registered_envs()[-1] == "my_ant"
+    assert newton_qd.reward_offset["my_ant"] == 0.0
+    assert layers(newton_qd.create("my_ant"))[2] is FeetContactWrapper
+    with pytest.raises(ValueError, match="env_name='my_ant': taken"):
+        newton_qd.register("my_ant", Ant)
+    with pytest.raises(ValueError, match="env_name=''"):
+        newton_qd.register("", Ant)
+    with pytest.raises(TypeError, match="base=3"):
+        newton_qd.register("three", 3)  # pyright: ignore[reportArgumentType]
+
+
+def test_errors_survive_pickling() -> None:
+    for error in (
+        newton_qd.UnknownEnvironment("x", ["ant"]),
+        newton_qd.MissingExtra("qdax", "qd"),
+        newton_qd.FaultError("world 1"),
+    ):
+        again = pickle.loads(pickle.dumps(error))
+        assert str(again) == str(error) and type(again) is type(error)
+
+
+def test_missing_extra_says_the_command() -> None:
+    error = newton_qd.MissingExtra("qdax", "qd")
+    assert isinstance(error, ImportError)
+    assert "pip install 'newton_qd[qd]'" in str(error) and "qdax" in str(error)
+
+
+def test_facade() -> None:
+    for name in newton_qd.__all__:
+        assert getattr(newton_qd, name) is not None
+    assert set(newton_qd.__all__) <= set(dir(newton_qd))
+    with pytest.raises(AttributeError, match="'newton_qd' has no attribute 'nothing'"):
+        newton_qd.nothing  # noqa: B018 # pyright: ignore
+    project = Path(__file__).resolve().parent.parent / "pyproject.toml"
+    declared = tomllib.loads(project.read_text(encoding="utf-8"))["project"]
+    assert newton_qd.__version__ == declared["version"]
+
+
+def episodes() -> tuple[SimpleNamespace, jax.Array]:
+    """Three episodes of 5 steps: whole, ended after 2 steps, ended after 1."""
+    descriptors = jnp.arange(30, dtype=np.float32).reshape(3, 5, 2)
+    mask = jnp.array([[0] * 5, [0, 0, 1, 1, 1], [0, 1, 1, 1, 1]], np.float32)
+    return SimpleNamespace(state_desc=descriptors), mask
+
+
+def test_final_position_is_of_the_last_valid_step() -> None:
+    assert get_final_xy_position(*episodes()).tolist() == [[8, 9], [12, 13], [20, 21]]
+
+
+def test_feet_proportion_is_over_valid_steps() -> None:
+    assert get_feet_contact_proportion(*episodes()).tolist() == [
+        [4.0, 5.0],
+        [11.0, 12.0],
+        [20.0, 21.0],
+    ]
+
+
+@pytest.mark.parametrize("steps", [1, 2, 7, 250])
+def test_descriptors_do_not_depend_on_the_batch(steps: int) -> None:
+    data = jax.random.uniform(jax.random.key(0), (64, steps, 4), np.float32)
+    mask = jnp.zeros((64, steps), np.float32)
+    extract = jax.jit(
+        lambda data, mask: get_feet_contact_proportion(
+            SimpleNamespace(state_desc=data), mask
+        )
+    )
+    batch = np.asarray(extract(data, mask))
+    for world in range(0, 64, 9):
+        one = slice(world, world + 1)
+        assert (
+            np.asarray(extract(data[one], mask[one])).tobytes() == batch[one].tobytes()
+        )
+    np.testing.assert_allclose(batch, np.mean(data, axis=1), rtol=1e-5)
+    assert folded_sum(jnp.zeros((0, 3)), 0).tolist() == [0.0] * 3
+
+
+def test_descriptors_keep_float32_under_x64(x64: None) -> None:
+    data, mask = episodes()
+    assert get_final_xy_position(data, mask).dtype == np.float32
+    assert get_feet_contact_proportion(data, mask > 0).dtype == np.float32

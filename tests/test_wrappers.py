@@ -1,0 +1,347 @@
+"""What each wrapper adds, on an environment that can be reckoned by hand."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import newton_qd
+from newton_qd.envs.ant import Ant
+from newton_qd.envs.base import Env, PhysicsEnv, State
+from newton_qd.envs.feet import feet_contact, load_fraction, smooth_feet_contact
+from newton_qd.physics.system import PhysicsState
+from newton_qd.types import Params
+from newton_qd.wrappers import (
+    AutoResetWrapper,
+    CompletedEvalMetrics,
+    CompletedEvalWrapper,
+    EpisodeWrapper,
+    EvalMetrics,
+    EvalWrapper,
+    FeetContactWrapper,
+    FixedInitialStateWrapper,
+    StateDescriptorResetWrapper,
+    VectorWrapper,
+    Wrapper,
+)
+
+KEY = jax.random.key(0)
+
+
+class Line(Env):
+    """A point on a line: it moves by the action and is done beyond ``end``.
+
+    The reward is the new position; ``params`` is a speed.
+    """
+
+    def __init__(self, end: float = 100.0) -> None:
+        self._end = end
+
+    def reset(self, rng: jax.Array) -> State:
+        position = jax.random.uniform(rng, (), np.float32, 0.0, 0.5)
+        return State(
+            pipeline_state=position,
+            obs=position[None],
+            reward=jnp.zeros((), np.float32),
+            done=jnp.zeros((), np.float32),
+            metrics={"moved": jnp.zeros((), np.float32)},
+            info={
+                "state_descriptor": position[None],
+                "fault": jnp.zeros((), np.int32),
+            },
+        )
+
+    def step(self, state: State, action: jax.Array, params: Params = None) -> State:
+        move = action[0] if params is None else action[0] * params
+        position = state.pipeline_state + move
+        return state.replace(
+            pipeline_state=position,
+            obs=position[None],
+            reward=position,
+            done=(position > self._end).astype(np.float32),
+            metrics={**state.metrics, "moved": move},
+            info={**state.info, "state_descriptor": position[None]},
+        )
+
+    observation_size = 1  # pyright: ignore[reportAssignmentType]
+    action_size = 1  # pyright: ignore[reportAssignmentType]
+    dtype = np.dtype(np.float32)  # pyright: ignore[reportAssignmentType]
+    dt = 0.5  # pyright: ignore[reportAssignmentType]
+    name = "line"  # pyright: ignore[reportAssignmentType]
+
+
+def play(env: Env, steps: int, action: float = 1.0) -> list[State]:
+    """The reset and the states after it."""
+    states = [jax.jit(env.reset)(KEY)]
+    step = jax.jit(env.step)
+    for _ in range(steps):
+        shape = (*states[-1].done.shape, 1)
+        states.append(step(states[-1], jnp.full(shape, action, np.float32)))
+    return states
+
+
+def column(states: list[State], key: str) -> list[float]:
+    return [float(state.info[key]) for state in states[1:]]
+
+
+def test_wrapper_forwards_everything() -> None:
+    line = Line()
+    env = Wrapper(Wrapper(line))
+    assert env.unwrapped is line
+    assert (env.observation_size, env.action_size, env.dt) == (1, 1, 0.5)
+    assert (env.dtype, env.name) == (np.float32, "line")
+    assert Wrapper(VectorWrapper(line, 3)).batch_size == 3
+    for missing in ("colour", "_end", "__setstate__"):
+        with pytest.raises(AttributeError, match=missing):
+            getattr(env, missing)
+    assert copy.copy(env).env is env.env
+    assert pickle.loads(pickle.dumps(env)).env.env.dt == 0.5
+
+
+def test_params_reach_the_environment_through_every_wrapper() -> None:
+    env = EpisodeWrapper(StateDescriptorResetWrapper(Wrapper(Line())), 9, 2)
+    env = CompletedEvalWrapper(EvalWrapper(AutoResetWrapper(VectorWrapper(env, 2))))
+    state = jax.jit(env.reset)(KEY)
+    speed = jnp.array([1.0, 10.0], np.float32)
+    moved = jax.jit(env.step)(state, jnp.ones((2, 1), np.float32), speed)
+    np.testing.assert_allclose(moved.obs - state.obs, [[2.0], [20.0]], rtol=1e-5)
+
+
+@pytest.mark.parametrize("key", [KEY, jax.random.PRNGKey(0)], ids=["typed", "uint32"])
+def test_episode_counts_from_zero(key: jax.Array) -> None:
+    state = EpisodeWrapper(Line(), 3, 1).reset(key)
+    assert state.info["steps"].shape == state.info["truncation"].shape == ()
+    batch = jax.vmap(EpisodeWrapper(Line(), 3, 1).reset)(jax.random.split(key, 4))
+    assert batch.info["steps"].tolist() == [0.0] * 4
+    assert batch.info["truncation"].dtype == np.float32
+
+
+def test_episode_ends_by_its_length() -> None:
+    states = play(AutoResetWrapper(EpisodeWrapper(Line(), 3, 1)), 5)
+    assert column(states, "steps") == [1, 2, 3, 1, 2]
+    assert column(states, "truncation") == [0, 0, 1, 0, 0]
+    assert [float(s.done) for s in states[1:]] == [0, 0, 1, 0, 0]
+    assert states[3].obs == states[0].info["first_obs"]
+
+
+def test_episode_repeats_actions() -> None:
+    env = EpisodeWrapper(Line(), 5, 2)
+    assert env.dt == 1.0
+    states = play(env, 3)
+    assert column(states, "steps") == [2, 4, 6]
+    assert column(states, "truncation") == [0, 0, 1]
+    start = float(states[0].obs[0])
+    np.testing.assert_allclose(states[1].reward, 2 * start + 1 + 2, rtol=1e-6)
+    np.testing.assert_allclose(states[1].obs, [start + 2], rtol=1e-6)
+    assert float(states[1].metrics["moved"]) == 1.0
+
+
+def test_an_end_on_the_last_step_is_no_truncation() -> None:
+    states = play(EpisodeWrapper(Line(end=2.0), 3, 1), 3)
+    assert [float(s.done) for s in states[1:]] == [0, 1, 1]
+    assert column(states, "truncation") == [0, 0, 0]
+
+
+def test_steps_stand_still_at_a_fault() -> None:
+    env = EpisodeWrapper(Line(), 9, 1)
+    state = env.step(env.reset(KEY), jnp.ones(1))
+    broken = state.replace(info={**state.info, "fault": jnp.ones((), np.int32)})
+    assert float(env.step(broken, jnp.ones(1)).info["steps"]) == 1.0
+
+
+@pytest.mark.parametrize("value", [0, -1, 2.5, None, True])
+def test_counts_must_be_positive_integers(value: int) -> None:
+    with pytest.raises(ValueError, match=r"episode_length=.*integers from 1"):
+        EpisodeWrapper(Line(), value, 1)
+    with pytest.raises(ValueError, match=r"action_repeat=.*integers from 1"):
+        EpisodeWrapper(Line(), 5, value)
+    with pytest.raises(ValueError, match=r"batch_size=.*integers from 1"):
+        VectorWrapper(Line(), value)
+
+
+def test_vector_makes_worlds_and_steps_any_number() -> None:
+    env = VectorWrapper(Line(), 3)
+    state = env.reset(KEY)
+    assert env.batch_size == 3
+    assert all(leaf.shape[0] == 3 for leaf in jax.tree.leaves(state))
+    expected = [Line().reset(key).obs for key in jax.random.split(KEY, 3)]
+    assert state.obs.tolist() == jnp.stack(expected).tolist()
+    two = jax.tree.map(lambda x: x[:2], state)
+    assert env.step(two, jnp.ones((2, 1))).obs.shape == (2, 1)
+
+
+def test_auto_reset_returns_to_the_first_state() -> None:
+    states = play(AutoResetWrapper(Line(end=2.0)), 3)
+    first, done = states[0], states[2]
+    assert float(done.done) == 1.0
+    assert float(done.reward) > 2.0
+    assert float(done.metrics["moved"]) == 1.0
+    for part in (done.pipeline_state, done.obs, done.info["state_descriptor"]):
+        assert part == first.pipeline_state
+    assert states[3].obs == states[1].obs
+    assert float(states[3].done) == 0.0
+
+
+def test_auto_reset_is_per_world() -> None:
+    env = AutoResetWrapper(VectorWrapper(Line(end=2.0), 2))
+    state = env.reset(KEY)
+    after = env.step(state, jnp.array([[1.0], [3.0]], np.float32))
+    assert after.done.tolist() == [0, 1]
+    assert after.obs[0] > 1
+    assert after.obs[1] == state.obs[1]
+
+
+def test_auto_reset_clears_the_fault_at_the_next_step() -> None:
+    env = AutoResetWrapper(EpisodeWrapper(Line(end=2.0), 9, 1))
+    state = play(env, 2)[-1]
+    assert float(state.done) == 1.0
+    broken = state.replace(info={**state.info, "fault": jnp.ones((), np.int32)})
+    healed = env.step(broken, jnp.ones(1, np.float32))
+    assert int(healed.info["fault"]) == 0
+    assert healed.info["fault"].dtype == np.int32
+    assert float(healed.info["steps"]) == 1.0
+
+
+def test_state_descriptor_reset_touches_only_the_descriptor() -> None:
+    states = play(StateDescriptorResetWrapper(Line(end=2.0)), 2)
+    assert states[2].info["state_descriptor"] == states[0].info["state_descriptor"]
+    assert states[2].obs > 2.0
+    with pytest.raises(KeyError, match=r"state_descriptor.*FeetContactWrapper"):
+        StateDescriptorResetWrapper(Ant()).reset(KEY)
+
+
+def test_eval_sums_the_first_episode_only() -> None:
+    env = EvalWrapper(AutoResetWrapper(EpisodeWrapper(Line(), 3, 1)))
+    states = play(env, 5)
+    sums = [state.info["eval_metrics"] for state in states]
+    assert isinstance(sums[0], EvalMetrics)
+    assert [float(s.active_episodes) for s in sums] == [1, 1, 1, 0, 0, 0]
+    assert [float(s.episode_steps) for s in sums] == [0, 1, 2, 3, 3, 3]
+    assert [float(s.episode_metrics["moved"]) for s in sums] == [0, 1, 2, 3, 3, 3]
+    expected = sum(float(state.reward) for state in states[1:4])
+    np.testing.assert_allclose(sums[5].episode_metrics["reward"], expected, rtol=1e-6)
+
+
+def test_completed_eval_counts_each_step_once() -> None:
+    env = CompletedEvalWrapper(AutoResetWrapper(EpisodeWrapper(Line(), 3, 1)))
+    states = play(env, 8)
+    sums = [state.info["completed_eval_metrics"] for state in states]
+    assert isinstance(sums[0], CompletedEvalMetrics)
+    episodes = [0, 0, 0, 1, 1, 1, 2, 2, 2]
+    assert [float(s.completed_episodes) for s in sums] == episodes
+    assert [float(s.completed_episodes_steps) for s in sums] == [
+        3 * n for n in episodes
+    ]
+    moved = [float(s.completed_episodes_metrics["moved"]) for s in sums]
+    assert moved == [3.0 * n for n in episodes]
+    running = [float(s.current_episode_metrics["moved"]) for s in sums]
+    assert running == [0, 1, 2, 0, 1, 2, 0, 1, 2]
+
+
+@pytest.mark.parametrize("wrapper", [EvalWrapper, CompletedEvalWrapper])
+def test_eval_refuses_what_it_cannot_sum(
+    wrapper: type[EvalWrapper] | type[CompletedEvalWrapper],
+) -> None:
+    with pytest.raises(ValueError, match=r"steps.*EpisodeWrapper"):
+        wrapper(Line()).reset(KEY)
+    env = wrapper(EpisodeWrapper(Line(), 3, 1))
+    state = env.reset(KEY)
+    state = state.replace(info={**state.info, env.STATE_INFO_KEY: {}})
+    with pytest.raises(ValueError, match=r"Incorrect type for state_metrics.*dict"):
+        env.step(state, jnp.ones(1))
+
+
+def test_eval_leaves_the_old_state_alone() -> None:
+    env = CompletedEvalWrapper(EvalWrapper(EpisodeWrapper(Line(), 3, 1)))
+    state = env.reset(KEY)
+    keys = (set(state.info), set(state.metrics))
+    first = env.step(state, jnp.ones(1))
+    assert (set(state.info), set(state.metrics)) == keys
+    assert env.step(state, jnp.ones(1)).obs == first.obs
+
+
+def test_fixed_initial_state_needs_a_bare_robot() -> None:
+    ant = Ant()
+    state = FixedInitialStateWrapper(ant).reset(KEY)
+    assert state.obs.tolist() == ant.fixed_state().obs.tolist()
+    for other in (Line(), EpisodeWrapper(ant, 3, 1)):
+        with pytest.raises(NotImplementedError, match=r"does not support .* yet"):
+            FixedInitialStateWrapper(other)
+
+
+def physics_with(env: PhysicsEnv, fraction: float) -> PhysicsState:
+    """A state whose feet carried a share of the weight each."""
+    system = env.system
+    weight = system.total_mass * system.robot.gravity * system.robot.dt
+    rest = env.fixed_state().pipeline_state
+    loads = np.zeros(system.nb, np.float32)
+    loads[system.feet] = fraction * weight
+    return PhysicsState(rest.q, rest.v, rest.impulse, jnp.asarray(loads))
+
+
+@pytest.mark.parametrize(
+    ("fraction", "touching"), [(0.0, 0.0), (0.0099, 0.0), (0.0101, 1.0), (3.0, 1.0)]
+)
+def test_feet_touch_above_one_percent_of_the_weight(
+    fraction: float, touching: float
+) -> None:
+    ant = Ant()
+    state = physics_with(ant, fraction)
+    np.testing.assert_allclose(load_fraction(ant.system, state), fraction, rtol=1e-5)
+    contact = feet_contact(ant.system, state)
+    assert contact.tolist() == [touching] * 4
+    assert contact.dtype == np.float32
+    smooth = smooth_feet_contact(ant.system, state, 0.002)
+    expected = 1 / (1 + np.exp(-(fraction - 0.01) / 0.002))
+    np.testing.assert_allclose(smooth, expected, rtol=1e-4)
+
+
+def test_feet_contact_is_a_state_descriptor() -> None:
+    env = FeetContactWrapper(Ant(), "ant")
+    assert (env.state_descriptor_length, env.descriptor_length) == (4, 4)
+    assert env.behavior_descriptor_length == 4
+    assert env.state_descriptor_name == "feet_contact"
+    low, high = env.behavior_descriptor_limits
+    assert (low.tolist(), high.tolist()) == ([0.0] * 4, [1.0] * 4)
+    state = jax.jit(env.reset)(KEY)
+    assert state.info["state_descriptor"].tolist() == [0.0] * 4
+    step = jax.jit(env.step)
+    for _ in range(20):
+        state = step(state, jnp.zeros(8, np.float32))
+    assert state.info["state_descriptor"].tolist() == [1.0] * 4
+
+
+def test_feet_contact_can_be_smooth() -> None:
+    env = newton_qd.create("ant_uni", qdax_wrappers_kwargs=[{"smooth_width": 0.1}])
+    state = jax.jit(env.reset)(KEY)
+    np.testing.assert_allclose(
+        state.info["state_descriptor"], 1 / (1 + np.exp(0.1)), rtol=1e-6
+    )
+    with pytest.raises(ValueError, match=r"smooth_width=0.*above 0"):
+        FeetContactWrapper(Ant(), "ant", smooth_width=0.0)
+    ant = Ant()
+    with pytest.raises(ValueError, match=r"width=-1.*above 0"):
+        smooth_feet_contact(ant.system, ant.fixed_state().pipeline_state, -1.0)
+
+
+def test_feet_contact_needs_feet() -> None:
+    with pytest.raises(NotImplementedError, match="does not support line yet"):
+        FeetContactWrapper(Line(), "line")
+
+
+def test_check_counts_what_it_does_not_name() -> None:
+    faults = np.ones(20, np.int32)
+    state = SimpleNamespace(
+        info={"fault": faults, "steps": np.arange(20.0)},
+        pipeline_state=None,
+        obs=np.zeros((20, 2)),
+        reward=np.zeros(20),
+    )
+    with pytest.raises(newton_qd.FaultError, match="world 7 at step 7 and 12 more"):
+        newton_qd.check(state)  # pyright: ignore[reportArgumentType]
