@@ -220,7 +220,7 @@ def _inspection(system: System, name: str) -> Any:
 
 
 def dynamics(system: System, q: jax.Array, v: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Mass matrix (nv, nv), lower triangle along the tree, and bias forces (nv,)."""
+    """Mass matrix (nv, nv) and bias forces (nv,) of one world."""
     shapes = {"mass_matrix": (1, system.nv, system.nv), "bias": (1, system.nv)}
     outputs = _inspection(system, "dynamics_forward")(q[None], v[None], output_dims=shapes)
     return outputs[0][0], outputs[1][0]

@@ -17,22 +17,15 @@ _PER_BODY = ("pose", "twist_w", "twist_v", "bias_w", "bias_v", "inertia", "momen
 _PER_BODY += ("wrench_w", "wrench_v")
 _PER_CONTACT = ("point", "arm", "normal", "velocity", "load")
 _PER_SOLVE_CONTACT = ("push", "weight_n", "weight_t", "slip")
-_PER_SOLVE_BODY = ("added_ww", "added_wv", "added_vv", "push_w", "push_v")
+_PER_SOLVE_BODY = ("total_ww", "total_wv", "total_vv", "total_w", "total_v")
+_PER_SOLVE_BODY += ("passed_ww", "passed_wv", "passed_vv", "passed_w", "passed_v")
+_PER_SOLVE_BODY += ("lever_w", "lever_v", "effort", "change_w", "change_v")
 _REPORTED = ("impulse", "angular_impulse", "normal_impulse")
 
 
 def _frames_inverse(frames: np.ndarray) -> np.ndarray:
     """Inverse of (n, 7) transforms, position and quaternion xyzw."""
     return np.asarray([wp.transform_inverse(wp.transformd(*f)) for f in frames])
-
-
-def _composite_mass(system: System) -> np.ndarray:
-    """(nb,) mass of each body and its descendants [kg]."""
-    mass = system.mass.copy()
-    for body in range(system.nb - 1, -1, -1):
-        if system.parent[body] >= 0:
-            mass[system.parent[body]] += mass[body]
-    return mass
 
 
 def _with_world(table: np.ndarray) -> np.ndarray:
@@ -66,9 +59,7 @@ def build_model(system: System, device: Any) -> Any:
     model.gravity = robot.gravity
     _put_bodies(put, system, tree, package)
     model.body_levels = len(tree.body_level[0]) - 1
-    model.dof_levels = len(tree.dof_level[0]) - 1
-    model.width = tree.path.shape[1]
-    _put_dofs(put, system, tree)
+    _put_dofs(put, system)
     model.limit_smoothing = material.limit_smoothing
     _put_contacts(put, system, tree, package)
     model.contact_stiffness = system.contact_stiffness
@@ -89,24 +80,20 @@ def _put_bodies(put: Any, system: System, tree: Tree, p: Any) -> None:
     inverse = _frames_inverse(system.child_frame)
     put("child_frame_inverse", _with_world(inverse), p.transform)
     put("mass", _with_world(system.mass), p.real)
-    put("composite_mass", _with_world(_composite_mass(system)), p.real)
     put("com", _with_world(system.com), p.vec3)
     put("inertia", _with_world(system.inertia), p.mat33)
     put("body_level_start", tree.body_level[0], int)
     put("body_level", tree.body_level[1], int)
     put("child_start", tree.child[0], int)
     put("child", tree.child[1], int)
-    put("body_dof", tree.body_dof, int)
 
 
-def _put_dofs(put: Any, system: System, tree: Tree) -> None:
+def _put_dofs(put: Any, system: System) -> None:
     real = SCALARS[system.dtype]
     control = np.full(system.nv, -1, np.int32)
     control[system.control_dof] = np.arange(system.nu)
     gear = np.zeros(system.nv)
     gear[system.control_dof] = system.gear
-    put("dof_body", tree.dof_body, int)
-    put("dof_coordinate", tree.dof_coordinate, int)
     put("dof_control", control, int)
     for name, values in {
         "gear": gear,
@@ -120,12 +107,6 @@ def _put_dofs(put: Any, system: System, tree: Tree) -> None:
         "limit_stiffness": system.limit_stiffness,
     }.items():
         put(name, values, real)
-    put("depth", tree.depth, int)
-    put("path", tree.path.ravel(), int)
-    put("descendant_start", tree.descendant[0], int)
-    put("descendant", tree.descendant[1], int)
-    put("dof_level_start", tree.dof_level[0], int)
-    put("dof_level", tree.dof_level[1], int)
 
 
 def _put_contacts(put: Any, system: System, tree: Tree, p: Any) -> None:
@@ -157,7 +138,6 @@ def build_scratch(
     """
     space = kernels(system.dtype)
     values, adjoints = space.structs.Scratch(), space.structs.Scratch()
-    depth = build_tree(system).path.shape[1]
     n, nc = system.robot.substeps, max(len(system.contact_body), 1)
     steps, solves = (n, 2 * n) if adjoint else (1, 1)
     counts = {
@@ -170,8 +150,7 @@ def build_scratch(
         **dict.fromkeys(_REPORTED, n * nc),
         **dict.fromkeys(_PER_SOLVE_CONTACT, solves * nc),
         **dict.fromkeys(_PER_SOLVE_BODY, solves * (system.nb + 1)),
-        **dict.fromkeys(("H", "L"), solves * system.nv * depth),
-        **dict.fromkeys(("b", "dv"), solves * system.nv),
+        "dv": solves * system.nv,
     }
     size = 0
     for name, count in counts.items():

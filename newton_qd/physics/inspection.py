@@ -92,8 +92,7 @@ def mass_matrix(system: System, q: jax.Array) -> jax.Array:
         ValueError: ``q`` has another shape.
     """
     q = _checked(system, "q", q, system.nq)
-    lower, _ = bridge.dynamics(system, q, jnp.zeros((system.nv,), q.dtype))
-    return lower + lower.T - jnp.diag(jnp.diagonal(lower))
+    return bridge.dynamics(system, q, jnp.zeros((system.nv,), q.dtype))[0]
 
 
 def bias_forces(system: System, q: jax.Array, v: jax.Array) -> jax.Array:

@@ -1,4 +1,4 @@
-"""Tables of a kinematic tree that the kernels walk: levels, paths, descendants."""
+"""Tables of a kinematic tree that the kernels walk: levels, children, contacts."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from newton_qd.physics.system import JointKind, System
+from newton_qd.physics.system import System
 
 
 def _ragged(rows: Sequence[Sequence[int]]) -> tuple[np.ndarray, np.ndarray]:
@@ -33,32 +33,18 @@ class Tree:
         body_parent: (nb + 1,).
         body_level: Level starts and bodies, roots first.
         child: Child starts (nb + 2) and children of each body.
-        body_dof: (nb + 1,) last degree of freedom on the way from the root, or -1.
-        dof_body: (nv,) body that a degree of freedom moves first.
-        dof_coordinate: (nv,) index in ``q``; -1 for the dofs of a free joint.
-        depth: (nv,) number of dofs on the way from the root, itself included.
-        path: (nv, max depth) dofs on the way from the root to the dof; padded by 0.
-        descendant: Starts (nv + 1) and descendants of each dof.
-        dof_level: Level starts and dofs, roots first.
         contact: Starts (nb + 2) of each body's contacts.
     """
 
     body_parent: np.ndarray
     body_level: tuple[np.ndarray, np.ndarray]
     child: tuple[np.ndarray, np.ndarray]
-    body_dof: np.ndarray
-    dof_body: np.ndarray
-    dof_coordinate: np.ndarray
-    depth: np.ndarray
-    path: np.ndarray
-    descendant: tuple[np.ndarray, np.ndarray]
-    dof_level: tuple[np.ndarray, np.ndarray]
     contact: np.ndarray
 
 
 def build_tree(system: System) -> Tree:
     """Index tables of ``system``."""
-    nb, nv = system.nb, system.nv
+    nb = system.nb
     parent = [-1, *(int(p) + 1 for p in system.parent)]
     level = [-1]
     for body in range(1, nb + 1):
@@ -66,38 +52,10 @@ def build_tree(system: System) -> Tree:
     levels = [[b + 1 for b in row] for row in _by_level(level[1:])]
     children = [[c for c in range(1, nb + 1) if parent[c] == b] for b in range(nb + 1)]
 
-    v_end = [*system.v_start[1:], nv]
-    last, dof_body, dof_parent, coordinate = [-1], [], [], []
-    for body in range(1, nb + 1):
-        previous = last[parent[body]]
-        free = system.joint_kind[body - 1] == JointKind.FREE
-        for k in range(system.v_start[body - 1], v_end[body - 1]):
-            dof_body.append(body)
-            dof_parent.append(previous)
-            offset = k - system.v_start[body - 1]
-            coordinate.append(-1 if free else system.q_start[body - 1] + offset)
-            previous = k
-        last.append(previous)
-
-    paths: list[list[int]] = []
-    for k in range(nv):
-        paths.append([*(paths[dof_parent[k]] if dof_parent[k] >= 0 else []), k])
-    depth = [len(path) for path in paths]
-    path_table = np.zeros((nv, max(depth)), np.int32)
-    for k, path in enumerate(paths):
-        path_table[k, : len(path)] = path
-    descendants = [[k for k in range(nv - 1, i, -1) if i in paths[k][:-1]] for i in range(nv)]
     contact_counts = np.bincount(system.contact_body + 1, minlength=nb + 1)
     return Tree(
         body_parent=np.asarray(parent, np.int32),
         body_level=_ragged(levels),
         child=_ragged(children),
-        body_dof=np.asarray(last, np.int32),
-        dof_body=np.asarray(dof_body, np.int32),
-        dof_coordinate=np.asarray(coordinate, np.int32),
-        depth=np.asarray(depth, np.int32),
-        path=path_table,
-        descendant=_ragged(descendants),
-        dof_level=_ragged(_by_level([d - 1 for d in depth])),
         contact=np.asarray([0, *np.cumsum(contact_counts)], np.int32),
     )

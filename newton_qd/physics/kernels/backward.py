@@ -33,6 +33,6 @@ def step_backward(
     slot = slot_first + n * slot_stride
     w = first + n
     load_world(m, sc, g, row_at(m, slot, 1, 0, 0), slot, x, x_bar, w, lane, lanes)
-    simulate(m, sc, g, slot, 1, lane, lanes)
+    simulate(m, sc, slot, 1, lane, lanes)
     detect_fault(m, sc, slot, lane)
     seed_world(m, sc, g, slot, x_bar, w, lane, lanes)

@@ -75,13 +75,9 @@ def contact_predictor(m: Model, sc: Scratch, row: Row, c: int):
 @stage
 def contact_slip(m: Model, sc: Scratch, row: Row, c: int):
     """Change of a contact point's velocity by the row's solve."""
+    at = row.solve_body + load(m.contact_body, c)
     r = load(sc.point, row.contact + c)
-    dv = vec3()
-    last = load(m.body_dof, load(m.contact_body, c))
-    for d in range(load(m.depth, last)):
-        k = load(m.path, last * m.width + d)
-        j = load(sc.axis_v, row.dof + k) + wp.cross(load(sc.axis_w, row.dof + k), r)
-        dv = dv + j * load(sc.dv, row.solve_dof + k)
+    dv = load(sc.change_v, at) + wp.cross(load(sc.change_w, at), r)
     store(sc.slip, row.solve_contact + c, dv)
 
 

@@ -28,6 +28,6 @@ def step_forward(
     slot = slot_first + n * slot_stride
     w = first + n
     load_world(m, sc, sc, row_at(m, slot, 0, 0, 0), slot, x, x, w, lane, lanes)
-    simulate(m, sc, sc, slot, 0, lane, lanes)
+    simulate(m, sc, slot, 0, lane, lanes)
     detect_fault(m, sc, slot, lane)
     store_world(m, sc, slot, x, w, lane, lanes)

@@ -3,8 +3,8 @@
 import warp as wp
 
 from . import real, sync, transform, vec3
-from .dynamics import rigid_momentum
-from .simulate import composite, kinematics
+from .inertia import rigid_inertia
+from .simulate import kinematics
 from .memory import constant, load, store
 from .structs import Model, Row, Scratch, row_at
 
@@ -86,32 +86,101 @@ def adj_seed_poses(m: Model, g: Scratch, row: Row, x_bar: Views, w: int):
 
 
 @wp.func
+def composite(m: Model, sc: Scratch, row: Row, i: int):
+    """Rigid inertia and bias wrench of body ``i`` and its descendants."""
+    at = row.solve_body + i
+    body = row.body + i
+    ww = load(sc.inertia, body)
+    wv = wp.skew(load(sc.moment, body))
+    vv = constant(m.mass, i) * wp.identity(n=3, dtype=real)
+    n = load(sc.wrench_w, body)
+    f = load(sc.wrench_v, body)
+    for j in range(load(m.child_start, i), load(m.child_start, i + 1)):
+        child = row.solve_body + load(m.child, j)
+        ww += load(sc.total_ww, child)
+        wv += load(sc.total_wv, child)
+        vv += load(sc.total_vv, child)
+        n += load(sc.total_w, child)
+        f += load(sc.total_v, child)
+    store(sc.total_ww, at, ww)
+    store(sc.total_wv, at, wv)
+    store(sc.total_vv, at, vv)
+    store(sc.total_w, at, n)
+    store(sc.total_v, at, f)
+
+
+@wp.func
+def dof_count(m: Model, i: int):
+    """Degrees of freedom of joint ``i``."""
+    count = int(1)
+    if load(m.joint_kind, i) == 0:
+        count = 6
+    return count
+
+
+@wp.func
+def dof_axis(m: Model, sc: Scratch, row: Row, i: int, a: int):
+    """Motion (angular, linear) about O of a unit velocity of dof ``a`` of joint ``i``."""
+    w = vec3()
+    v = vec3()
+    if load(m.joint_kind, i) == 0:
+        if a < 3:
+            v[a] = real(1.0)
+        else:
+            w[a - 3] = real(1.0)
+            v = wp.cross(wp.transform_get_translation(load(sc.pose, row.body + i)), w)
+    else:
+        w = load(sc.axis_w, row.dof + load(m.v_start, i))
+        v = load(sc.axis_v, row.dof + load(m.v_start, i))
+    return w, v
+
+
+@wp.func
+def store_body(m: Model, sc: Scratch, row: Row, x: Views, w: int, i: int):
+    """Rows of joint ``i``: M_kj = S_j . I_c S_k (Featherstone 2008, table 6.2)."""
+    at = row.solve_body + i
+    ww = load(sc.total_ww, at)
+    wv = load(sc.total_wv, at)
+    vv = load(sc.total_vv, at)
+    for a in range(dof_count(m, i)):
+        k = load(m.v_start, i) + a
+        sw, sv = dof_axis(m, sc, row, i, a)
+        x.bias[w, k] = wp.dot(sw, load(sc.total_w, at)) + wp.dot(
+            sv, load(sc.total_v, at)
+        )
+        angular = ww * sw + wv * sv
+        linear = wp.transpose(wv) * sw + vv * sv
+        up = int(i)
+        while up > 0:
+            for b in range(dof_count(m, up)):
+                tw, tv = dof_axis(m, sc, row, up, b)
+                j = load(m.v_start, up) + b
+                value = wp.dot(tw, angular) + wp.dot(tv, linear)
+                if j == k:
+                    value += constant(m.armature, k)
+                x.mass_matrix[w, k, j] = value
+                x.mass_matrix[w, j, k] = value
+            up = load(m.body_parent, up)
+
+
+@wp.func
 def store_dynamics(m: Model, sc: Scratch, row: Row, x: Views, w: int):
     """Write the mass matrix and the bias forces of world ``w``."""
-    composite(m, sc, row, 0, 1)
+    for i in range(1, m.nb + 1):
+        rigid_inertia(m, sc, row, i)
+    # children come after their parents
+    for n in range(m.nb):
+        composite(m, sc, row, m.nb - n)
     for k in range(m.nv):
-        i = load(m.dof_body, k)
-        sw = load(sc.axis_w, row.dof + k)
-        sv = load(sc.axis_v, row.dof + k)
-        angular, linear = rigid_momentum(m, sc, row, i, sw, sv)
-        x.bias[w, k] = wp.dot(sw, load(sc.wrench_w, row.body + i)) + wp.dot(
-            sv, load(sc.wrench_v, row.body + i)
-        )
         for j in range(m.nv):
             x.mass_matrix[w, k, j] = real(0.0)
-        for d in range(load(m.depth, k)):
-            j = load(m.path, k * m.width + d)
-            value = wp.dot(load(sc.axis_w, row.dof + j), angular) + wp.dot(
-                load(sc.axis_v, row.dof + j), linear
-            )
-            if j == k:
-                value += constant(m.armature, k)
-            x.mass_matrix[w, k, j] = value
+    for i in range(1, m.nb + 1):
+        store_body(m, sc, row, x, w, i)
 
 
 @wp.kernel(enable_backward=False)
 def dynamics_forward(m: Model, first: int, slot_first: int, slot_stride: int, sc: Scratch, x: Views):
-    """Lower triangle of the mass matrix along the tree, and bias forces."""
+    """Mass matrix and bias forces."""
     n = wp.tid()
     w = first + n
     slot = slot_first + n * slot_stride

@@ -26,12 +26,6 @@ def world_frame(m: Model, sc: Scratch, row: Row):
     store(sc.bias_v, row.body + 0, vec3(real(0.0), real(0.0), m.gravity))
 
 
-@wp.func
-def unit(a: int):
-    """Unit vector of a world axis."""
-    return vec3(real(int(a == 0)), real(int(a == 1)), real(int(a == 2)))
-
-
 @stage
 def free_joint(m: Model, sc: Scratch, row: Row, i: int):
     """Six dofs: velocity of the body origin, then angular velocity, world axes."""
@@ -49,12 +43,6 @@ def free_joint(m: Model, sc: Scratch, row: Row, i: int):
     at = wp.transform_get_translation(x)
     vl = vec3(load(sc.v, row.v + k), load(sc.v, row.v + k + 1), load(sc.v, row.v + k + 2))
     om = vec3(load(sc.v, row.v + k + 3), load(sc.v, row.v + k + 4), load(sc.v, row.v + k + 5))
-    for j in range(3):
-        e = unit(j)
-        store(sc.axis_w, row.dof + k + j, vec3())
-        store(sc.axis_v, row.dof + k + j, e)
-        store(sc.axis_w, row.dof + k + 3 + j, e)
-        store(sc.axis_v, row.dof + k + 3 + j, wp.cross(at, e))
     store(sc.twist_w, row.body + i, om)
     store(sc.twist_v, row.body + i, vl + wp.cross(at, om))
     store(sc.bias_w, row.body + i, vec3())

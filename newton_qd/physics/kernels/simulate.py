@@ -3,10 +3,9 @@
 import warp as wp
 
 from . import stage, sync
+from .articulation import change_free, change_hinge, eliminate_hinge, gather, rest_world
 from .contact import contact_corrector, contact_impulse, contact_predictor, contact_slip
-from .dynamics import equation_row
-from .factorization import solve
-from .inertia import contact_inertia, rigid_inertia
+from .inertia import rigid_inertia
 from .integration import new_coordinates, new_velocity
 from .kinematics import free_joint, hinge_joint, world_frame
 from .memory import load
@@ -31,42 +30,41 @@ def kinematics(m: Model, sc: Scratch, row: Row, lane: int, lanes: int):
 
 
 @stage
-def composite(m: Model, sc: Scratch, row: Row, lane: int, lanes: int):
-    """Rigid inertias and wrenches, leaves to root."""
+def linear_solve(m: Model, sc: Scratch, row: Row, lane: int, lanes: int):
+    """Eliminate joints, leaves to root; velocity changes, root to leaves."""
+    if lane == 0:
+        rest_world(sc, row)
     for n in range(m.body_levels):
         level = m.body_levels - 1 - n
         start = load(m.body_level_start, level)
         for p in range(start + lane, load(m.body_level_start, level + 1), lanes):
-            rigid_inertia(m, sc, row, load(m.body_level, p))
+            i = load(m.body_level, p)
+            gather(m, sc, row, i)
+            if load(m.joint_kind, i) != 0:
+                eliminate_hinge(m, sc, row, i)
         sync()
-
-
-@stage
-def linear_solve(m: Model, sc: Scratch, g: Scratch, row: Row, lane: int, lanes: int):
-    """Contacts as added inertia, leaves to root; rows; solve; contact slip."""
-    for n in range(m.body_levels):
-        level = m.body_levels - 1 - n
+    for level in range(m.body_levels):
         start = load(m.body_level_start, level)
         for p in range(start + lane, load(m.body_level_start, level + 1), lanes):
-            contact_inertia(m, sc, row, load(m.body_level, p))
+            i = load(m.body_level, p)
+            if load(m.joint_kind, i) == 0:
+                change_free(m, sc, row, i)
+            else:
+                change_hinge(m, sc, row, i)
         sync()
-    for k in range(lane, m.nv, lanes):
-        equation_row(m, sc, row, k)
-    sync()
-    solve(m, sc, g, row, lane, lanes)
     for c in range(lane, m.nc, lanes):
         contact_slip(m, sc, row, c)
     sync()
 
 
 @wp.func
-def simulate(
-    m: Model, sc: Scratch, g: Scratch, slot: int, keep: int, lane: int, lanes: int
-):
+def simulate(m: Model, sc: Scratch, slot: int, keep: int, lane: int, lanes: int):
     """All substeps of one world; ``keep`` as in ``row_at``."""
     for s in range(m.substeps):
-        kinematics(m, sc, row_at(m, slot, keep, s, 0), lane, lanes)
-        composite(m, sc, row_at(m, slot, keep, s, 0), lane, lanes)
+        first = row_at(m, slot, keep, s, 0)
+        kinematics(m, sc, first, lane, lanes)
+        for i in range(1 + lane, m.nb + 1, lanes):
+            rigid_inertia(m, sc, first, i)
         # predictor, then corrector
         for p in range(m.passes):
             row = row_at(m, slot, keep, s, p)
@@ -76,7 +74,7 @@ def simulate(
                 else:
                     contact_corrector(m, sc, row, c)
             sync()
-            linear_solve(m, sc, g, row, lane, lanes)
+            linear_solve(m, sc, row, lane, lanes)
         last = row_at(m, slot, keep, s, m.passes - 1)
         for k in range(lane, m.nv, lanes):
             new_velocity(sc, last, k)

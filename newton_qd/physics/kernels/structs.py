@@ -32,7 +32,6 @@ class Model:
     parent_frame: wp.array[transform]
     child_frame_inverse: wp.array[transform]
     mass: wp.array[real]
-    composite_mass: wp.array[real]
     com: wp.array[vec3]
     inertia: wp.array[mat33]
     body_levels: int
@@ -40,10 +39,7 @@ class Model:
     body_level: wp.array[int]
     child_start: wp.array[int]
     child: wp.array[int]
-    body_dof: wp.array[int]  # last degree of freedom on the way from the root, or -1
     # degrees of freedom, (nv)
-    dof_body: wp.array[int]
-    dof_coordinate: wp.array[int]  # index in q, -1 for a free joint
     dof_control: wp.array[int]  # index in ctrl, -1 if not driven
     gear: wp.array[real]
     armature: wp.array[real]
@@ -54,14 +50,6 @@ class Model:
     limit_upper: wp.array[real]
     limit_stiffness: wp.array[real]
     limit_smoothing: real
-    width: int  # entries of a row of path, H and L
-    depth: wp.array[int]  # number of dofs on the way from the root, itself included
-    path: wp.array[int]  # (nv, width): dofs from the root to k
-    descendant_start: wp.array[int]
-    descendant: wp.array[int]
-    dof_levels: int
-    dof_level_start: wp.array[int]
-    dof_level: wp.array[int]
     # contacts, (nc)
     contact_start: wp.array[int]  # (nb + 2)
     contact_body: wp.array[int]
@@ -116,16 +104,24 @@ class Scratch:
     weight_n: wp.array[real]
     weight_t: wp.array[real]
     slip: wp.array[vec3]
-    # bodies, per solve: contact weights as added inertia, and contact push
-    added_ww: wp.array[mat33]
-    added_wv: wp.array[mat33]
-    added_vv: wp.array[mat33]
-    push_w: wp.array[vec3]
-    push_v: wp.array[vec3]
+    # bodies, per solve: inertia and wrench with contacts and descendants, what of
+    # them a joint passes on to the parent, and the change of twist
+    total_ww: wp.array[mat33]
+    total_wv: wp.array[mat33]
+    total_vv: wp.array[mat33]
+    total_w: wp.array[vec3]
+    total_v: wp.array[vec3]
+    passed_ww: wp.array[mat33]
+    passed_wv: wp.array[mat33]
+    passed_vv: wp.array[mat33]
+    passed_w: wp.array[vec3]
+    passed_v: wp.array[vec3]
+    lever_w: wp.array[vec3]
+    lever_v: wp.array[vec3]
+    effort: wp.array[real]
+    change_w: wp.array[vec3]
+    change_v: wp.array[vec3]
     # degrees of freedom, per solve
-    H: wp.array[real]
-    L: wp.array[real]
-    b: wp.array[real]
     dv: wp.array[real]
 
 
@@ -146,7 +142,6 @@ class Row:
     solve_body: int
     solve_dof: int
     solve_contact: int
-    matrix: int
 
 
 @wp.func
@@ -177,5 +172,4 @@ def row_at(m: Model, slot: int, keep: int, s: int, p: int):
     r.solve_body = solve * (m.nb + 1)
     r.solve_dof = solve * m.nv
     r.solve_contact = solve * m.nc
-    r.matrix = solve * m.nv * m.width
     return r

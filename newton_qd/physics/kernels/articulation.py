@@ -1,0 +1,182 @@
+"""One linear solve: the articulated-body algorithm with contacts as added inertia.
+
+Featherstone 2008, section 7.3, in velocity changes: every body's equation is
+``inertia . change = wrench``, leaves hand what their joint cannot take on to their
+parents, and changes come back from the root. All spatial quantities are about O in
+world axes, so nothing is transformed on the way. This is L^T D L along the tree,
+without ever forming the mass matrix; springs, damping and limits of a joint are
+implicit in its new velocity and sit on its diagonal D.
+"""
+
+import warp as wp
+
+from . import mat33, real, stage, vec3
+from .memory import constant, load, store
+from .smooth import gate, penetration
+from .structs import Model, Row, Scratch
+
+
+@wp.func
+def point_weight(sc: Scratch, row: Row, c: int):
+    """3 x 3 weight of a contact: impulse per change of contact velocity [kg]."""
+    n = load(sc.normal, row.contact + c)
+    wt = load(sc.weight_t, row.solve_contact + c)
+    wn = load(sc.weight_n, row.solve_contact + c)
+    return (wn - wt) * wp.outer(n, n) + wt * wp.identity(n=3, dtype=real)
+
+
+@stage
+def gather(m: Model, sc: Scratch, row: Row, i: int):
+    """Inertia and wrench of body ``i``: its own, its contacts', its children's.
+
+    With R = [r]x a contact's weight W adds ww = R^T W R, wv = -(W R)^T, vv = W.
+    """
+    ww = mat33()
+    wv = mat33()
+    vv = mat33()
+    n = vec3()
+    f = vec3()
+    for c in range(load(m.contact_start, i), load(m.contact_start, i + 1)):
+        r = load(sc.point, row.contact + c)
+        weight = point_weight(sc, row, c)
+        cross = wp.skew(r)
+        turned = weight * cross
+        p = load(sc.push, row.solve_contact + c)
+        ww = ww - cross * turned
+        wv = wv - wp.transpose(turned)
+        vv = vv + weight
+        n = n + wp.cross(r, p)
+        f = f + p
+    for j in range(load(m.child_start, i), load(m.child_start, i + 1)):
+        child = row.solve_body + load(m.child, j)
+        ww = ww + load(sc.passed_ww, child)
+        wv = wv + load(sc.passed_wv, child)
+        vv = vv + load(sc.passed_vv, child)
+        n = n + load(sc.passed_w, child)
+        f = f + load(sc.passed_v, child)
+    at = row.solve_body + i
+    body = row.body + i
+    store(sc.total_ww, at, ww + load(sc.inertia, body))
+    store(sc.total_wv, at, wv + wp.skew(load(sc.moment, body)))
+    store(sc.total_vv, at, vv + constant(m.mass, i) * wp.identity(n=3, dtype=real))
+    store(sc.total_w, at, n - m.h * load(sc.wrench_w, body))
+    store(sc.total_v, at, f - m.h * load(sc.wrench_v, body))
+
+
+@stage
+def eliminate_hinge(m: Model, sc: Scratch, row: Row, i: int):
+    """Take the joint's dof out of body ``i``'s equation; pass the rest on."""
+    at = row.solve_body + i
+    k = load(m.v_start, i)
+    h = m.h
+    qk = load(sc.q, row.q + load(m.q_start, i))
+    vk = load(sc.v, row.v + k)
+    # angle predicted at the old velocity: limits are linearised about it
+    ahead = qk + h * vk
+    ks = constant(m.stiffness, k)
+    kl = constant(m.limit_stiffness, k)
+    kd = constant(m.damping, k)
+    width = m.limit_smoothing
+    lower = ahead - constant(m.limit_lower, k)
+    upper = constant(m.limit_upper, k) - ahead
+    force = (
+        kl * (penetration(lower, width) - penetration(upper, width))
+        - ks * (ahead - constant(m.spring_rest, k))
+        - kd * vk
+    )
+    implicit = h * kd + h * h * (ks + kl * (gate(lower, width) + gate(upper, width)))
+    u = load(m.dof_control, k)
+    if u >= 0:
+        force = force + constant(m.gear, k) * load(sc.ctrl, row.ctrl + u)
+
+    sw = load(sc.axis_w, row.dof + k)
+    sv = load(sc.axis_v, row.dof + k)
+    ww = load(sc.total_ww, at)
+    wv = load(sc.total_wv, at)
+    vv = load(sc.total_vv, at)
+    n = load(sc.total_w, at)
+    f = load(sc.total_v, at)
+    uw = ww * sw + wv * sv
+    uv = wp.transpose(wv) * sw + vv * sv
+    d = wp.dot(sw, uw) + wp.dot(sv, uv) + constant(m.armature, k) + implicit
+    inverse = real(1.0) / d
+    effort = h * force + wp.dot(sw, n) + wp.dot(sv, f)
+    scaled_w = inverse * uw
+    scaled_v = inverse * uv
+    store(sc.passed_ww, at, ww - wp.outer(uw, scaled_w))
+    store(sc.passed_wv, at, wv - wp.outer(uw, scaled_v))
+    store(sc.passed_vv, at, vv - wp.outer(uv, scaled_v))
+    store(sc.passed_w, at, n - effort * scaled_w)
+    store(sc.passed_v, at, f - effort * scaled_v)
+    store(sc.lever_w, at, scaled_w)
+    store(sc.lever_v, at, scaled_v)
+    store(sc.effort, at, inverse * effort)
+
+
+@stage
+def rest_world(sc: Scratch, row: Row):
+    """The world does not move."""
+    store(sc.change_w, row.solve_body, vec3())
+    store(sc.change_v, row.solve_body, vec3())
+
+
+@stage
+def change_hinge(m: Model, sc: Scratch, row: Row, i: int):
+    """Change of the joint's velocity and of body ``i``'s twist."""
+    at = row.solve_body + i
+    up = row.solve_body + load(m.body_parent, i)
+    k = load(m.v_start, i)
+    w = load(sc.change_w, up)
+    v = load(sc.change_v, up)
+    dv = (
+        load(sc.effort, at)
+        - wp.dot(load(sc.lever_w, at), w)
+        - wp.dot(load(sc.lever_v, at), v)
+    )
+    store(sc.dv, row.solve_dof + k, dv)
+    store(sc.change_w, at, w + dv * load(sc.axis_w, row.dof + k))
+    store(sc.change_v, at, v + dv * load(sc.axis_v, row.dof + k))
+
+
+@stage
+def change_free(m: Model, sc: Scratch, row: Row, i: int):
+    """Solve a free root's own equation: 6 x 6, by blocks."""
+    at = row.solve_body + i
+    k = load(m.v_start, i)
+    p = wp.transform_get_translation(load(sc.pose, row.body + i))
+    fj = m.h * vec3(
+        free_force(m, sc, row, k),
+        free_force(m, sc, row, k + 1),
+        free_force(m, sc, row, k + 2),
+    )
+    nj = m.h * vec3(
+        free_force(m, sc, row, k + 3),
+        free_force(m, sc, row, k + 4),
+        free_force(m, sc, row, k + 5),
+    )
+    wv = load(sc.total_wv, at)
+    n = load(sc.total_w, at) + nj + wp.cross(p, fj)
+    f = load(sc.total_v, at) + fj
+    inverse = wp.inverse(load(sc.total_vv, at))
+    reduced = wv * inverse
+    w = wp.inverse(load(sc.total_ww, at) - reduced * wp.transpose(wv)) * (
+        n - reduced * f
+    )
+    v = inverse * (f - wp.transpose(wv) * w)
+    store(sc.change_w, at, w)
+    store(sc.change_v, at, v)
+    # the joint's coordinates are the velocity of its origin and the angular velocity
+    origin = v + wp.cross(w, p)
+    for j in range(3):
+        store(sc.dv, row.solve_dof + k + j, origin[j])
+        store(sc.dv, row.solve_dof + k + 3 + j, w[j])
+
+
+@wp.func
+def free_force(m: Model, sc: Scratch, row: Row, k: int):
+    """Force on dof ``k`` of a free joint [N or N m]; none unless it is driven."""
+    force = real(0.0)
+    u = load(m.dof_control, k)
+    if u >= 0:
+        force = constant(m.gear, k) * load(sc.ctrl, row.ctrl + u)
+    return force
