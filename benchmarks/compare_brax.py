@@ -25,6 +25,8 @@ from typing import Any
 
 WORKER = Path(__file__).with_name("worker.py")
 OURS, PEER = "newton_qd", "brax_v1"
+# Average number of running processes above which a measurement is not to be trusted.
+BUSY_LOAD = 0.5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -231,6 +233,9 @@ def main() -> int:
     arguments = parse_arguments()
     chosen = arguments.scenarios or [scenario.name for scenario in SCENARIOS]
     scenarios = [scenario for scenario in SCENARIOS if scenario.name in chosen]
+    load = os.getloadavg()[0]
+    if load > BUSY_LOAD:
+        print(f"warning: the load is {load:.1f}: other processes share the cores")
     pythons = {}
     if not arguments.only_peer:
         pythons[OURS] = arguments.python
@@ -250,7 +255,11 @@ def main() -> int:
     print(table(rows, scenarios))
     if arguments.out:
         result = {
-            "machine": {"platform": platform.platform(), "cores": os.cpu_count()},
+            "machine": {
+                "platform": platform.platform(),
+                "cores": os.cpu_count(),
+                "load_before": load,
+            },
             "libraries": described,
             "repetitions": arguments.repetitions,
             "scenarios": [dataclasses.asdict(scenario) for scenario in scenarios],

@@ -2,21 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from newton_qd.types import Descriptor, Mask
-
-
-class Transitions(Protocol):
-    """What an extractor reads; QDax's ``QDTransition`` has it."""
-
-    @property
-    def state_desc(self) -> jax.Array:
-        """State descriptors before each step (n, t, nd)."""
-        ...
 
 
 def folded_sum(values: jax.Array, axis: int) -> jax.Array:
@@ -42,11 +33,12 @@ def folded_sum(values: jax.Array, axis: int) -> jax.Array:
     return rest[0]
 
 
-def get_final_xy_position(data: Transitions, mask: Mask) -> Descriptor:
+def get_final_xy_position(data: Any, mask: Mask) -> Descriptor:
     """Position before the last valid step of each episode.
 
     Args:
-        data: Transitions with ``state_desc`` (n, t, nd).
+        data: Transitions with ``state_desc`` (n, t, nd), as QDax's ``QDTransition``:
+            state descriptors before each step.
         mask: (n, t) 1 where a step comes after the end of the episode, else 0.
 
     Returns:
@@ -56,11 +48,12 @@ def get_final_xy_position(data: Transitions, mask: Mask) -> Descriptor:
     return jax.vmap(lambda rows, index: rows[index])(data.state_desc, last)
 
 
-def get_feet_contact_proportion(data: Transitions, mask: Mask) -> Descriptor:
+def get_feet_contact_proportion(data: Any, mask: Mask) -> Descriptor:
     """Proportion of the valid steps at which each foot touched the ground.
 
     Args:
-        data: Transitions with ``state_desc`` (n, t, nd).
+        data: Transitions with ``state_desc`` (n, t, nd), as QDax's ``QDTransition``:
+            state descriptors before each step.
         mask: (n, t) 1 where a step comes after the end of the episode, else 0.
 
     Returns:

@@ -6,8 +6,7 @@ import pickle
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -189,11 +188,15 @@ def test_facade() -> None:
     assert newton_qd.__version__ == declared["version"]
 
 
-def episodes() -> tuple[SimpleNamespace, jax.Array]:
+class Data(NamedTuple):
+    state_desc: jax.Array
+
+
+def episodes() -> tuple[Data, jax.Array]:
     """Three episodes of 5 steps: whole, ended after 2 steps, ended after 1."""
     descriptors = jnp.arange(30, dtype=np.float32).reshape(3, 5, 2)
     mask = jnp.array([[0] * 5, [0, 0, 1, 1, 1], [0, 1, 1, 1, 1]], np.float32)
-    return SimpleNamespace(state_desc=descriptors), mask
+    return Data(descriptors), mask
 
 
 def test_final_position_is_of_the_last_valid_step() -> None:
@@ -212,11 +215,7 @@ def test_feet_proportion_is_over_valid_steps() -> None:
 def test_descriptors_do_not_depend_on_the_batch(steps: int) -> None:
     data = jax.random.uniform(jax.random.key(0), (64, steps, 4), np.float32)
     mask = jnp.zeros((64, steps), np.float32)
-    extract = jax.jit(
-        lambda data, mask: get_feet_contact_proportion(
-            SimpleNamespace(state_desc=data), mask
-        )
-    )
+    extract = jax.jit(lambda data, mask: get_feet_contact_proportion(Data(data), mask))
     batch = np.asarray(extract(data, mask))
     for world in range(0, 64, 9):
         one = slice(world, world + 1)

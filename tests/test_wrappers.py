@@ -69,11 +69,25 @@ class Line(Env):
             info={**state.info, "state_descriptor": position[None]},
         )
 
-    observation_size = 1  # pyright: ignore[reportAssignmentType]
-    action_size = 1  # pyright: ignore[reportAssignmentType]
-    dtype = np.dtype(np.float32)  # pyright: ignore[reportAssignmentType]
-    dt = 0.5  # pyright: ignore[reportAssignmentType]
-    name = "line"  # pyright: ignore[reportAssignmentType]
+    @property
+    def observation_size(self) -> int:
+        return 1
+
+    @property
+    def action_size(self) -> int:
+        return 1
+
+    @property
+    def dtype(self) -> np.dtype:
+        return np.dtype(np.float32)
+
+    @property
+    def dt(self) -> float:
+        return 0.5
+
+    @property
+    def name(self) -> str:
+        return "line"
 
 
 def play(env: Env, steps: int, action: float = 1.0) -> list[State]:

@@ -135,11 +135,14 @@ def _angular_changes(system: System, state: PhysicsState) -> jax.Array:
 def _isotropic_inertia(system: System) -> np.ndarray:
     """Returns the one moment of inertia (nb,) of each body [kg m^2]."""
     moment = system.inertia[:, 0, 0]
-    isotropic = moment[:, None, None] * np.eye(3)
-    if not np.allclose(system.inertia, isotropic, rtol=1e-6, atol=0.0):
+    excess = np.abs(system.inertia - moment[:, None, None] * np.eye(3))
+    refused = (excess.max(axis=(1, 2)) > 1e-6 * moment) | (moment <= 0)
+    if np.any(refused):
+        body = int(np.argmax(refused))
         raise ValueError(
-            f"use_contact_forces=True: a body of {system.robot.urdf!r} has an inertia "
-            "that depends on the axis; allowed: False, or isotropic inertias"
+            f"use_contact_forces=True: link {system.body_names[body]!r} of "
+            f"{system.robot.urdf!r} has the inertia {system.inertia[body].tolist()}; "
+            "allowed: False, or inertias that are positive and equal about every axis"
         )
     return moment
 

@@ -213,18 +213,18 @@ class PhysicsEnv(Env):
                 "allowed: None"
             )
         action = self._checked_action(action)
-        # Double where: what is not finite enters neither the physics nor a product,
-        # so that the zero gradient of a faulty world is not 0 * nan.
+        # The physics freezes a world at fault and passes no gradient through it; a
+        # world that was at fault before is handed over as one. The outcome sees zeros
+        # instead, so that its zero gradient is not 0 * nan (double where).
         start: PhysicsState = state.pipeline_state
-        sound = _all_finite(start.q) & _all_finite(start.v)
-        start = select(sound, start, self._rest())
-        sound &= _all_finite(action) & (state.info["fault"] == 0)
-        action = jnp.where(sound, action, jnp.zeros_like(action))
-        after, fault = physics.step(self.system, start, action)
-        fault = jnp.where(sound, fault, jnp.maximum(state.info["fault"], 1))
-        frozen = physics.initial_state(self.system, start.q, start.v)
+        sound = _all_finite(action) & (state.info["fault"] == 0)
+        nan = jnp.full_like(action, jnp.nan)
+        after, fault = physics.step(
+            self.system, start, jnp.where(sound, action, nan)
+        )
+        fault = jnp.maximum(state.info["fault"], fault)
         faulty = fault != 0
-        after = select(faulty, jax.lax.stop_gradient(frozen), after)
+        action = jnp.where(sound, action, jnp.zeros_like(action))
         reward, done, metrics = self._outcome(start, after, action)
         reward, metrics = select(
             faulty, jax.tree.map(jnp.zeros_like, (reward, metrics)), (reward, metrics)

@@ -11,6 +11,8 @@ from collections.abc import Iterator
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 import warp as wp
 from warp._src.jax.ffi import FfiCallable
 
@@ -41,89 +43,66 @@ def _errors_contained() -> Iterator[None]:
         raise RuntimeError(f"interrupted inside the physics: {error!r}") from error
 
 
-def _callable(function: Any, outputs: int, module: Any) -> Any:
-    """Register a function that launches kernels of ``module`` as an XLA custom call."""
+@functools.cache
+def _kernel_call(system: System, module: str, name: str, size: int) -> Any:
+    """A kernel as a function of contiguous rows.
+
+    Args:
+        system: The system.
+        module: Module of :mod:`newton_qd.physics.kernels`.
+        name: Kernel; one that ends in ``_backward`` runs its adjoint, and takes the
+            adjoints of the outputs as a second argument.
+        size: Length of a row of the first argument.
+
+    Returns:
+        Function of one world's rows that returns a tuple of one row; its
+        ``output_dims`` says how long. Under ``vmap`` the worlds share one launch.
+    """
+    real = SCALARS[system.dtype]
+    loaded = getattr(kernels(system.dtype), module)
+    kernel = getattr(loaded, name)
+
+    def forward(x: wp.array(dtype=real), y: wp.array(dtype=real)):
+        with _errors_contained():
+            device = launcher(system, x.device)
+            device.launch(kernel, x.shape[0] // size, x, y)
+
+    def backward(
+        x: wp.array(dtype=real),
+        y_bar: wp.array(dtype=real),
+        x_bar: wp.array(dtype=real),
+    ):
+        with _errors_contained():
+            device = launcher(system, x.device)
+            device.launch(kernel, x.shape[0] // size, x, y_bar, x_bar, adjoint=True)
+
+    function = backward if name.endswith("_backward") else forward
+    function.__name__ = function.__qualname__ = name
     # Warp loads the module of the function when a call is traced: the kernels' one
-    function.__module__ = module.__name__
+    function.__module__ = loaded.__name__
     return wp.jax_callable(
         function,
-        num_outputs=outputs,
+        num_outputs=1,
         vmap_method="broadcast_all",
         graph_mode=wp.JaxCallableGraphMode.NONE,
     )
 
 
-def _fill(struct: Any, **arrays: Any) -> Any:
-    """Set the named arrays of a Warp struct."""
-    for name, array in arrays.items():
-        setattr(struct, name, array)
-    return struct
+def _differentiable(forward: Any, backward: Any, size: int, output_size: int) -> Any:
+    """Reverse-mode function of one row, from two kernels."""
 
+    @jax.custom_vjp
+    def run(x: jax.Array) -> jax.Array:
+        return forward(x, output_dims=output_size)[0]
 
-@functools.cache
-def _forward_call(system: System) -> Any:
-    real = SCALARS[system.dtype]
-    world = kernels(system.dtype).world
+    def run_forward(x: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return run(x), x
 
-    def step_forward(
-        q: wp.array2d(dtype=real),
-        v: wp.array2d(dtype=real),
-        ctrl: wp.array2d(dtype=real),
-        q_new: wp.array2d(dtype=real),
-        v_new: wp.array2d(dtype=real),
-        impulse: wp.array3d(dtype=real),
-        normal_impulse: wp.array2d(dtype=real),
-        fault: wp.array1d(dtype=real),
-    ):
-        values = _fill(
-            world.Values(),
-            q=q,
-            v=v,
-            ctrl=ctrl,
-            q_new=q_new,
-            v_new=v_new,
-            impulse=impulse,
-            normal_impulse=normal_impulse,
-            fault=fault,
-        )
-        with _errors_contained():
-            launcher(system, q.device).forward(q.shape[0], values)
+    def run_backward(x: jax.Array, y_bar: jax.Array) -> tuple[jax.Array]:
+        return (backward(x, y_bar, output_dims=size)[0],)
 
-    return _callable(step_forward, 5, kernels(system.dtype).forward)
-
-
-@functools.cache
-def _backward_call(system: System) -> Any:
-    real = SCALARS[system.dtype]
-    world = kernels(system.dtype).world
-
-    def step_backward(
-        q: wp.array2d(dtype=real),
-        v: wp.array2d(dtype=real),
-        ctrl: wp.array2d(dtype=real),
-        q_new_bar: wp.array2d(dtype=real),
-        v_new_bar: wp.array2d(dtype=real),
-        impulse_bar: wp.array3d(dtype=real),
-        normal_impulse_bar: wp.array2d(dtype=real),
-        q_bar: wp.array2d(dtype=real),
-        v_bar: wp.array2d(dtype=real),
-        ctrl_bar: wp.array2d(dtype=real),
-    ):
-        adjoints = _fill(
-            world.Values(),
-            q=q_bar,
-            v=v_bar,
-            ctrl=ctrl_bar,
-            q_new=q_new_bar,
-            v_new=v_new_bar,
-            impulse=impulse_bar,
-            normal_impulse=normal_impulse_bar,
-        )
-        values = _fill(world.Values(), q=q, v=v, ctrl=ctrl)
-        with _errors_contained():
-            launcher(system, q.device).backward(q.shape[0], values, adjoints)
-
-    return _callable(step_backward, 3, kernels(system.dtype).backward)
+    run.defvjp(run_forward, run_backward)
+    return run
 
 
 @functools.cache
@@ -140,114 +119,48 @@ def control_step(system: System) -> Any:
         mode once, no forward mode. Under ``vmap`` the worlds share one launch.
     """
     interrupts.install()
-    forward, backward = _forward_call(system), _backward_call(system)
-    shapes = {
-        "q_new": (1, system.nq),
-        "v_new": (1, system.nv),
-        "impulse": (1, system.nb, 6),
-        "normal_impulse": (1, system.nb),
-        "fault": (1,),
-    }
-    bar_shapes = {
-        "q_bar": (1, system.nq),
-        "v_bar": (1, system.nv),
-        "ctrl_bar": (1, system.nu),
-    }
+    nq, nv, nb = system.nq, system.nv, system.nb
+    size, output_size = nq + nv + system.nu, nq + nv + 7 * nb + 1
+    step = _differentiable(
+        _kernel_call(system, "forward", "step_forward", size),
+        _kernel_call(system, "backward", "step_backward", size),
+        size,
+        output_size,
+    )
+    ends = np.cumsum([nq, nv, 6 * nb, nb])
 
-    @jax.custom_vjp
     def run(q: jax.Array, v: jax.Array, control: jax.Array) -> tuple[jax.Array, ...]:
-        outputs = forward(q[None], v[None], control[None], output_dims=shapes)
-        return tuple(output[0] for output in outputs)
+        y = step(jnp.concatenate([q, v, control]))
+        q, v, impulse, normal_impulse, fault = jnp.split(y, ends)
+        return q, v, impulse.reshape(nb, 6), normal_impulse, fault[0]
 
-    def run_forward(q: jax.Array, v: jax.Array, control: jax.Array) -> Any:
-        return run(q, v, control), (q, v, control)
-
-    def run_backward(inputs: Any, bars: Any) -> tuple[jax.Array, ...]:
-        # the fault is a flag and has no adjoint
-        arrays = [x[None] for x in (*inputs, *bars[:-1])]
-        outputs = backward(*arrays, output_dims=bar_shapes)
-        return tuple(output[0] for output in outputs)
-
-    run.defvjp(run_forward, run_backward)
     return run
-
-
-@functools.cache
-def _inspection(system: System, name: str) -> Any:
-    """A kernel of ``kernels.inspect`` as a function of (worlds, nq) and (worlds, nv)."""
-    real = SCALARS[system.dtype]
-    inspect = kernels(system.dtype).inspect
-
-    def launch(q: Any, **arrays: Any) -> None:
-        views = _fill(inspect.Views(), q=q, **arrays)
-        with _errors_contained():
-            kernel = getattr(inspect, name)
-            launcher(system, q.device).inspect(kernel, q.shape[0], views)
-
-    def dynamics_forward(
-        q: wp.array2d(dtype=real),
-        v: wp.array2d(dtype=real),
-        mass_matrix: wp.array3d(dtype=real),
-        bias: wp.array2d(dtype=real),
-    ):
-        launch(q, v=v, mass_matrix=mass_matrix, bias=bias)
-
-    def kinematics_forward(
-        q: wp.array2d(dtype=real),
-        v: wp.array2d(dtype=real),
-        pose: wp.array3d(dtype=real),
-        twist: wp.array3d(dtype=real),
-    ):
-        launch(q, v=v, pose=pose, twist=twist)
-
-    def kinematics_backward(
-        q: wp.array2d(dtype=real),
-        v: wp.array2d(dtype=real),
-        pose_bar: wp.array3d(dtype=real),
-        twist_bar: wp.array3d(dtype=real),
-        q_bar: wp.array2d(dtype=real),
-        v_bar: wp.array2d(dtype=real),
-    ):
-        views = _fill(inspect.Views(), q=q, v=v)
-        bars = _fill(inspect.Views(), q=q_bar, v=v_bar, pose=pose_bar, twist=twist_bar)
-        with _errors_contained():
-            kernel = inspect.kinematics_backward
-            launcher(system, q.device).inspect(kernel, q.shape[0], views, bars)
-
-    functions = (dynamics_forward, kinematics_forward, kinematics_backward)
-    function = {f.__name__: f for f in functions}[name]
-    return _callable(function, 2, inspect)
-
-
-def dynamics(system: System, q: jax.Array, v: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Mass matrix (nv, nv) and bias forces (nv,) of one world."""
-    shapes = {"mass_matrix": (1, system.nv, system.nv), "bias": (1, system.nv)}
-    outputs = _inspection(system, "dynamics_forward")(q[None], v[None], output_dims=shapes)
-    return outputs[0][0], outputs[1][0]
 
 
 @functools.cache
 def kinematics(system: System) -> Any:
     """Differentiable poses (nb, 7) and twists (nb, 6) about O of one world."""
-    shapes = {"pose": (1, system.nb, 7), "twist": (1, system.nb, 6)}
-    bar_shapes = {"q_bar": (1, system.nq), "v_bar": (1, system.nv)}
+    size, output_size = system.nq + system.nv, 13 * system.nb
+    views = _differentiable(
+        _kernel_call(system, "inspect", "kinematics_forward", size),
+        _kernel_call(system, "inspect", "kinematics_backward", size),
+        size,
+        output_size,
+    )
 
-    @jax.custom_vjp
     def run(q: jax.Array, v: jax.Array) -> tuple[jax.Array, jax.Array]:
-        call = _inspection(system, "kinematics_forward")
-        pose, twist = call(q[None], v[None], output_dims=shapes)
-        return pose[0], twist[0]
+        y = views(jnp.concatenate([q, v])).reshape(system.nb, 13)
+        return y[:, :7], y[:, 7:]
 
-    def run_forward(q: jax.Array, v: jax.Array) -> Any:
-        return run(q, v), (q, v)
-
-    def run_backward(inputs: Any, bars: Any) -> tuple[jax.Array, ...]:
-        call = _inspection(system, "kinematics_backward")
-        arrays = [x[None] for x in (*inputs, *bars)]
-        return tuple(bar[0] for bar in call(*arrays, output_dims=bar_shapes))
-
-    run.defvjp(run_forward, run_backward)
     return run
+
+
+def dynamics(system: System, q: jax.Array, v: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Mass matrix (nv, nv) and bias forces (nv,) of one world."""
+    nv = system.nv
+    call = _kernel_call(system, "inspect", "dynamics_forward", system.nq + nv)
+    y = call(jnp.concatenate([q, v]), output_dims=nv * (nv + 1))[0]
+    return y[: nv * nv].reshape(nv, nv), y[nv * nv :]
 
 
 interrupts.protect(FfiCallable.ffi_callback)

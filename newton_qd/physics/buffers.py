@@ -57,6 +57,7 @@ def build_model(system: System, device: Any) -> Any:
     model.substeps, model.passes = robot.substeps, 2
     model.h = robot.dt / robot.substeps
     model.gravity = robot.gravity
+    put("rest_q", system.rest_q, package.real)
     _put_bodies(put, system, tree, package)
     model.body_levels = len(tree.body_level[0]) - 1
     _put_dofs(put, system)

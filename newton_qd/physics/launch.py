@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -14,7 +15,7 @@ from newton_qd.physics.precision import kernels
 from newton_qd.physics.system import System
 
 LANES = (1, 2, 4, 8, 16, 32)
-_BLOCK = 128
+_GPU_BLOCK = 128
 _MIN_WORLDS_PER_THREAD = 4
 _RESIDENT_WORLDS = 16384
 
@@ -48,11 +49,10 @@ def lane_count(worlds: int) -> int:
 
 
 class Launcher:
-    """The step of one system on one device.
+    """The kernels of one system on one device.
 
-    Scratch memory is allocated once per number of threads (CPU) or worlds in flight
-    (GPU) and reused; on a GPU launches of one stream follow each other, so they can
-    share it.
+    Scratch memory and launch commands are made once per thread (CPU) or stream (GPU)
+    and reused; launches of one stream follow each other, so they can share it.
     """
 
     def __init__(self, system: System, device: Any) -> None:
@@ -60,130 +60,138 @@ class Launcher:
         self.device = device
         self.kernels = kernels(system.dtype)
         self.model = buffers.build_model(system, device)
-        self._scratch: dict[tuple[bool, Any], Any] = {}
+        self._scratch: dict[tuple[bool, Any], tuple[int, Any]] = {}
+        self._commands: dict[tuple[str, Any], Any] = {}
         self._pool: ThreadPoolExecutor | None = None
         self._lock = threading.Lock()
 
-    def forward(self, worlds: int, values: Any) -> None:
-        """One control step of ``worlds`` worlds.
+    def forward(self, worlds: int, x: Any, y: Any) -> None:
+        """One control step; rows as :mod:`~newton_qd.physics.kernels.world` says.
 
         Args:
             worlds: Number of worlds.
-            values: Struct ``Values`` with inputs and outputs.
+            x: (worlds * inputs,) Warp array to read.
+            y: (worlds * outputs,) Warp array to write.
         """
-        kernel = self.kernels.forward.step_forward
+        self.launch(self.kernels.forward.step_forward, worlds, x, y)
 
-        def launch(
-            scratch: Any, count: int, first: int, slot: int, stride: int, lanes: int
-        ) -> None:
-            wp.launch(
-                kernel,
-                dim=count * lanes,
-                inputs=[self.model, first, slot, stride, lanes, scratch.values, values],
-                device=self.device,
-                block_dim=_BLOCK,
-            )
-
-        self._run(launch, worlds, adjoint=False)
-
-    def backward(self, worlds: int, values: Any, adjoints: Any) -> None:
+    def backward(self, worlds: int, x: Any, y_bar: Any, x_bar: Any) -> None:
         """Adjoint of one control step.
 
         Args:
             worlds: Number of worlds.
-            values: Struct ``Values`` with the inputs.
-            adjoints: Struct ``Values``: adjoints of the outputs, and where to
-                write those of the inputs.
+            x: (worlds * inputs,) Warp array to read.
+            y_bar: (worlds * outputs,) adjoints of the outputs, to read.
+            x_bar: (worlds * inputs,) adjoints of the inputs, to write.
         """
         kernel = self.kernels.backward.step_backward
-        structs = self.kernels.structs
-        # adjoints travel through the scratch and ``adjoints``, not through Warp's
-        unused: list[Any] = [structs.Model(), 0, 0, 0, 0]
-        unused += [structs.Scratch(), structs.Scratch(), type(values)(), type(values)()]
+        self.launch(kernel, worlds, x, y_bar, x_bar, adjoint=True)
 
-        def launch(
-            scratch: Any, count: int, first: int, slot: int, stride: int, lanes: int
-        ) -> None:
-            inputs = [self.model, first, slot, stride, lanes]
-            inputs += [scratch.values, scratch.adjoints, values, adjoints]
-            wp.launch(
-                kernel,
-                dim=count * lanes,
-                inputs=inputs,
-                adj_inputs=unused,
-                adjoint=True,
-                device=self.device,
-                block_dim=_BLOCK,
-            )
-
-        self._run(launch, worlds, adjoint=True)
-
-    def inspect(self, kernel: Any, worlds: int, *views: Any) -> None:
-        """Run a kernel of :mod:`~newton_qd.physics.kernels.inspect`, one lane a world.
+    def launch(
+        self, kernel: Any, worlds: int, *arrays: Any, adjoint: bool = False
+    ) -> None:
+        """Run a kernel, or its adjoint, on all worlds.
 
         Args:
-            kernel: ``dynamics_forward``, ``kinematics_forward``, or
-                ``kinematics_backward``, whose adjoint is run.
+            kernel: One whose arguments are the model, first world, slot stride, lanes,
+                scratch (and its adjoint), then ``arrays``.
             worlds: Number of worlds.
-            *views: Struct ``Views``; for the adjoint, a second one with adjoints.
+            *arrays: Warp arrays with a contiguous row per world.
+            adjoint: Whether the kernel's adjoint is run.
         """
-        adjoint = len(views) == 2
-        structs = self.kernels.structs
-
-        def launch(
-            scratch: Any, count: int, first: int, slot: int, stride: int, lanes: int
-        ) -> None:
-            held = [scratch.values, *([scratch.adjoints] if adjoint else [])]
-            unused = [structs.Model(), 0, 0, 0, *(structs.Scratch() for _ in held)]
-            unused += [type(view)() for view in views]
-            wp.launch(
-                kernel,
-                dim=count,
-                inputs=[self.model, first, slot, stride, *held, *views],
-                adj_inputs=unused if adjoint else [],
-                adjoint=adjoint,
-                device=self.device,
-                block_dim=_BLOCK,
-            )
-
-        self._run(launch, worlds, adjoint=adjoint)
-
-    def _run(self, launch: Any, worlds: int, *, adjoint: bool) -> None:
         if worlds == 0:
             return
         if self.device.is_cpu:
             with self._lock:
-                self._run_threads(launch, worlds, adjoint=adjoint)
+                self._launch_threads(kernel, worlds, arrays, adjoint)
             return
         lanes = lane_count(worlds)
         resident = min(worlds, _RESIDENT_WORLDS)
-        scratch = self._get_scratch(resident, adjoint, wp.get_stream().cuda_stream)
+        owner = wp.get_stream(self.device).cuda_stream
         for first in range(0, worlds, resident):
             count = min(resident, worlds - first)
-            launch(scratch, count, first, 0, 1, lanes)
+            command = self._command(kernel, owner, resident, arrays, adjoint)
+            _send(command, arrays, count, first, 1, lanes)
 
-    def _run_threads(self, launch: Any, worlds: int, *, adjoint: bool) -> None:
+    def _launch_threads(
+        self, kernel: Any, worlds: int, arrays: tuple[Any, ...], adjoint: bool
+    ) -> None:
         """Split the worlds over threads; each walks through its share in one slot."""
         threads = min(thread_count(), -(-worlds // _MIN_WORLDS_PER_THREAD))
-        scratch = self._get_scratch(threads, adjoint, None)
         bounds = [worlds * n // threads for n in range(threads + 1)]
         if threads > 1 and self._pool is None:
             self._pool = ThreadPoolExecutor(
                 thread_count(), thread_name_prefix="newton_qd"
             )
-        shares = [
-            self._pool.submit(launch, scratch, b - a, a, slot, 0, 1)  # type: ignore[union-attr]
-            for slot, (a, b) in enumerate(zip(bounds[1:], bounds[2:], strict=False), 1)
+        # memory of its own for each thread: shared cache lines would slow all down
+        commands = [
+            self._command(kernel, thread, 1, arrays, adjoint)
+            for thread in range(threads)
         ]
-        launch(scratch, bounds[1], 0, 0, 0, 1)
+        shares = [
+            self._pool.submit(_send, commands[n], arrays, end - first, first, 0, 1)  # type: ignore[union-attr]
+            for n, (first, end) in enumerate(itertools.pairwise(bounds))
+            if n > 0
+        ]
+        _send(commands[0], arrays, bounds[1], 0, 0, 1)
         for share in shares:
             share.result()
 
-    def _get_scratch(self, slots: int, adjoint: bool, stream: Any) -> Any:
-        held = self._scratch.get((adjoint, stream))
+    def _command(
+        self,
+        kernel: Any,
+        owner: Any,
+        slots: int,
+        arrays: tuple[Any, ...],
+        adjoint: bool,
+    ) -> Any:
+        """The recorded launch of ``kernel`` in an owner's scratch."""
+        held = self._scratch.get((adjoint, owner))
         if held is None or held[0] < slots:
             scratch = buffers.build_scratch(
                 self.system, slots, self.device, adjoint=adjoint
             )
-            held = self._scratch[adjoint, stream] = (slots, scratch)
-        return held[1]
+            held = self._scratch[adjoint, owner] = (slots, scratch)
+            self._commands.clear()
+        command = self._commands.get((kernel.key, owner))
+        if command is None:
+            command = self._record(kernel, held[1], arrays, adjoint)
+            self._commands[kernel.key, owner] = command
+        return command
+
+    def _record(
+        self, kernel: Any, scratch: Any, arrays: tuple[Any, ...], adjoint: bool
+    ) -> Any:
+        structs = self.kernels.structs
+        held = [scratch.values, *([scratch.adjoints] if adjoint else [])]
+        # adjoints travel through the scratch and ``arrays``, not through Warp's
+        unused = [structs.Model(), 0, 0, 0, *(structs.Scratch() for _ in held)]
+        unused += [None for _ in arrays]
+        return wp.launch(
+            kernel,
+            dim=1,
+            inputs=[self.model, 0, 0, 1, *held, *arrays],
+            adj_inputs=unused if adjoint else [],
+            adjoint=adjoint,
+            device=self.device,
+            block_dim=1 if self.device.is_cpu else _GPU_BLOCK,
+            record_cmd=True,
+        )
+
+
+def _send(
+    command: Any,
+    arrays: tuple[Any, ...],
+    count: int,
+    first: int,
+    slot_stride: int,
+    lanes: int,
+) -> None:
+    """Launch a recorded command on ``count`` worlds from ``first`` on."""
+    command.set_dim(count * lanes)
+    for index, value in enumerate((first, slot_stride, lanes), 1):
+        command.set_param_at_index(index, value)
+    begin = len(command.kernel.adj.args) - len(arrays)
+    for index, array in enumerate(arrays, begin):
+        command.set_param_at_index(index, array)
+    command.launch()

@@ -55,14 +55,14 @@ class EvolveConfig:
 
     env_name: str = "ant_uni"
     seed: int = 0
-    iterations: int = 200
+    iterations: int = 240
     batch_size: int = 128
     episode_length: int = 100
     hidden: tuple[int, ...] = (32,)
     grid: tuple[int, ...] | None = None
     centroids: int | None = None
-    iso_sigma: float = 0.05
-    line_sigma: float = 0.5
+    iso_sigma: float = 0.02
+    line_sigma: float = 0.2
 
     def __post_init__(self) -> None:
         """Normalizes sequences to tuples and checks every value."""

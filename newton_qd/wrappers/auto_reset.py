@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 
 from newton_qd.envs.base import State, select
@@ -27,6 +28,8 @@ class AutoResetWrapper(Wrapper):
         }
         if "state_descriptor" in state.info:
             first["first_state_descriptor"] = state.info["state_descriptor"]
+        # copies: no buffer is in a state twice, so that a state can be donated
+        first = jax.tree.map(jnp.copy, first)
         return state.replace(info={**state.info, **first})
 
     def step(self, state: State, action: Action, params: Params = None) -> State:

@@ -67,7 +67,8 @@ class EvalWrapper(Wrapper):
 
 def with_reward_metric(state: State) -> State:
     """Returns the state with its reward among the metrics."""
-    return state.replace(metrics={**state.metrics, "reward": state.reward})
+    reward = jnp.copy(state.reward)  # its own buffer: the state can be donated
+    return state.replace(metrics={**state.metrics, "reward": reward})
 
 
 def require_steps(state: State, wrapper: str) -> None:

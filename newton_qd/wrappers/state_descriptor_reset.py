@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import jax.numpy as jnp
+
 from newton_qd.envs.base import State, select
 from newton_qd.types import Action, Params, RNGKey
 from newton_qd.wrappers.base import Wrapper
@@ -22,7 +24,7 @@ class StateDescriptorResetWrapper(Wrapper):
                 "info['state_descriptor'] is missing: StateDescriptorResetWrapper "
                 "needs a descriptor wrapper inside, such as FeetContactWrapper"
             )
-        first = state.info["state_descriptor"]
+        first = jnp.copy(state.info["state_descriptor"])
         return state.replace(info={**state.info, "first_state_descriptor": first})
 
     def step(self, state: State, action: Action, params: Params = None) -> State:

@@ -2,9 +2,10 @@
 
 import warp as wp
 
+from . import real
 from .simulate import simulate
 from .structs import Model, Scratch, row_at
-from .world import Values, detect_fault, load_world, seed_world
+from .world import detect_fault, load_world, seed_world
 
 
 @wp.kernel
@@ -12,27 +13,26 @@ def step_backward(
     # system
     m: Model,
     first: int,
-    slot_first: int,
     slot_stride: int,
     lanes: int,
     sc: Scratch,
     g: Scratch,
     # in
-    x: Values,
-    # in and out
-    x_bar: Values,
+    x: wp.array[real],
+    y_bar: wp.array[real],
+    # out
+    x_bar: wp.array[real],
 ):
     """Launched with ``adjoint=True``: its forward part fills the scratch again.
 
-    ``g`` is the adjoint of ``sc``, all zero before and after; ``x_bar`` holds the
-    adjoints of the outputs and receives those of the inputs.
+    ``g`` is the adjoint of ``sc``, all zero before and after.
     """
     tid = wp.tid()
     n = tid // lanes
     lane = tid - n * lanes
-    slot = slot_first + n * slot_stride
+    slot = n * slot_stride
     w = first + n
     load_world(m, sc, g, row_at(m, slot, 1, 0, 0), slot, x, x_bar, w, lane, lanes)
     simulate(m, sc, slot, 1, lane, lanes)
     detect_fault(m, sc, slot, lane)
-    seed_world(m, sc, g, slot, x_bar, w, lane, lanes)
+    seed_world(m, sc, g, slot, y_bar, w, lane, lanes)

@@ -2,9 +2,10 @@
 
 import warp as wp
 
+from . import real
 from .simulate import simulate
 from .structs import Model, Scratch, row_at
-from .world import Values, detect_fault, load_world, store_world
+from .world import detect_fault, load_world, store_impulses, store_state
 
 wp.set_module_options({"enable_backward": False})
 
@@ -14,20 +15,22 @@ def step_forward(
     # system
     m: Model,
     first: int,
-    slot_first: int,
     slot_stride: int,
     lanes: int,
     sc: Scratch,
-    # in and out
-    x: Values,
+    # in
+    x: wp.array[real],
+    # out
+    y: wp.array[real],
 ):
     """One control step of the worlds from ``first`` on; thread = world * lanes + lane."""
     tid = wp.tid()
     n = tid // lanes
     lane = tid - n * lanes
-    slot = slot_first + n * slot_stride
+    slot = n * slot_stride
     w = first + n
     load_world(m, sc, sc, row_at(m, slot, 0, 0, 0), slot, x, x, w, lane, lanes)
     simulate(m, sc, slot, 0, lane, lanes)
     detect_fault(m, sc, slot, lane)
-    store_world(m, sc, slot, x, w, lane, lanes)
+    store_state(m, sc, slot, x, y, w, lane, lanes)
+    store_impulses(m, sc, slot, y, w, lane, lanes)

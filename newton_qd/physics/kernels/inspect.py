@@ -1,4 +1,8 @@
-"""Kernels that show a system from inside: poses, twists, mass matrix, bias forces."""
+"""Kernels that show a system from inside: poses, twists, mass matrix, bias forces.
+
+Inputs: q and v of each world. Outputs: for each body pose (7) and twist (6, angular
+first), both about O; or the mass matrix, row by row, and the bias forces.
+"""
 
 import warp as wp
 
@@ -9,39 +13,41 @@ from .memory import constant, load, store
 from .structs import Model, Row, Scratch, row_at
 
 
-@wp.struct
-class Views:
-    """What the kernels report, or its adjoints; first index: world."""
-
-    q: wp.array2d[real]
-    v: wp.array2d[real]
-    pose: wp.array3d[real]  # (world, body, 7) about O
-    twist: wp.array3d[real]  # (world, body, 6) angular, then linear at O
-    mass_matrix: wp.array3d[real]  # (world, dof, dof)
-    bias: wp.array2d[real]  # (world, dof)
-
-
 @wp.func
 def load_views(
-    m: Model, sc: Scratch, g: Scratch, row: Row, x: Views, x_bar: Views, w: int
+    m: Model,
+    sc: Scratch,
+    g: Scratch,
+    row: Row,
+    x: wp.array[real],
+    x_bar: wp.array[real],
+    w: int,
 ):
     """Copy coordinates and velocities of world ``w`` into its slot."""
+    at = w * (m.nq + m.nv)
     for k in range(m.nq):
-        store(sc.q, row.q + k, x.q[w, k])
+        store(sc.q, row.q + k, constant(x, at + k))
     for k in range(m.nv):
-        store(sc.v, row.v + k, x.v[w, k])
+        store(sc.v, row.v + k, constant(x, at + m.nq + k))
 
 
 @wp.func_grad(load_views)
 def adj_load_views(
-    m: Model, sc: Scratch, g: Scratch, row: Row, x: Views, x_bar: Views, w: int
+    m: Model,
+    sc: Scratch,
+    g: Scratch,
+    row: Row,
+    x: wp.array[real],
+    x_bar: wp.array[real],
+    w: int,
 ):
     """Hand the adjoints of coordinates and velocities to the caller."""
+    at = w * (m.nq + m.nv)
     for k in range(m.nq):
-        x_bar.q[w, k] = load(g.q, row.q + k)
+        store(x_bar, at + k, load(g.q, row.q + k))
         store(g.q, row.q + k, real(0.0))
     for k in range(m.nv):
-        x_bar.v[w, k] = load(g.v, row.v + k)
+        store(x_bar, at + m.nq + k, load(g.v, row.v + k))
         store(g.v, row.v + k, real(0.0))
 
 
@@ -52,35 +58,37 @@ def run_kinematics(m: Model, sc: Scratch, row: Row):
 
 
 @wp.func
-def store_poses(m: Model, sc: Scratch, row: Row, x: Views, w: int):
+def store_poses(m: Model, sc: Scratch, row: Row, y: wp.array[real], w: int):
     """Write poses and twists of world ``w``."""
     for i in range(m.nb):
+        at = (w * m.nb + i) * 13
         for j in range(7):
-            x.pose[w, i, j] = load(sc.pose, row.body + i + 1)[j]
+            store(y, at + j, load(sc.pose, row.body + i + 1)[j])
         for j in range(3):
-            x.twist[w, i, j] = load(sc.twist_w, row.body + i + 1)[j]
-            x.twist[w, i, 3 + j] = load(sc.twist_v, row.body + i + 1)[j]
+            store(y, at + 7 + j, load(sc.twist_w, row.body + i + 1)[j])
+            store(y, at + 10 + j, load(sc.twist_v, row.body + i + 1)[j])
 
 
 @wp.func
-def seed_poses(m: Model, g: Scratch, row: Row, x_bar: Views, w: int):
+def seed_poses(m: Model, g: Scratch, row: Row, y_bar: wp.array[real], w: int):
     """Start the reverse pass with the caller's adjoints of poses and twists."""
     for i in range(m.nb):
+        at = (w * m.nb + i) * 13
         p = transform()
         for j in range(7):
-            p[j] = x_bar.pose[w, i, j]
+            p[j] = constant(y_bar, at + j)
         store(g.pose, row.body + i + 1, p)
         angular = vec3()
         linear = vec3()
         for j in range(3):
-            angular[j] = x_bar.twist[w, i, j]
-            linear[j] = x_bar.twist[w, i, 3 + j]
+            angular[j] = constant(y_bar, at + 7 + j)
+            linear[j] = constant(y_bar, at + 10 + j)
         store(g.twist_w, row.body + i + 1, angular)
         store(g.twist_v, row.body + i + 1, linear)
 
 
 @wp.func_grad(seed_poses)
-def adj_seed_poses(m: Model, g: Scratch, row: Row, x_bar: Views, w: int):
+def adj_seed_poses(m: Model, g: Scratch, row: Row, y_bar: wp.array[real], w: int):
     """Nothing: seeding is not part of the kinematics."""
     sync()
 
@@ -136,7 +144,7 @@ def dof_axis(m: Model, sc: Scratch, row: Row, i: int, a: int):
 
 
 @wp.func
-def store_body(m: Model, sc: Scratch, row: Row, x: Views, w: int, i: int):
+def store_body(m: Model, sc: Scratch, row: Row, y: wp.array[real], out: int, i: int):
     """Rows of joint ``i``: M_kj = S_j . I_c S_k (Featherstone 2008, table 6.2)."""
     at = row.solve_body + i
     ww = load(sc.total_ww, at)
@@ -145,9 +153,8 @@ def store_body(m: Model, sc: Scratch, row: Row, x: Views, w: int, i: int):
     for a in range(dof_count(m, i)):
         k = load(m.v_start, i) + a
         sw, sv = dof_axis(m, sc, row, i, a)
-        x.bias[w, k] = wp.dot(sw, load(sc.total_w, at)) + wp.dot(
-            sv, load(sc.total_v, at)
-        )
+        bias = wp.dot(sw, load(sc.total_w, at)) + wp.dot(sv, load(sc.total_v, at))
+        store(y, out + m.nv * m.nv + k, bias)
         angular = ww * sw + wv * sv
         linear = wp.transpose(wv) * sw + vv * sv
         up = int(i)
@@ -158,66 +165,67 @@ def store_body(m: Model, sc: Scratch, row: Row, x: Views, w: int, i: int):
                 value = wp.dot(tw, angular) + wp.dot(tv, linear)
                 if j == k:
                     value += constant(m.armature, k)
-                x.mass_matrix[w, k, j] = value
-                x.mass_matrix[w, j, k] = value
+                store(y, out + k * m.nv + j, value)
+                store(y, out + j * m.nv + k, value)
             up = load(m.body_parent, up)
 
 
 @wp.func
-def store_dynamics(m: Model, sc: Scratch, row: Row, x: Views, w: int):
+def store_dynamics(m: Model, sc: Scratch, row: Row, y: wp.array[real], w: int):
     """Write the mass matrix and the bias forces of world ``w``."""
     for i in range(1, m.nb + 1):
         rigid_inertia(m, sc, row, i)
     # children come after their parents
     for n in range(m.nb):
         composite(m, sc, row, m.nb - n)
-    for k in range(m.nv):
-        for j in range(m.nv):
-            x.mass_matrix[w, k, j] = real(0.0)
+    out = w * m.nv * (m.nv + 1)
+    for k in range(m.nv * m.nv):
+        store(y, out + k, real(0.0))
     for i in range(1, m.nb + 1):
-        store_body(m, sc, row, x, w, i)
+        store_body(m, sc, row, y, out, i)
 
 
 @wp.kernel(enable_backward=False)
-def dynamics_forward(m: Model, first: int, slot_first: int, slot_stride: int, sc: Scratch, x: Views):
+def dynamics_forward(m: Model, first: int, slot_stride: int, lanes: int, sc: Scratch, x: wp.array[real], y: wp.array[real]):
     """Mass matrix and bias forces."""
     n = wp.tid()
     w = first + n
-    slot = slot_first + n * slot_stride
+    slot = n * slot_stride
     row = row_at(m, slot, 0, 0, 0)
     load_views(m, sc, sc, row, x, x, w)
     kinematics(m, sc, row, 0, 1)
-    store_dynamics(m, sc, row, x, w)
+    store_dynamics(m, sc, row, y, w)
 
 
 @wp.kernel(enable_backward=False)
-def kinematics_forward(m: Model, first: int, slot_first: int, slot_stride: int, sc: Scratch, x: Views):
+def kinematics_forward(m: Model, first: int, slot_stride: int, lanes: int, sc: Scratch, x: wp.array[real], y: wp.array[real]):
     """Poses and twists."""
     n = wp.tid()
     w = first + n
-    slot = slot_first + n * slot_stride
+    slot = n * slot_stride
     row = row_at(m, slot, 0, 0, 0)
     load_views(m, sc, sc, row, x, x, w)
     kinematics(m, sc, row, 0, 1)
-    store_poses(m, sc, row, x, w)
+    store_poses(m, sc, row, y, w)
 
 
 @wp.kernel
 def kinematics_backward(
     m: Model,
     first: int,
-    slot_first: int,
     slot_stride: int,
+    lanes: int,
     sc: Scratch,
     g: Scratch,
-    x: Views,
-    x_bar: Views,
+    x: wp.array[real],
+    y_bar: wp.array[real],
+    x_bar: wp.array[real],
 ):
     """Adjoint of the kinematics; launched with ``adjoint=True``."""
     n = wp.tid()
     w = first + n
-    slot = slot_first + n * slot_stride
+    slot = n * slot_stride
     row = row_at(m, slot, 1, 0, 0)
     load_views(m, sc, g, row, x, x_bar, w)
     run_kinematics(m, sc, row)
-    seed_poses(m, g, row, x_bar, w)
+    seed_poses(m, g, row, y_bar, w)

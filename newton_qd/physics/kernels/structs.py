@@ -23,6 +23,7 @@ class Model:
     passes: int  # solves of a substep: predictor and corrector
     h: real  # [s]
     gravity: real  # [m/s^2]
+    rest_q: wp.array[real]  # (nq,)
     # bodies, (nb + 1)
     body_parent: wp.array[int]
     joint_kind: wp.array[int]

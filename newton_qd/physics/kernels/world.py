@@ -1,24 +1,14 @@
-"""Moving one world between the caller's arrays and the scratch, with adjoints."""
+"""Moving one world between the caller's arrays and the scratch, with adjoints.
+
+The arrays hold one contiguous row per world. Inputs: q, v, ctrl. Outputs: q, v, the
+contact impulse of each body (6), the normal impulse of each body, the fault.
+"""
 
 import warp as wp
 
 from . import real, sync, vec3
-from .memory import load, store
+from .memory import constant, load, store
 from .structs import Model, Row, Scratch, row_at
-
-
-@wp.struct
-class Values:
-    """A control step's inputs and outputs, or their adjoints; first index: world."""
-
-    q: wp.array2d[real]
-    v: wp.array2d[real]
-    ctrl: wp.array2d[real]
-    q_new: wp.array2d[real]
-    v_new: wp.array2d[real]
-    impulse: wp.array3d[real]  # (world, body, 6)
-    normal_impulse: wp.array2d[real]  # (world, body)
-    fault: wp.array[real]  # (world,)
 
 
 @wp.func
@@ -28,19 +18,20 @@ def load_world(
     g: Scratch,
     row: Row,
     slot: int,
-    x: Values,
-    x_bar: Values,
+    x: wp.array[real],
+    x_bar: wp.array[real],
     w: int,
     lane: int,
     lanes: int,
 ):
     """Copy the inputs of world ``w`` into its slot, whose first row is ``row``."""
+    at = w * (m.nq + m.nv + m.nu)
     for k in range(lane, m.nq, lanes):
-        store(sc.q, row.q + k, x.q[w, k])
+        store(sc.q, row.q + k, constant(x, at + k))
     for k in range(lane, m.nv, lanes):
-        store(sc.v, row.v + k, x.v[w, k])
+        store(sc.v, row.v + k, constant(x, at + m.nq + k))
     for k in range(lane, m.nu, lanes):
-        store(sc.ctrl, row.ctrl + k, x.ctrl[w, k])
+        store(sc.ctrl, row.ctrl + k, constant(x, at + m.nq + m.nv + k))
     sync()
 
 
@@ -51,22 +42,26 @@ def adj_load_world(
     g: Scratch,
     row: Row,
     slot: int,
-    x: Values,
-    x_bar: Values,
+    x: wp.array[real],
+    x_bar: wp.array[real],
     w: int,
     lane: int,
     lanes: int,
 ):
     """Hand the adjoints of the inputs to the caller; exactly 0 for a faulty world."""
+    at = w * (m.nq + m.nv + m.nu)
     good = sc.fault[slot] == 0
     for k in range(lane, m.nq, lanes):
-        x_bar.q[w, k] = wp.where(good, load(g.q, row.q + k), real(0.0))
+        value = load(g.q, row.q + k)
+        store(x_bar, at + k, wp.where(good, value, real(0.0)))
         store(g.q, row.q + k, real(0.0))
     for k in range(lane, m.nv, lanes):
-        x_bar.v[w, k] = wp.where(good, load(g.v, row.v + k), real(0.0))
+        value = load(g.v, row.v + k)
+        store(x_bar, at + m.nq + k, wp.where(good, value, real(0.0)))
         store(g.v, row.v + k, real(0.0))
     for k in range(lane, m.nu, lanes):
-        x_bar.ctrl[w, k] = wp.where(good, load(g.ctrl, row.ctrl + k), real(0.0))
+        value = load(g.ctrl, row.ctrl + k)
+        store(x_bar, at + m.nq + m.nv + k, wp.where(good, value, real(0.0)))
         store(g.ctrl, row.ctrl + k, real(0.0))
     sync()
 
@@ -97,32 +92,77 @@ def detect_fault(m: Model, sc: Scratch, slot: int, lane: int):
 
 
 @wp.func
-def store_world(
-    m: Model, sc: Scratch, slot: int, x: Values, w: int, lane: int, lanes: int
+def output_size(m: Model):
+    """Length of a row of outputs."""
+    return m.nq + m.nv + 7 * m.nb + 1
+
+
+@wp.func
+def store_state(
+    m: Model,
+    sc: Scratch,
+    slot: int,
+    x: wp.array[real],
+    y: wp.array[real],
+    w: int,
+    lane: int,
+    lanes: int,
 ):
-    """Write the outputs of world ``w``: a faulty world stays where it was."""
+    """Write q and v of world ``w``: a faulty world stays where it was, or at rest."""
     good = sc.fault[slot] == 0
     end = row_at(m, slot, 0, m.substeps, 0)
+    start = w * (m.nq + m.nv + m.nu)
+    at = w * output_size(m)
+    whole = bool(True)
+    for k in range(m.nq + m.nv):
+        whole = whole and wp.isfinite(constant(x, start + k))
     for k in range(lane, m.nq, lanes):
-        x.q_new[w, k] = wp.where(good, load(sc.q, end.q + k), x.q[w, k])
+        value = constant(x, start + k)
+        if good:
+            value = load(sc.q, end.q + k)
+        elif not whole:
+            value = constant(m.rest_q, k)
+        store(y, at + k, value)
     for k in range(lane, m.nv, lanes):
-        x.v_new[w, k] = wp.where(good, load(sc.v, end.v + k), x.v[w, k])
+        value = constant(x, start + m.nq + k)
+        if good:
+            value = load(sc.v, end.v + k)
+        elif not whole:
+            value = real(0.0)
+        store(y, at + m.nq + k, value)
+
+
+@wp.func
+def store_impulses(
+    m: Model,
+    sc: Scratch,
+    slot: int,
+    y: wp.array[real],
+    w: int,
+    lane: int,
+    lanes: int,
+):
+    """Write the contact impulses of world ``w``, none if it is faulty, and the fault."""
+    good = sc.fault[slot] == 0
+    at = w * output_size(m) + m.nq + m.nv
     for i in range(lane, m.nb, lanes):
         linear = vec3()
         angular = vec3()
         normal = real(0.0)
-        for s in range(m.substeps):
-            report = row_at(m, slot, 0, s, 0).report
-            for c in range(m.contact_start[i + 1], m.contact_start[i + 2]):
-                linear += load(sc.impulse, report + c)
-                angular += load(sc.angular_impulse, report + c)
-                normal += load(sc.normal_impulse, report + c)
+        if good:
+            for s in range(m.substeps):
+                report = row_at(m, slot, 0, s, 0).report
+                start = load(m.contact_start, i + 1)
+                for c in range(start, load(m.contact_start, i + 2)):
+                    linear += load(sc.impulse, report + c)
+                    angular += load(sc.angular_impulse, report + c)
+                    normal += load(sc.normal_impulse, report + c)
         for j in range(3):
-            x.impulse[w, i, j] = wp.where(good, linear[j], real(0.0))
-            x.impulse[w, i, 3 + j] = wp.where(good, angular[j], real(0.0))
-        x.normal_impulse[w, i] = wp.where(good, normal, real(0.0))
+            store(y, at + 6 * i + j, linear[j])
+            store(y, at + 6 * i + 3 + j, angular[j])
+        store(y, at + 6 * m.nb + i, normal)
     if lane == 0:
-        x.fault[w] = real(sc.fault[slot])
+        store(y, at + 7 * m.nb, real(sc.fault[slot]))
 
 
 @wp.func
@@ -131,7 +171,7 @@ def seed_world(
     sc: Scratch,
     g: Scratch,
     slot: int,
-    x_bar: Values,
+    y_bar: wp.array[real],
     w: int,
     lane: int,
     lanes: int,
@@ -139,20 +179,24 @@ def seed_world(
     """Start the reverse pass: the caller's adjoints of the outputs."""
     good = sc.fault[slot] == 0
     end = row_at(m, slot, 0, m.substeps, 0)
+    at = w * output_size(m)
     for k in range(lane, m.nq, lanes):
-        store(g.q, end.q + k, wp.where(good, x_bar.q_new[w, k], real(0.0)))
+        value = constant(y_bar, at + k)
+        store(g.q, end.q + k, wp.where(good, value, real(0.0)))
     for k in range(lane, m.nv, lanes):
-        store(g.v, end.v + k, wp.where(good, x_bar.v_new[w, k], real(0.0)))
+        value = constant(y_bar, at + m.nq + k)
+        store(g.v, end.v + k, wp.where(good, value, real(0.0)))
+    at += m.nq + m.nv
     for c in range(lane, m.nc, lanes):
-        i = m.contact_body[c] - 1
+        i = load(m.contact_body, c) - 1
         linear = vec3()
         angular = vec3()
         normal = real(0.0)
         if good:
             for j in range(3):
-                linear[j] = x_bar.impulse[w, i, j]
-                angular[j] = x_bar.impulse[w, i, 3 + j]
-            normal = x_bar.normal_impulse[w, i]
+                linear[j] = constant(y_bar, at + 6 * i + j)
+                angular[j] = constant(y_bar, at + 6 * i + 3 + j)
+            normal = constant(y_bar, at + 6 * m.nb + i)
         for s in range(m.substeps):
             report = row_at(m, slot, 0, s, 0).report
             store(g.impulse, report + c, linear)
@@ -167,7 +211,7 @@ def adj_seed_world(
     sc: Scratch,
     g: Scratch,
     slot: int,
-    x_bar: Values,
+    y_bar: wp.array[real],
     w: int,
     lane: int,
     lanes: int,

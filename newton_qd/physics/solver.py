@@ -1,0 +1,291 @@
+"""The physics as a solver for a plain Newton loop."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+import warnings
+
+import newton
+import numpy as np
+import warp as wp
+from newton.solvers import SolverBase
+
+from newton_qd.assets import find_urdf
+from newton_qd.physics.description import read_description
+from newton_qd.physics.kernels.conventions import to_centre_of_mass, to_origin
+from newton_qd.physics.launch import Launcher
+from newton_qd.physics.model import load_system, newton_builder
+from newton_qd.physics.precision import kernels
+from newton_qd.physics.system import JointKind, System
+from newton_qd.robots import Robot
+
+# Arrays that every world must share with the robot, by what they have a row for.
+_COMPARED = {
+    "body": ("body_mass", "body_com", "body_inertia", "body_flags"),
+    "joint": (
+        "joint_type",
+        "joint_parent",
+        "joint_child",
+        "joint_X_p",
+        "joint_X_c",
+        "joint_dof_dim",
+        "joint_enabled",
+        "joint_mimic_joint",
+    ),
+    "joint_dof": (
+        "joint_axis",
+        "joint_armature",
+        "joint_damping",
+        "joint_friction",
+        "joint_stiffness",
+        "joint_limit_lower",
+        "joint_limit_upper",
+        "joint_target_ke",
+        "joint_target_kd",
+    ),
+    "joint_coord": ("joint_rest_q",),
+}
+# Entries that count on from world to world, and what they count.
+_NUMBERED = {
+    "joint_parent": "body_count",
+    "joint_child": "body_count",
+    "joint_mimic_joint": "joint_count",
+}
+_ABSENT = ("particle_count", "muscle_count", "tendon_count", "constraint_mimic_count")
+# Step lengths whose model stays in memory.
+_HELD_STEPS = 8
+
+
+class NewtonQDSolver(SolverBase):
+    """Steps a Newton model of identical worlds with the kernels of this package.
+
+    The model is made of copies of one robot, one a world::
+
+        scene = newton.ModelBuilder(gravity=(0.0, 0.0, -robot.gravity))
+        scene.replicate(newton_builder(path, floating=True, gravity=robot.gravity), 64)
+        model = scene.finalize()
+        solver = NewtonQDSolver(model, robot)
+        solver.step(state_in, state_out, control, None, dt)
+
+    The physics is that of :func:`newton_qd.physics.step`: the robot touches the ground
+    z = 0 with the spheres and the material of its row. Hence ``contacts`` is ignored,
+    as are the materials, limit gains and effort limits of the model, shapes that belong
+    to no body, ``State.body_f``, and every part of ``Control`` except ``joint_f``,
+    which is added to the passive joint forces.
+
+    Joint velocities and forces follow Newton's convention: those of a free joint belong
+    to the child's centre of mass. Nothing is differentiable by ``wp.Tape``; gradients
+    come from :func:`newton_qd.physics.step`. Step once with each ``dt`` before a CUDA
+    graph is captured, so that every buffer exists.
+
+    Attributes:
+        fault: (worlds,) 1 where the last step met a number that is not finite; such a
+            world keeps the coordinates and velocities of ``state_in``. Else 0.
+        impulse: (worlds, nb, 6) contact impulses of the last step, as in
+            :class:`~newton_qd.physics.system.PhysicsState`.
+        normal_impulse: (worlds, nb) likewise [N s].
+    """
+
+    def __init__(self, model: newton.Model, robot: Robot) -> None:
+        """Checks the model and allocates the buffers of a step.
+
+        Args:
+            model: Worlds that are copies of the robot.
+            robot: Row of the robot.
+
+        Raises:
+            ValueError: ``model`` is something else; names the array that differs.
+        """
+        super().__init__(model)
+        self.robot = robot
+        self._reference = _one_world(robot)
+        _check_model(model, self._reference, robot)
+        self._system = load_system(robot, "float32")
+        self._worlds = model.world_count
+        nb, nv = self._system.nb, self._system.nv
+        with wp.ScopedDevice(model.device):
+            self._v, self._v_new, self._force = (
+                wp.zeros((self._worlds, nv), dtype=wp.float32) for _ in range(3)
+            )
+            self.fault = wp.zeros(self._worlds, dtype=wp.float32)
+            self.impulse = wp.zeros((self._worlds, nb, 6), dtype=wp.float32)
+            self.normal_impulse = wp.zeros((self._worlds, nb), dtype=wp.float32)
+        free = self._system.joint_kind[0] == JointKind.FREE
+        self._root = (int(free), wp.vec3(*self._system.com[0]))
+        self._launcher = functools.lru_cache(_HELD_STEPS)(
+            functools.partial(_launcher, self._system, model.device)
+        )
+
+    def step(
+        self,
+        state_in: newton.State,
+        state_out: newton.State,
+        control: newton.Control | None,
+        contacts: newton.Contacts | None,
+        dt: float,
+        *,
+        observables: SolverBase.Observables | None = None,
+    ) -> None:
+        """Advances every world by one substep of length ``dt``.
+
+        Args:
+            state_in: Joint coordinates and velocities are read.
+            state_out: Joint coordinates and velocities, and the poses and velocities
+                of the bodies, are written; may be ``state_in``.
+            control: ``joint_f`` is read: generalized forces [N or N m]; ``None``
+                takes the model's.
+            contacts: Ignored, ``None`` is fine.
+            dt: Duration [s]; the robot's row was made for ``dt / substeps`` of it.
+            observables: This solver has none.
+
+        Raises:
+            ValueError: ``dt`` is not positive, or an array has another size.
+            RuntimeError: A ``wp.Tape`` is recording.
+        """
+        self.validate_observables(observables)
+        if not (math.isfinite(dt) and dt > 0.0):
+            raise ValueError(f"dt={dt!r}; allowed: positive numbers of seconds")
+        if wp._src.context.runtime.tape is not None:
+            raise RuntimeError(
+                "NewtonQDSolver.step inside wp.Tape would record no gradient; "
+                "differentiate newton_qd.physics.step with jax.grad instead"
+            )
+        joint_f = (self.model if control is None else control).joint_f
+        q = self._rows("state_in.joint_q", state_in.joint_q, self._system.nq)
+        qd = self._rows("state_in.joint_qd", state_in.joint_qd, self._system.nv)
+        force = self._rows("control.joint_f", joint_f, self._system.nv)
+        q_new = self._rows("state_out.joint_q", state_out.joint_q, self._system.nq)
+        qd_new = self._rows("state_out.joint_qd", state_out.joint_qd, self._system.nv)
+        with wp.ScopedDevice(self.model.device):
+            wp.launch(
+                to_origin,
+                dim=self._worlds,
+                inputs=[*self._root, q, qd, force],
+                outputs=[self._v, self._force],
+            )
+            self._launcher(float(dt)).forward(self._worlds, self._values(q, q_new))
+            wp.launch(
+                to_centre_of_mass,
+                dim=self._worlds,
+                inputs=[*self._root, q_new, self._v_new],
+                outputs=[qd_new],
+            )
+        newton.eval_fk(self.model, state_out.joint_q, state_out.joint_qd, state_out)
+
+    def notify_model_changed(self, flags: newton.ModelFlags | int) -> None:
+        """Checks again that every world is the robot.
+
+        Args:
+            flags: Ignored; everything is checked.
+
+        Raises:
+            ValueError: The model is no longer copies of the robot.
+        """
+        _check_model(self.model, self._reference, self.robot)
+
+    def _rows(self, name: str, array: wp.array | None, columns: int) -> wp.array:
+        """Returns the array as (worlds, columns), without a copy."""
+        size = self._worlds * columns
+        if array is None or array.shape != (size,):
+            shape = None if array is None else array.shape
+            raise ValueError(f"{name} has shape {shape}; expected ({size},)")
+        return array.reshape((self._worlds, columns))
+
+    def _values(self, q: wp.array, q_new: wp.array) -> object:
+        values = kernels(self._system.dtype).world.Values()
+        values.q, values.v, values.ctrl = q, self._v, self._force
+        values.q_new, values.v_new = q_new, self._v_new
+        values.impulse, values.normal_impulse = self.impulse, self.normal_impulse
+        values.fault = self.fault
+        return values
+
+
+def _launcher(system: System, device: wp.Device, dt: float) -> Launcher:
+    """Returns the launcher of one substep of ``dt`` [s], driven by joint forces."""
+    driven = dataclasses.replace(
+        system,
+        robot=dataclasses.replace(system.robot, dt=dt, substeps=1),
+        control_dof=np.arange(system.nv, dtype=np.int32),
+        gear=np.ones(system.nv),
+    )
+    return Launcher(driven, device)
+
+
+def _one_world(robot: Robot) -> newton.Model:
+    """Returns what Newton makes of the robot alone, as its users would build it."""
+    path = find_urdf(robot.urdf)
+    floating = read_description(path).floating
+    builder = newton_builder(str(path), floating, robot.gravity)
+    with warnings.catch_warnings():
+        # that it corrects inertias it has said of the caller's model already
+        warnings.simplefilter("ignore", newton.NewtonWarning)
+        return builder.finalize(device="cpu")
+
+
+def _check_model(model: newton.Model, one: newton.Model, robot: Robot) -> None:
+    """Raises ValueError unless every world of ``model`` is ``one``."""
+    worlds = model.world_count
+    for name in _ABSENT:
+        if getattr(model, name):
+            raise ValueError(f"model.{name} is {getattr(model, name)}; expected 0")
+    for kind in _COMPARED:
+        name = f"{kind}_count"
+        found, expected = getattr(model, name), worlds * getattr(one, name)
+        if worlds < 1 or found != expected:
+            raise ValueError(
+                f"model.{name} is {found}; expected {expected}: {worlds} worlds, each "
+                f"with one robot {robot.name!r} of {getattr(one, name)}"
+            )
+    for names in _COMPARED.values():
+        for name in names:
+            _compare(name, _per_world(model, name, worlds), _per_world(one, name, 1))
+    gravity = model.gravity.numpy()[:worlds]
+    _compare("gravity", gravity[:, None], one.gravity.numpy()[None, :1])
+    for name in ("shape_type", "shape_transform", "shape_scale"):
+        ours = _colliders(one, name, one.body_count)[0]
+        for world, theirs in enumerate(_colliders(model, name, one.body_count)):
+            if len(theirs) != len(ours):
+                raise ValueError(
+                    f"model.{name} has {len(theirs)} colliders on the bodies of world "
+                    f"{world}; the robot has {len(ours)}"
+                )
+            _compare(name, theirs[None], ours[None], world)
+
+
+def _per_world(model: newton.Model, name: str, worlds: int) -> np.ndarray:
+    """Returns an array of the model as (worlds, rows, entries)."""
+    rows = getattr(model, name).numpy().reshape(worlds, -1)
+    if name in _NUMBERED:
+        per_world = getattr(model, _NUMBERED[name]) // worlds
+        first = per_world * np.arange(worlds, dtype=rows.dtype)[:, None]
+        rows = np.where(rows < 0, rows, rows - first)
+    return rows
+
+
+def _colliders(model: newton.Model, name: str, nb: int) -> list[np.ndarray]:
+    """Returns a shape array of each world's colliders, sorted by body."""
+    body, flags = model.shape_body.numpy(), model.shape_flags.numpy()
+    values = getattr(model, name).numpy()
+    values = values.reshape(len(body), math.prod(values.shape[1:]))
+    chosen = (body >= 0) & ((flags & int(newton.ShapeFlags.COLLIDE_SHAPES)) != 0)
+    table = np.concatenate([body[:, None], values], axis=1)[chosen]
+    table = table[np.argsort(table[:, 0], kind="stable")]
+    worlds = table[:, 0] // nb
+    table[:, 0] %= nb
+    return [table[worlds == world] for world in range(model.body_count // nb)]
+
+
+def _compare(
+    name: str, worlds: np.ndarray, robot: np.ndarray, first_world: int = 0
+) -> None:
+    """Raises ValueError where a world's row differs from the robot's."""
+    different = worlds != robot
+    if different.any():
+        place = tuple(np.argwhere(different)[0])
+        raise ValueError(
+            f"model.{name} of world {first_world + place[0]} has {worlds[place]} where "
+            f"the robot has {robot[(0, *place[1:])]}; every world must be a copy of "
+            "newton_builder()'s, unchanged"
+        )

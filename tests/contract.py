@@ -1,0 +1,118 @@
+"""What the tests of the environments share: stacks, jitted functions, comparisons."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import newton_qd
+from newton_qd.envs.base import Env, State
+
+NAMES = newton_qd.registered_envs()
+STACKS: dict[str, dict[str, Any]] = {
+    "default": {},
+    "bare": {"episode_length": None, "auto_reset": False},
+    "repeat": {"action_repeat": 2},
+    "fixed": {"fixed_init_state": True},
+    "batch": {"batch_size": 3},
+    "eval": {"batch_size": 3, "eval_metrics": True},
+    "all": {
+        "episode_length": 3,
+        "action_repeat": 2,
+        "batch_size": 3,
+        "eval_metrics": True,
+        "fixed_init_state": True,
+    },
+}
+
+
+@functools.cache
+def make(name: str, stack: str = "default") -> Env:
+    return newton_qd.create(name, **STACKS[stack])
+
+
+@functools.cache
+def rollout(env: Env) -> Any:
+    """Jitted function of one state and actions (t, nu): the states it went through."""
+
+    def run(state: State, actions: jax.Array) -> State:
+        def advance(state: State, action: jax.Array) -> tuple[State, State]:
+            state = env.step(state, action)
+            return state, state
+
+        return jax.lax.scan(advance, state, actions)[1]
+
+    return jax.jit(jax.vmap(run))
+
+
+@functools.cache
+def reset(env: Env) -> Any:
+    return jax.jit(env.reset)
+
+
+@functools.cache
+def step(env: Env) -> Any:
+    return jax.jit(env.step)
+
+
+@functools.cache
+def batched_reset(env: Env) -> Any:
+    return jax.jit(jax.vmap(env.reset))
+
+
+def keys(count: int, seed: int = 0) -> jax.Array:
+    return jax.random.split(jax.random.key(seed), count)
+
+
+def random_actions(env: Env, shape: tuple[int, ...], seed: int = 0) -> jax.Array:
+    shape = (*shape, env.action_size)
+    return jax.random.uniform(jax.random.key(seed), shape, env.dtype, -1.0, 1.0)
+
+
+def worlds(env: Env, count: int) -> State:
+    return batched_reset(env)(keys(count))
+
+
+def zero_action(env: Env, state: State) -> jax.Array:
+    return jnp.zeros((*state.done.shape, env.action_size), env.dtype)
+
+
+def same(a: Any, b: Any) -> bool:
+    """Whether two pytrees are equal bit by bit."""
+    equal = jax.tree.map(
+        lambda x, y: np.asarray(x).tobytes() == np.asarray(y).tobytes(), a, b
+    )
+    return all(jax.tree.leaves(equal))
+
+
+def outline(tree: Any) -> Any:
+    return [(x.shape, x.dtype, x.weak_type) for x in jax.tree.leaves(tree)]
+
+
+def row(tree: Any, index: Any) -> Any:
+    return jax.tree.map(lambda x: np.asarray(x)[index], tree)
+
+
+def reshaped(tree: Any, old_axes: int, new: tuple[int, ...]) -> Any:
+    return jax.tree.map(
+        lambda x: np.asarray(x).reshape(*new, *x.shape[old_axes:]), tree
+    )
+
+
+@functools.cache
+def gradient(env: Env) -> Any:
+    """Jitted gradient, to q and actions, of a sum over everything that is returned."""
+
+    def total(q: jax.Array, actions: jax.Array, state: State) -> jax.Array:
+        start = dataclasses.replace(state.pipeline_state, q=q)
+        states = rollout(env)(state.replace(pipeline_state=start), actions)
+        parts = (states.reward, states.obs, states.pipeline_state, states.metrics)
+        zero = jnp.zeros((), env.dtype)
+        return sum((jnp.sum(jnp.sin(x)) for x in jax.tree.leaves(parts)), zero)
+
+    return jax.jit(jax.grad(total, argnums=(0, 1)))

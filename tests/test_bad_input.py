@@ -1,0 +1,155 @@
+"""Faults stay in their world, and wrong input is named, in every environment."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from contract import (
+    NAMES,
+    gradient,
+    make,
+    random_actions,
+    reset,
+    rollout,
+    row,
+    same,
+    step,
+    worlds,
+)
+
+import newton_qd
+from newton_qd.envs.base import State
+
+
+def spoil(state: State, actions: jax.Array, kind: str) -> tuple[State, jax.Array]:
+    """World 1 of a batch meets a value that is not finite; actions are (n, t, nu)."""
+    if kind == "state":
+        physics = state.pipeline_state
+        physics = dataclasses.replace(physics, q=physics.q.at[1, -1].set(jnp.nan))
+        return state.replace(pipeline_state=physics), actions
+    value = {"nan": jnp.nan, "inf": jnp.inf, "huge": 1e38}[kind]
+    return state, actions.at[1, 2, 0].set(value)
+
+
+@pytest.mark.parametrize("kind", ["nan", "inf", "huge", "state"])
+@pytest.mark.parametrize("name", NAMES)
+def test_a_fault_stays_in_its_world(name: str, kind: str) -> None:
+    env = make(name, "bare")
+    state, actions = worlds(env, 4), random_actions(env, (4, 5))
+    sound = rollout(env)(state, actions)
+    bad_state, bad_actions = spoil(state, actions, kind)
+    states = rollout(env)(bad_state, bad_actions)
+    others = np.array([0, 2, 3])
+    assert same(row(states, others), row(sound, others))
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(states))
+    first = 0 if kind == "state" else 2
+    faulty = row(states, 1)
+    assert faulty.info["fault"].tolist() == [0] * first + [1] * (5 - first)
+    assert np.all(faulty.reward[first:] == 0) and np.all(faulty.done[first:] == 1)
+    for value in faulty.metrics.values():
+        assert np.all(value[first:] == 0)
+    physics = faulty.pipeline_state
+    assert np.all(physics.impulse[first:] == 0)
+    assert np.all(physics.normal_impulse[first:] == 0)
+    if first:
+        assert same(row(physics.q, first), row(physics.q, first - 1))
+        assert same(row(physics.v, first), row(physics.v, first - 1))
+    assert same(row(faulty.obs, first), row(faulty.obs, 4))
+
+
+@pytest.mark.parametrize("kind", ["nan", "huge", "state"])
+@pytest.mark.parametrize("name", NAMES)
+def test_no_gradient_passes_a_fault(name: str, kind: str) -> None:
+    env = make(name, "bare")
+    start, sound_actions = worlds(env, 4), 0.1 * random_actions(env, (4, 5))
+    bad_start, bad_actions = spoil(start, sound_actions, kind)
+
+    sound = gradient(env)(start.pipeline_state.q, sound_actions, start)
+    bad = gradient(env)(bad_start.pipeline_state.q, bad_actions, bad_start)
+    others = np.array([0, 2, 3])
+    assert same(row(bad, others), row(sound, others))
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(bad))
+    first = 0 if kind == "state" else 2
+    assert np.all(bad[1][1, first:] == 0)
+    if kind == "state":
+        assert np.all(bad[0][1] == 0)
+    else:
+        assert np.any(bad[1][1, :first] != 0)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_auto_reset_heals_a_fault(name: str) -> None:
+    env = make(name, "batch")
+    first = reset(env)(jax.random.key(0))
+    actions = random_actions(env, (3,))
+    broken = step(env)(step(env)(first, actions), actions.at[1].set(jnp.nan))
+    assert broken.info["fault"].tolist() == [0, 1, 0]
+    assert broken.info["steps"].tolist() == [2, 2, 2]
+    with pytest.raises(newton_qd.FaultError, match="world 1 at step 2"):
+        newton_qd.check(broken)
+    assert same(row(broken.obs, 1), row(first.obs, 1))
+    healed = step(env)(broken, actions)
+    newton_qd.check(healed)
+    assert healed.info["steps"].tolist() == [3, 1, 3]
+    assert same(row(healed.obs, 1), row(step(env)(first, actions).obs, 1))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_check_names_worlds(name: str) -> None:
+    env = make(name, "bare")
+    state = worlds(env, 4)
+    newton_qd.check(state)
+    bad, _ = spoil(state, random_actions(env, (4, 3)), "state")
+    with pytest.raises(newton_qd.FaultError, match=r"world 1;") as caught:
+        newton_qd.check(bad)
+    assert isinstance(caught.value, FloatingPointError)
+    with pytest.raises(TypeError, match="traced"):
+        jax.eval_shape(newton_qd.check, state)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_bad_actions_are_named(name: str) -> None:
+    env = make(name)
+    state = reset(env)(jax.random.key(0))
+    size = env.action_size
+    for shape in ((size + 1,), (), (2, size)):
+        with pytest.raises(ValueError, match=rf"action: shape .*\({size},\)"):
+            jax.eval_shape(env.step, state, jnp.zeros(shape, env.dtype))
+    for wrong in (jnp.zeros(size, jnp.int32), jnp.zeros(size, jnp.bfloat16)):
+        with pytest.raises(TypeError, match=rf"dtype {wrong.dtype} .*float32"):
+            env.step(state, wrong)
+    with pytest.raises(TypeError, match="action: type list"):
+        env.step(state, [0.0] * size)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match=r"params=.*not available yet.*None"):
+        env.step(state, jnp.zeros(size), params={"mass": jnp.ones(())})
+    batched = make(name, "batch")
+    states = reset(batched)(jax.random.key(0))
+    with pytest.raises(
+        ValueError, match=rf"action: shape \(2, {size}\).*\(3, {size}\)"
+    ):
+        batched.step(states, jnp.zeros((2, size)))
+    with pytest.raises(ValueError, match=r"state: done has shape \(\)"):
+        batched.step(state, jnp.zeros((3, size)))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_actions_of_numpy_and_weak_types_are_taken(name: str) -> None:
+    env = make(name)
+    state = reset(env)(jax.random.key(0))
+    strong = env.step(state, jnp.full((env.action_size,), 0.5, np.float32))
+    array: Any = np.full(env.action_size, 0.5)
+    assert same(strong, env.step(state, array))
+    assert same(strong, env.step(state, jnp.full((env.action_size,), 0.5)))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_float64_action_is_refused_by_float32(name: str, x64: None) -> None:
+    env = make(name)
+    state = reset(env)(jax.random.key(0))
+    with pytest.raises(TypeError, match=r"float64 given; .*float32"):
+        env.step(state, jnp.zeros(env.action_size, np.float64))

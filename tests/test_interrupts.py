@@ -1,0 +1,215 @@
+"""Ctrl-C at any moment of a run: KeyboardInterrupt, and never a wrong result.
+
+The interrupts hit a child process, this file run as a script, so that a crash of its
+interpreter is seen and none of them hits pytest.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import random
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from warp._src.jax import ffi
+
+import newton_qd
+from newton_qd import physics
+from newton_qd.physics import interrupts
+from newton_qd.robots import ANT
+
+INTERRUPTS = 20
+ENTRY = 40  # moments in a row from the first one on, in which a callback is entered
+MOMENTS = 200
+TIMEOUT_S = 100.0
+RETRY_S = 0.002  # of the children: they have many interrupts to wait for
+
+Compute = Callable[[], str]
+
+
+def digest(arrays: object) -> str:
+    """Hash of every bit of a pytree."""
+    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(arrays)]
+    return hashlib.sha256(b"".join(leaf.tobytes() for leaf in leaves)).hexdigest()
+
+
+def rollout() -> Compute:
+    """A jitted scan of ant_uni: about a tenth of a second, 600 callbacks."""
+    env = newton_qd.create("ant_uni", batch_size=2)
+
+    @jax.jit
+    def run(key: jax.Array) -> tuple:
+        actions = jax.random.uniform(key, (300, 2, 8), jnp.float32, -1.0, 1.0)
+
+        def advance(state, action):
+            state = env.step(state, action)
+            return state, (state.obs, state.reward)
+
+        return jax.lax.scan(advance, env.reset(key), actions)[1]
+
+    return lambda: digest(run(jax.random.key(0)))
+
+
+def gradient() -> Compute:
+    """A control step and its adjoint: every kind of callback of a run."""
+    system = physics.load_system(ANT)
+    start = physics.initial_state(system, jnp.asarray(system.rest_q), jnp.zeros(14))
+
+    @jax.jit
+    @jax.value_and_grad
+    def run(action: jax.Array) -> jax.Array:
+        return physics.step(system, start, action)[0].v.sum()
+
+    return lambda: digest(run(jnp.full((8,), 0.5, jnp.float32)))
+
+
+def child_random_moments() -> None:
+    """Computes over and over; a line for each interrupt, then ``done``."""
+    compute = rollout()
+    expected = compute()
+    assert compute() == expected
+    print("ready", flush=True)
+    for _ in range(INTERRUPTS):
+        try:
+            while True:
+                assert compute() == expected, "wrong result"
+        except KeyboardInterrupt:
+            print("interrupted", flush=True)
+    assert compute() == expected, "wrong result"
+    print("done", flush=True)
+
+
+class InterruptAt:
+    """Profiler that sends an interrupt at one moment of the callbacks of a run.
+
+    Python runs signal handlers when a function is entered and after a call into C.
+    """
+
+    def __init__(self, moment: int) -> None:
+        self.moment = moment
+        self.count = 0
+
+    def __call__(self, frame: FrameType, event: str, argument: object) -> None:
+        if event not in ("call", "c_return") or not _in_callback(frame):
+            return
+        if self.count == self.moment:
+            # what follows is not to be counted, nor the handler itself
+            sys.setprofile(None)
+            signal.raise_signal(signal.SIGINT)
+        self.count += 1
+
+
+def _in_callback(frame: FrameType | None) -> bool:
+    """Whether XLA has called into Warp; told apart by file, not by function."""
+    while frame is not None:
+        if frame.f_code.co_filename == ffi.__file__:
+            return True
+        frame = frame.f_back
+    return False
+
+
+def child_moments_of_a_callback() -> None:
+    """Interrupts a run at the first moments of its callbacks, and at others."""
+    interrupts._RETRY_SECONDS = RETRY_S
+    compute = gradient()
+    expected = compute()
+    counter = InterruptAt(-1)
+    sys.setprofile(counter)
+    assert compute() == expected
+    sys.setprofile(None)
+    others = random.Random(6).sample(range(ENTRY, counter.count), MOMENTS)
+    for moment in (*range(ENTRY), *others):
+        found, interrupted = None, False
+        try:
+            sys.setprofile(InterruptAt(moment))
+            found = compute()
+            sys.setprofile(None)
+            time.sleep(5.0)
+        except KeyboardInterrupt:
+            interrupted = True
+        assert interrupted, f"the interrupt at moment {moment} was lost"
+        assert found in (None, expected), f"wrong result at moment {moment}"
+        assert compute() == expected, f"wrong result after moment {moment}"
+    print("done", flush=True)
+
+
+def start(child: Callable[[], None], errors: Path, device: jax.Device):
+    """Starts a child; its standard error goes to a file."""
+    platform = {"cpu": "cpu", "gpu": "cuda"}[device.platform]
+    environment = os.environ | {
+        "JAX_PLATFORMS": platform,
+        "XLA_PYTHON_CLIENT_PREALLOCATE": "false",
+        "PYTHONFAULTHANDLER": "1",
+    }
+    with errors.open("w", encoding="utf-8") as stderr:
+        return subprocess.Popen(
+            [sys.executable, "-W", "error", __file__, child.__name__],
+            stdout=subprocess.PIPE,
+            stderr=stderr,
+            text=True,
+            env=environment,
+        )
+
+
+def check_end(process: subprocess.Popen, errors: Path) -> None:
+    """No crash, and nothing that ctypes or Python swallowed."""
+    assert process.stdout is not None
+    rest = process.stdout.read()
+    status = process.wait()
+    said = errors.read_text(encoding="utf-8")
+    assert status == 0, f"exit status {status}: {said}"
+    assert rest.endswith("done\n")
+    for trouble in ("ignored", "Traceback", "Fatal Python error"):
+        assert trouble not in said, said
+
+
+@pytest.mark.slow
+def test_random_moments(tmp_path: Path, device: jax.Device) -> None:
+    rng = random.Random(5)
+    errors = tmp_path / "stderr"
+    with start(child_random_moments, errors, device) as process:
+        watchdog = threading.Timer(TIMEOUT_S, process.kill)
+        watchdog.start()
+        try:
+            assert process.stdout is not None
+            for line in process.stdout:
+                if line == "ready\n":
+                    break
+            for _ in range(INTERRUPTS):
+                time.sleep(rng.uniform(0.0, 0.3))
+                process.send_signal(signal.SIGINT)
+                line = process.stdout.readline()
+                assert line == "interrupted\n", (line, errors.read_text())
+            check_end(process, errors)
+        finally:
+            watchdog.cancel()
+            process.kill()
+
+
+@pytest.mark.slow
+def test_moments_of_a_callback(tmp_path: Path, device: jax.Device) -> None:
+    errors = tmp_path / "stderr"
+    with start(child_moments_of_a_callback, errors, device) as process:
+        watchdog = threading.Timer(TIMEOUT_S, process.kill)
+        watchdog.start()
+        try:
+            check_end(process, errors)
+        finally:
+            watchdog.cancel()
+            process.kill()
+
+
+if __name__ == "__main__":
+    children = (child_random_moments, child_moments_of_a_callback)
+    {child.__name__: child for child in children}[sys.argv[1]]()
