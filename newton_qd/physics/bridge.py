@@ -76,6 +76,7 @@ def _kernel_call(system: System, module: str, name: str, size: int) -> Any:
             device = launcher(system, x.device)
             device.launch(kernel, x.shape[0] // size, x, y_bar, x_bar, adjoint=True)
 
+    launcher(system, wp.device_from_jax(jax.devices()[0])).prepare(kernel)
     function = backward if name.endswith("_backward") else forward
     function.__name__ = function.__qualname__ = name
     # Warp loads the module of the function when a call is traced: the kernels' one

@@ -60,10 +60,15 @@ class Launcher:
         self.device = device
         self.kernels = kernels(system.dtype)
         self.model = buffers.build_model(system, device)
+        self._block = 1 if device.is_cpu else _GPU_BLOCK
         self._scratch: dict[tuple[bool, Any], tuple[int, Any]] = {}
         self._commands: dict[tuple[str, Any], Any] = {}
         self._pool: ThreadPoolExecutor | None = None
         self._lock = threading.Lock()
+
+    def prepare(self, kernel: Any) -> None:
+        """Compile ``kernel`` now, rather than inside a callback."""
+        kernel.module.load(self.device, self._block)
 
     def forward(self, worlds: int, x: Any, y: Any) -> None:
         """One control step; rows as :mod:`~newton_qd.physics.kernels.world` says.
@@ -174,7 +179,7 @@ class Launcher:
             adj_inputs=unused if adjoint else [],
             adjoint=adjoint,
             device=self.device,
-            block_dim=1 if self.device.is_cpu else _GPU_BLOCK,
+            block_dim=self._block,
             record_cmd=True,
         )
 

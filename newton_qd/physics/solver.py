@@ -14,10 +14,9 @@ from newton.solvers import SolverBase
 
 from newton_qd.assets import find_urdf
 from newton_qd.physics.description import read_description
-from newton_qd.physics.kernels.conventions import to_centre_of_mass, to_origin
+from newton_qd.physics.kernels.conventions import pack, unpack
 from newton_qd.physics.launch import Launcher
 from newton_qd.physics.model import load_system, newton_builder
-from newton_qd.physics.precision import kernels
 from newton_qd.physics.system import JointKind, System
 from newton_qd.robots import Robot
 
@@ -104,14 +103,13 @@ class NewtonQDSolver(SolverBase):
         _check_model(model, self._reference, robot)
         self._system = load_system(robot, "float32")
         self._worlds = model.world_count
-        nb, nv = self._system.nb, self._system.nv
+        nq, nv, nb = self._system.nq, self._system.nv, self._system.nb
         with wp.ScopedDevice(model.device):
-            self._v, self._v_new, self._force = (
-                wp.zeros((self._worlds, nv), dtype=wp.float32) for _ in range(3)
-            )
-            self.fault = wp.zeros(self._worlds, dtype=wp.float32)
-            self.impulse = wp.zeros((self._worlds, nb, 6), dtype=wp.float32)
-            self.normal_impulse = wp.zeros((self._worlds, nb), dtype=wp.float32)
+            self._inputs = self._zeros(nq + 2 * nv)
+            self._outputs = self._zeros(nq + nv + 7 * nb + 1)
+            self.impulse = self._zeros(nb, 6)
+            self.normal_impulse = self._zeros(nb)
+            self.fault = self._zeros()
         free = self._system.joint_kind[0] == JointKind.FREE
         self._root = (int(free), wp.vec3(*self._system.com[0]))
         self._launcher = functools.lru_cache(_HELD_STEPS)(
@@ -158,20 +156,14 @@ class NewtonQDSolver(SolverBase):
         force = self._rows("control.joint_f", joint_f, self._system.nv)
         q_new = self._rows("state_out.joint_q", state_out.joint_q, self._system.nq)
         qd_new = self._rows("state_out.joint_qd", state_out.joint_qd, self._system.nv)
+        worlds, x, y = self._worlds, self._inputs, self._outputs
+        reports = (self.impulse.reshape((worlds, -1)), self.normal_impulse, self.fault)
         with wp.ScopedDevice(self.model.device):
-            wp.launch(
-                to_origin,
-                dim=self._worlds,
-                inputs=[*self._root, q, qd, force],
-                outputs=[self._v, self._force],
-            )
-            self._launcher(float(dt)).forward(self._worlds, self._values(q, q_new))
-            wp.launch(
-                to_centre_of_mass,
-                dim=self._worlds,
-                inputs=[*self._root, q_new, self._v_new],
-                outputs=[qd_new],
-            )
+            sources = [*self._root, q, qd, force]
+            wp.launch(pack, dim=worlds, inputs=sources, outputs=[x])
+            self._launcher(float(dt)).forward(worlds, x.flatten(), y.flatten())
+            results = [q_new, qd_new, *reports]
+            wp.launch(unpack, dim=worlds, inputs=[*self._root, y], outputs=results)
         newton.eval_fk(self.model, state_out.joint_q, state_out.joint_qd, state_out)
 
     def notify_model_changed(self, flags: newton.ModelFlags | int) -> None:
@@ -193,13 +185,8 @@ class NewtonQDSolver(SolverBase):
             raise ValueError(f"{name} has shape {shape}; expected ({size},)")
         return array.reshape((self._worlds, columns))
 
-    def _values(self, q: wp.array, q_new: wp.array) -> object:
-        values = kernels(self._system.dtype).world.Values()
-        values.q, values.v, values.ctrl = q, self._v, self._force
-        values.q_new, values.v_new = q_new, self._v_new
-        values.impulse, values.normal_impulse = self.impulse, self.normal_impulse
-        values.fault = self.fault
-        return values
+    def _zeros(self, *shape: int) -> wp.array:
+        return wp.zeros((self._worlds, *shape), dtype=wp.float32)
 
 
 def _launcher(system: System, device: wp.Device, dt: float) -> Launcher:

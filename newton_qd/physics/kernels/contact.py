@@ -48,9 +48,13 @@ def contact_predictor(m: Model, sc: Scratch, row: Row, c: int):
     o = load(m.contact_obstacle, c)
     x = load(sc.pose, row.body + i)
     center = wp.transform_point(x, constant(m.contact_position, c))
-    frame = load(sc.pose, row.body) * constant(m.obstacle_frame, o)
-    at = wp.transform_point(wp.transform_inverse(frame), center)
-    normal = wp.transform_vector(frame, obstacle_normal(m, o, at))
+    # the world's axes are never turned: only the origin is elsewhere
+    frame = constant(m.obstacle_frame, o)
+    turn = wp.transform_get_rotation(frame)
+    world = wp.transform_get_translation(load(sc.pose, row.body))
+    from_obstacle = center - world - wp.transform_get_translation(frame)
+    at = wp.quat_rotate_inv(turn, from_obstacle)
+    normal = wp.quat_rotate(turn, obstacle_normal(m, o, at))
     radius = constant(m.contact_radius, c)
     gap = obstacle_distance(m, o, at) - radius
     r = center - radius * normal

@@ -1,14 +1,15 @@
-"""Between Newton's conventions for a free root and ours; float32, as Newton's states.
+"""Between Newton's arrays and the rows of a step; float32, as Newton's states.
 
 Newton's free joint has the velocity of the child's centre of mass, and its force acts
 there; ours are those of the child's origin. Both are in world axes, linear part first.
+Rows are as in ``world``: the force of every degree of freedom is its control.
 """
 
 import warp as wp
 
 
 @wp.kernel
-def to_origin(
+def pack(
     # system
     free_root: int,
     com: wp.vec3,
@@ -16,45 +17,60 @@ def to_origin(
     q: wp.array2d[float],
     qd: wp.array2d[float],
     joint_f: wp.array2d[float],
-    # out, first index: world
-    v: wp.array2d[float],
-    force: wp.array2d[float],
+    # out: q, v, force
+    x: wp.array2d[float],
 ):
-    """Move velocities (nv) and generalized forces (nv) to the origin of the root."""
+    """Write coordinates, and velocities and forces moved to the origin of the root."""
     w = wp.tid()
-    for k in range(qd.shape[1]):
-        v[w, k] = qd[w, k]
-        force[w, k] = joint_f[w, k]
+    nq = q.shape[1]
+    nv = qd.shape[1]
+    for k in range(nq):
+        x[w, k] = q[w, k]
+    for k in range(nv):
+        x[w, nq + k] = qd[w, k]
+        x[w, nq + nv + k] = joint_f[w, k]
     if free_root != 0:
-        turn = wp.quat(q[w, 3], q[w, 4], q[w, 5], q[w, 6])
-        arm = wp.quat_rotate(turn, com)
+        arm = wp.quat_rotate(wp.quat(q[w, 3], q[w, 4], q[w, 5], q[w, 6]), com)
         # v_origin = v_com - omega x arm
         moved = wp.cross(wp.vec3(qd[w, 3], qd[w, 4], qd[w, 5]), arm)
         # the same power at every velocity: torque_origin = torque_com + arm x force
         torque = wp.cross(arm, wp.vec3(joint_f[w, 0], joint_f[w, 1], joint_f[w, 2]))
         for k in range(3):
-            v[w, k] = qd[w, k] - moved[k]
-            force[w, 3 + k] = joint_f[w, 3 + k] + torque[k]
+            x[w, nq + k] = qd[w, k] - moved[k]
+            x[w, nq + nv + 3 + k] = joint_f[w, 3 + k] + torque[k]
 
 
 @wp.kernel
-def to_centre_of_mass(
+def unpack(
     # system
     free_root: int,
     com: wp.vec3,
-    # in, first index: world
-    q: wp.array2d[float],
-    v: wp.array2d[float],
+    # in: q, v, impulse, normal impulse, fault
+    y: wp.array2d[float],
     # out, first index: world
+    q: wp.array2d[float],
     qd: wp.array2d[float],
+    impulse: wp.array2d[float],
+    normal_impulse: wp.array2d[float],
+    fault: wp.array[float],
 ):
-    """Move velocities (nv) to the centre of mass of the root."""
+    """Read a step's results, with velocities moved to the root's centre of mass."""
     w = wp.tid()
-    for k in range(v.shape[1]):
-        qd[w, k] = v[w, k]
+    nq = q.shape[1]
+    nv = qd.shape[1]
+    n = impulse.shape[1]
+    for k in range(nq):
+        q[w, k] = y[w, k]
+    for k in range(nv):
+        qd[w, k] = y[w, nq + k]
+    for k in range(n):
+        impulse[w, k] = y[w, nq + nv + k]
+    for k in range(normal_impulse.shape[1]):
+        normal_impulse[w, k] = y[w, nq + nv + n + k]
+    fault[w] = y[w, nq + nv + n + normal_impulse.shape[1]]
     if free_root != 0:
-        turn = wp.quat(q[w, 3], q[w, 4], q[w, 5], q[w, 6])
-        omega = wp.vec3(v[w, 3], v[w, 4], v[w, 5])
-        moved = wp.cross(omega, wp.quat_rotate(turn, com))
+        arm = wp.quat_rotate(wp.quat(y[w, 3], y[w, 4], y[w, 5], y[w, 6]), com)
+        omega = wp.vec3(y[w, nq + 3], y[w, nq + 4], y[w, nq + 5])
+        moved = wp.cross(omega, arm)
         for k in range(3):
-            qd[w, k] = v[w, k] + moved[k]
+            qd[w, k] = y[w, nq + k] + moved[k]

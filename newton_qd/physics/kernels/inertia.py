@@ -15,13 +15,14 @@ def rigid_inertia(m: Model, sc: Scratch, row: Row, i: int):
     wrench is I a + v x* I v (Featherstone 2008, eq. 5.14 and 6.2).
     """
     x = load(sc.pose, row.body + i)
-    r = wp.quat_to_matrix(wp.transform_get_rotation(x))
     c = wp.transform_point(x, constant(m.com, i))
     mass = constant(m.mass, i)
     hm = mass * c
-    io = r * constant(m.inertia, i) * wp.transpose(r) + (
-        wp.dot(hm, c) * wp.identity(n=3, dtype=real) - wp.outer(hm, c)
-    )
+    spin = constant(m.inertia, i)
+    if load(m.isotropic, i) == 0:
+        r = wp.quat_to_matrix(wp.transform_get_rotation(x))
+        spin = r * constant(m.inertia, i) * wp.transpose(r)
+    io = spin + wp.dot(hm, c) * wp.identity(n=3, dtype=real) - wp.outer(hm, c)
     w = load(sc.twist_w, row.body + i)
     v = load(sc.twist_v, row.body + i)
     aw = load(sc.bias_w, row.body + i)

@@ -69,8 +69,15 @@ def hinge_joint(m: Model, sc: Scratch, row: Row, i: int):
         shift = qk
         sw = vec3()
         sv = a
-    motion = transform(shift * axis, wp.quat_from_axis_angle(axis, angle))
-    store(sc.pose, row.body + i, frame * motion * constant(m.child_frame_inverse, i))
+    turn = wp.quat_from_axis_angle(axis, angle)
+    # a is the joint's axis in world axes: a slide moves along it
+    x = transform(
+        wp.transform_get_translation(frame) + shift * a,
+        wp.transform_get_rotation(frame) * turn,
+    )
+    if load(m.child_moved, i) == 1:
+        x = x * constant(m.child_frame_inverse, i)
+    store(sc.pose, row.body + i, x)
     store(sc.axis_w, row.dof + k, sw)
     store(sc.axis_v, row.dof + k, sv)
     vw = load(sc.twist_w, row.body + p) + sw * vk

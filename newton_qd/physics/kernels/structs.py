@@ -32,9 +32,11 @@ class Model:
     joint_axis: wp.array[vec3]
     parent_frame: wp.array[transform]
     child_frame_inverse: wp.array[transform]
+    child_moved: wp.array[int]  # 0: the child frame is the identity
     mass: wp.array[real]
     com: wp.array[vec3]
     inertia: wp.array[mat33]
+    isotropic: wp.array[int]  # 1: the inertia does not depend on the rotation
     body_levels: int
     body_level_start: wp.array[int]
     body_level: wp.array[int]
