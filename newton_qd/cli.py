@@ -288,10 +288,14 @@ def _report(result: EvolveResult, out: Path) -> None:
         )
         print(f"results in {out}")
     if result.interrupted:
-        done = max(result.iteration, 0)
+        when = "before the initial population"
+        if result.iteration >= 0:
+            when = (
+                f"after generation {result.iteration} of {config.iterations}, "
+                "everything up to it is saved"
+            )
         print(
-            f"interrupted after generation {done} of {config.iterations}, everything "
-            "up to it is saved; continue with:\n"
+            f"interrupted {when}; continue with:\n"
             f"  newton-qd evolve --resume --out {shlex.quote(str(out))}"
         )
 

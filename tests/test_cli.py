@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -13,7 +15,9 @@ from test_evolve import SMALL, point_task
 
 import newton_qd
 from newton_qd import cli
+from newton_qd.qd.config import EvolveConfig
 from newton_qd.qd.folder import load_archive
+from newton_qd.qd.task import Task
 
 # QDax and what it imports warn about their own use of other packages.
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
@@ -77,6 +81,21 @@ def test_resume_starts_a_run_that_was_killed_too_early(tmp_path: Path) -> None:
     out = tmp_path / "run"
     assert call(*POINT, "--resume", "--out", out) == cli.OK
     assert (out / "archive.npz").exists()
+
+
+def test_a_signal_before_the_first_generation(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted_task(config: EvolveConfig) -> Task:
+        os.kill(os.getpid(), signal.SIGINT)
+        return point_task(config)
+
+    out = tmp_path / "run"
+    arguments = [*POINT, "--out", str(out)]
+    assert cli.main(arguments, task_factory=interrupted_task) == cli.INTERRUPTED
+    assert "interrupted before the initial population" in capsys.readouterr().out
+    assert [entry.name for entry in out.iterdir()] == ["config.json"]
+    assert call("evolve", "--resume", "--quiet", "--out", out) == cli.OK
 
 
 @pytest.mark.parametrize(

@@ -219,9 +219,7 @@ class PhysicsEnv(Env):
         start: PhysicsState = state.pipeline_state
         sound = _all_finite(action) & (state.info["fault"] == 0)
         nan = jnp.full_like(action, jnp.nan)
-        after, fault = physics.step(
-            self.system, start, jnp.where(sound, action, nan)
-        )
+        after, fault = physics.step(self.system, start, jnp.where(sound, action, nan))
         fault = jnp.maximum(state.info["fault"], fault)
         faulty = fault != 0
         action = jnp.where(sound, action, jnp.zeros_like(action))

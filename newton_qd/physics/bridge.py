@@ -14,12 +14,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import warp as wp
+from jax.core import Tracer
 from warp._src.jax.ffi import FfiCallable
 
 from newton_qd.physics import interrupts
 from newton_qd.physics.launch import Launcher
 from newton_qd.physics.precision import SCALARS, kernels
 from newton_qd.physics.system import System
+
+# Kernel modules other than ``inspect``: each is compiled as a whole.
+_MODULES = {"step_forward": "forward", "step_backward": "backward"}
 
 
 @functools.cache
@@ -35,6 +39,8 @@ def launcher(system: System, device: Any) -> Launcher:
 @contextlib.contextmanager
 def _errors_contained() -> Iterator[None]:
     """Turn what Warp would let through XLA's frames into an error that it reports."""
+    # notebooks put Python's own SIGINT handler back before every cell
+    interrupts.install()
     try:
         yield
     except Exception:
@@ -44,12 +50,11 @@ def _errors_contained() -> Iterator[None]:
 
 
 @functools.cache
-def _kernel_call(system: System, module: str, name: str, size: int) -> Any:
+def _kernel_call(system: System, name: str, size: int) -> Any:
     """A kernel as a function of contiguous rows.
 
     Args:
         system: The system.
-        module: Module of :mod:`newton_qd.physics.kernels`.
         name: Kernel; one that ends in ``_backward`` runs its adjoint, and takes the
             adjoints of the outputs as a second argument.
         size: Length of a row of the first argument.
@@ -59,13 +64,16 @@ def _kernel_call(system: System, module: str, name: str, size: int) -> Any:
         ``output_dims`` says how long. Under ``vmap`` the worlds share one launch.
     """
     real = SCALARS[system.dtype]
+    module = _MODULES.get(name, "inspect")
+    # the kernels that show a system are written for one lane
+    lanes = 1 if module == "inspect" else None
     loaded = getattr(kernels(system.dtype), module)
     kernel = getattr(loaded, name)
 
     def forward(x: wp.array(dtype=real), y: wp.array(dtype=real)):
         with _errors_contained():
             device = launcher(system, x.device)
-            device.launch(kernel, x.shape[0] // size, x, y)
+            device.launch(kernel, x.shape[0] // size, x, y, lanes=lanes)
 
     def backward(
         x: wp.array(dtype=real),
@@ -74,32 +82,38 @@ def _kernel_call(system: System, module: str, name: str, size: int) -> Any:
     ):
         with _errors_contained():
             device = launcher(system, x.device)
-            device.launch(kernel, x.shape[0] // size, x, y_bar, x_bar, adjoint=True)
+            worlds, arrays = x.shape[0] // size, (x, y_bar, x_bar)
+            device.launch(kernel, worlds, *arrays, adjoint=True, lanes=lanes)
 
     launcher(system, wp.device_from_jax(jax.devices()[0])).prepare(kernel)
     function = backward if name.endswith("_backward") else forward
     function.__name__ = function.__qualname__ = name
     # Warp loads the module of the function when a call is traced: the kernels' one
     function.__module__ = loaded.__name__
-    return wp.jax_callable(
+    call = wp.jax_callable(
         function,
         num_outputs=1,
         vmap_method="broadcast_all",
         graph_mode=wp.JaxCallableGraphMode.NONE,
     )
+    # Warp numbers and keeps every call that it traces, and XLA compiles each number:
+    # without jit that would be every eager call
+    return jax.jit(call, static_argnames="output_dims", inline=True)
 
 
-def _differentiable(forward: Any, backward: Any, size: int, output_size: int) -> Any:
-    """Reverse-mode function of one row, from two kernels."""
+def _differentiable(system: System, name: str, size: int, output_size: int) -> Any:
+    """Reverse-mode function of one row; the adjoint is compiled when first traced."""
 
     @jax.custom_vjp
     def run(x: jax.Array) -> jax.Array:
+        forward = _kernel_call(system, f"{name}_forward", size)
         return forward(x, output_dims=output_size)[0]
 
     def run_forward(x: jax.Array) -> tuple[jax.Array, jax.Array]:
         return run(x), x
 
     def run_backward(x: jax.Array, y_bar: jax.Array) -> tuple[jax.Array]:
+        backward = _kernel_call(system, f"{name}_backward", size)
         return (backward(x, y_bar, output_dims=size)[0],)
 
     run.defvjp(run_forward, run_backward)
@@ -122,12 +136,7 @@ def control_step(system: System) -> Any:
     interrupts.install()
     nq, nv, nb = system.nq, system.nv, system.nb
     size, output_size = nq + nv + system.nu, nq + nv + 7 * nb + 1
-    step = _differentiable(
-        _kernel_call(system, "forward", "step_forward", size),
-        _kernel_call(system, "backward", "step_backward", size),
-        size,
-        output_size,
-    )
+    step = _differentiable(system, "step", size, output_size)
     ends = np.cumsum([nq, nv, 6 * nb, nb])
 
     def run(q: jax.Array, v: jax.Array, control: jax.Array) -> tuple[jax.Array, ...]:
@@ -142,12 +151,7 @@ def control_step(system: System) -> Any:
 def kinematics(system: System) -> Any:
     """Differentiable poses (nb, 7) and twists (nb, 6) about O of one world."""
     size, output_size = system.nq + system.nv, 13 * system.nb
-    views = _differentiable(
-        _kernel_call(system, "inspect", "kinematics_forward", size),
-        _kernel_call(system, "inspect", "kinematics_backward", size),
-        size,
-        output_size,
-    )
+    views = _differentiable(system, "kinematics", size, output_size)
 
     def run(q: jax.Array, v: jax.Array) -> tuple[jax.Array, jax.Array]:
         y = views(jnp.concatenate([q, v])).reshape(system.nb, 13)
@@ -159,7 +163,7 @@ def kinematics(system: System) -> Any:
 def dynamics(system: System, q: jax.Array, v: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Mass matrix (nv, nv) and bias forces (nv,) of one world."""
     nv = system.nv
-    call = _kernel_call(system, "inspect", "dynamics_forward", system.nq + nv)
+    call = _kernel_call(system, "dynamics_forward", system.nq + nv)
     y = call(jnp.concatenate([q, v]), output_dims=nv * (nv + 1))[0]
     return y[: nv * nv].reshape(nv, nv), y[nv * nv :]
 
@@ -198,10 +202,8 @@ def from_jax(array: jax.Array, dtype: Any = None) -> Any:
     Raises:
         TypeError: ``array`` is traced.
     """
-    if isinstance(array, jax.core.Tracer):
+    if isinstance(array, Tracer):
         raise TypeError(
             "from_jax: array is traced; a DLPack view needs a concrete array"
         )
     return wp.from_jax(jax.block_until_ready(array), dtype=dtype)
-
-

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from newton_qd.physics import reference
 from newton_qd.physics.precision import SCALARS, kernels
 from newton_qd.physics.system import JointKind, System
 from newton_qd.physics.tree import Tree, build_tree
@@ -21,11 +22,6 @@ _PER_SOLVE_BODY = ("total_ww", "total_wv", "total_vv", "total_w", "total_v")
 _PER_SOLVE_BODY += ("passed_ww", "passed_wv", "passed_vv", "passed_w", "passed_v")
 _PER_SOLVE_BODY += ("lever_w", "lever_v", "effort", "change_w", "change_v")
 _REPORTED = ("impulse", "angular_impulse", "normal_impulse")
-
-
-def _frames_inverse(frames: np.ndarray) -> np.ndarray:
-    """Inverse of (n, 7) transforms, position and quaternion xyzw."""
-    return np.asarray([wp.transform_inverse(wp.transformd(*f)) for f in frames])
 
 
 def _with_world(table: np.ndarray) -> np.ndarray:
@@ -78,7 +74,7 @@ def _put_bodies(put: Any, system: System, tree: Tree, p: Any) -> None:
     put("v_start", _with_world(system.v_start), int)
     put("joint_axis", _with_world(system.joint_axis), p.vec3)
     put("parent_frame", _with_world(system.parent_frame), p.transform)
-    inverse = _frames_inverse(system.child_frame)
+    inverse = np.asarray([reference.inverse(frame) for frame in system.child_frame])
     put("child_frame_inverse", _with_world(inverse), p.transform)
     identity = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
     moved = np.any(system.child_frame != identity, axis=1)

@@ -15,7 +15,7 @@ from newton_qd.physics.precision import kernels
 from newton_qd.physics.system import System
 
 LANES = (1, 2, 4, 8, 16, 32)
-_GPU_BLOCK = 128
+_GPU_BLOCK = 256
 _MIN_WORLDS_PER_THREAD = 4
 _RESIDENT_WORLDS = 16384
 
@@ -30,7 +30,9 @@ def thread_count() -> int:
     if text is None:
         return len(os.sched_getaffinity(0))
     if not text.isdecimal() or int(text) < 1:
-        raise ValueError(f"NEWTON_QD_THREADS={text!r}: expected an integer of 1 or more")
+        raise ValueError(
+            f"NEWTON_QD_THREADS={text!r}: expected an integer of 1 or more"
+        )
     return int(text)
 
 
@@ -93,7 +95,12 @@ class Launcher:
         self.launch(kernel, worlds, x, y_bar, x_bar, adjoint=True)
 
     def launch(
-        self, kernel: Any, worlds: int, *arrays: Any, adjoint: bool = False
+        self,
+        kernel: Any,
+        worlds: int,
+        *arrays: Any,
+        adjoint: bool = False,
+        lanes: int | None = None,
     ) -> None:
         """Run a kernel, or its adjoint, on all worlds.
 
@@ -103,6 +110,7 @@ class Launcher:
             worlds: Number of worlds.
             *arrays: Warp arrays with a contiguous row per world.
             adjoint: Whether the kernel's adjoint is run.
+            lanes: Lanes per world on a GPU; chosen by the batch size if not given.
         """
         if worlds == 0:
             return
@@ -110,7 +118,7 @@ class Launcher:
             with self._lock:
                 self._launch_threads(kernel, worlds, arrays, adjoint)
             return
-        lanes = lane_count(worlds)
+        lanes = lanes or lane_count(worlds)
         resident = min(worlds, _RESIDENT_WORLDS)
         owner = wp.get_stream(self.device).cuda_stream
         for first in range(0, worlds, resident):

@@ -283,7 +283,7 @@ def build_system(robot: Robot, dtype: str) -> System:
     description = read_description(find_urdf(robot.urdf))
     builder = newton_builder(str(description.path), description.floating, robot.gravity)
     # The file's inertias are checked already; Newton would correct some silently.
-    model = builder.finalize(device="cpu", skip_validation_inertia=True)
+    model = builder.finalize(skip_validation_inertia=True)
     built = _read_newton(model, description)
     verify(built, description)
     bodies = [description.bodies[name] for name in built.body_names]

@@ -11,6 +11,7 @@ import newton
 import numpy as np
 import warp as wp
 from newton.solvers import SolverBase
+from warp._src import context
 
 from newton_qd.assets import find_urdf
 from newton_qd.physics.description import read_description
@@ -62,7 +63,7 @@ class NewtonQDSolver(SolverBase):
 
     The model is made of copies of one robot, one a world::
 
-        scene = newton.ModelBuilder(gravity=(0.0, 0.0, -robot.gravity))
+        scene = newton.ModelBuilder()
         scene.replicate(newton_builder(path, floating=True, gravity=robot.gravity), 64)
         model = scene.finalize()
         solver = NewtonQDSolver(model, robot)
@@ -76,8 +77,8 @@ class NewtonQDSolver(SolverBase):
 
     Joint velocities and forces follow Newton's convention: those of a free joint belong
     to the child's centre of mass. Nothing is differentiable by ``wp.Tape``; gradients
-    come from :func:`newton_qd.physics.step`. Step once with each ``dt`` before a CUDA
-    graph is captured, so that every buffer exists.
+    come from :func:`newton_qd.physics.step`. Step once with each ``dt``, eight at most,
+    before a CUDA graph is captured, so that every buffer exists and stays.
 
     Attributes:
         fault: (worlds,) 1 where the last step met a number that is not finite; such a
@@ -145,7 +146,7 @@ class NewtonQDSolver(SolverBase):
         self.validate_observables(observables)
         if not (math.isfinite(dt) and dt > 0.0):
             raise ValueError(f"dt={dt!r}; allowed: positive numbers of seconds")
-        if wp._src.context.runtime.tape is not None:
+        if getattr(context.runtime, "tape", None) is not None:
             raise RuntimeError(
                 "NewtonQDSolver.step inside wp.Tape would record no gradient; "
                 "differentiate newton_qd.physics.step with jax.grad instead"
@@ -164,7 +165,7 @@ class NewtonQDSolver(SolverBase):
             self._launcher(float(dt)).forward(worlds, x.flatten(), y.flatten())
             results = [q_new, qd_new, *reports]
             wp.launch(unpack, dim=worlds, inputs=[*self._root, y], outputs=results)
-        newton.eval_fk(self.model, state_out.joint_q, state_out.joint_qd, state_out)
+        newton.eval_fk(self.model, q_new.flatten(), qd_new.flatten(), state_out)
 
     def notify_model_changed(self, flags: newton.ModelFlags | int) -> None:
         """Checks again that every world is the robot.

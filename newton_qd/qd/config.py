@@ -55,7 +55,7 @@ class EvolveConfig:
 
     env_name: str = "ant_uni"
     seed: int = 0
-    iterations: int = 240
+    iterations: int = 400
     batch_size: int = 128
     episode_length: int = 100
     hidden: tuple[int, ...] = (32,)

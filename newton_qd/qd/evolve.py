@@ -87,9 +87,7 @@ def evolve(
         folder.check(resume=resume)
         require_extra("matplotlib", "viz")
     require_extra("qdax", "qd")
-    # First, so that it is what remains after the run: loading the physics inside
-    # the block would find another handler and leave Ctrl-C unprotected later.
-    interrupts.install()
+    interrupts.install()  # before the handlers below, so that it outlives them
     with ExitStack() as stack:
         stop = stack.enter_context(graceful_stop())
         task = task_factory(config)
@@ -104,9 +102,9 @@ def evolve(
         state = search.empty() if checkpoint is None else search.restore(checkpoint)
         save = _Saver(search, folder, checkpoint_seconds)
         state = _loop(search, state, config.iterations, display, stop, save)
+        save.now(state)
         result = _result(config, search.checkpoint(state), folder, begin)
         if folder is not None and state.iteration >= 0:
-            save.now(state)
             picture = archive_png(result.archive, config, task, state.iteration)
             folder.save_archive(result.archive, picture)
         return result
@@ -151,8 +149,8 @@ class _Saver:
             self.now(state)
 
     def now(self, state: SearchState) -> None:
-        """Saves."""
-        if self._folder is not None:
+        """Saves, if there is anything yet and a folder for it."""
+        if self._folder is not None and state.iteration >= 0:
             self._folder.save(self._search.checkpoint(state))
         self._saved_at = time.monotonic()
 

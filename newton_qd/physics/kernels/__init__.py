@@ -27,9 +27,13 @@ __syncwarp();
 """
 
 
-@wp.func_native(snippet=_SYNC, adj_snippet=_SYNC, replay_snippet=_SYNC)
-def sync():
-    """Wait for the other lanes of a warp; nothing on a CPU."""
+@wp.func_native(snippet=_SYNC, adj_snippet=_SYNC, replay_snippet="")
+def sync(lane: int):
+    """Wait for the other lanes of a warp; nothing on a CPU.
+
+    Takes an argument because Warp (1.19) leaves out the adjoint of a function that has
+    none: without it the reverse pass would run unsynchronised.
+    """
     ...
 
 

@@ -10,8 +10,8 @@ thus never negative and friction stays close to its cone.
 import warp as wp
 
 from . import real, stage, vec3
-from .smooth import gate, penetration
 from .memory import constant, load, store
+from .smooth import gate, penetration
 from .structs import Model, Row, Scratch
 
 # Hunt-Crossley factor and clipping switch over these fractions of their natural scale.
@@ -71,7 +71,9 @@ def contact_predictor(m: Model, sc: Scratch, row: Row, c: int):
     store(sc.normal, row.contact + c, normal)
     store(sc.velocity, row.contact + c, vc)
     store(sc.load, row.contact + c, push)
-    store(sc.weight_n, row.solve_contact + c, m.h * k * gate(reach, m.contact_smoothing))
+    store(
+        sc.weight_n, row.solve_contact + c, m.h * k * gate(reach, m.contact_smoothing)
+    )
     store(sc.weight_t, row.solve_contact + c, wt)
     store(sc.push, row.solve_contact + c, push * normal - wt * vt)
 
@@ -104,7 +106,11 @@ def contact_corrector(m: Model, sc: Scratch, row: Row, c: int):
     store(sc.normal_impulse, row.report + c, normal_impulse)
     store(sc.weight_n, row.solve_contact + c, real(0.0))
     store(sc.weight_t, row.solve_contact + c, wt)
-    store(sc.push, row.solve_contact + c, normal_impulse * n - wt * (vc - wp.dot(n, vc) * n))
+    store(
+        sc.push,
+        row.solve_contact + c,
+        normal_impulse * n - wt * (vc - wp.dot(n, vc) * n),
+    )
 
 
 @stage
@@ -112,6 +118,10 @@ def contact_impulse(sc: Scratch, row: Row, c: int):
     """Impulse that the corrector applied, friction at the new velocity included."""
     n = load(sc.normal, row.contact + c)
     dv = load(sc.slip, row.solve_contact + c)
-    j = load(sc.push, row.solve_contact + c) - load(sc.weight_t, row.solve_contact + c) * (dv - wp.dot(n, dv) * n)
+    j = load(sc.push, row.solve_contact + c) - load(
+        sc.weight_t, row.solve_contact + c
+    ) * (dv - wp.dot(n, dv) * n)
     store(sc.impulse, row.report + c, j)
-    store(sc.angular_impulse, row.report + c, wp.cross(load(sc.arm, row.contact + c), j))
+    store(
+        sc.angular_impulse, row.report + c, wp.cross(load(sc.arm, row.contact + c), j)
+    )

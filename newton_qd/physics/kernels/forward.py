@@ -23,7 +23,7 @@ def step_forward(
     # out
     y: wp.array[real],
 ):
-    """One control step of the worlds from ``first`` on; thread = world * lanes + lane."""
+    """One control step of worlds from ``first`` on; thread = world * lanes + lane."""
     tid = wp.tid()
     n = tid // lanes
     lane = tid - n * lanes

@@ -8,8 +8,8 @@ import warp as wp
 
 from . import real, sync, transform, vec3
 from .inertia import rigid_inertia
-from .simulate import kinematics
 from .memory import constant, load, store
+from .simulate import kinematics
 from .structs import Model, Row, Scratch, row_at
 
 
@@ -90,7 +90,7 @@ def seed_poses(m: Model, g: Scratch, row: Row, y_bar: wp.array[real], w: int):
 @wp.func_grad(seed_poses)
 def adj_seed_poses(m: Model, g: Scratch, row: Row, y_bar: wp.array[real], w: int):
     """Nothing: seeding is not part of the kinematics."""
-    sync()
+    sync(0)
 
 
 @wp.func
@@ -128,7 +128,7 @@ def dof_count(m: Model, i: int):
 
 @wp.func
 def dof_axis(m: Model, sc: Scratch, row: Row, i: int, a: int):
-    """Motion (angular, linear) about O of a unit velocity of dof ``a`` of joint ``i``."""
+    """Motion (angular, linear) about O of unit velocity of joint ``i``'s dof ``a``."""
     w = vec3()
     v = vec3()
     if load(m.joint_kind, i) == 0:
@@ -186,7 +186,15 @@ def store_dynamics(m: Model, sc: Scratch, row: Row, y: wp.array[real], w: int):
 
 
 @wp.kernel(enable_backward=False)
-def dynamics_forward(m: Model, first: int, slot_stride: int, lanes: int, sc: Scratch, x: wp.array[real], y: wp.array[real]):
+def dynamics_forward(
+    m: Model,
+    first: int,
+    slot_stride: int,
+    lanes: int,
+    sc: Scratch,
+    x: wp.array[real],
+    y: wp.array[real],
+):
     """Mass matrix and bias forces."""
     n = wp.tid()
     w = first + n
@@ -198,7 +206,15 @@ def dynamics_forward(m: Model, first: int, slot_stride: int, lanes: int, sc: Scr
 
 
 @wp.kernel(enable_backward=False)
-def kinematics_forward(m: Model, first: int, slot_stride: int, lanes: int, sc: Scratch, x: wp.array[real], y: wp.array[real]):
+def kinematics_forward(
+    m: Model,
+    first: int,
+    slot_stride: int,
+    lanes: int,
+    sc: Scratch,
+    x: wp.array[real],
+    y: wp.array[real],
+):
     """Poses and twists."""
     n = wp.tid()
     w = first + n

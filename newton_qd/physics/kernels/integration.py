@@ -3,7 +3,7 @@
 import warp as wp
 
 from . import quat, real, stage
-from .memory import constant, load, store
+from .memory import load, store
 from .structs import Model, Row, Scratch
 
 
@@ -21,7 +21,11 @@ def new_coordinates(m: Model, sc: Scratch, row: Row, i: int):
     k = load(m.v_start, i)
     if load(m.joint_kind, i) == 0:
         for j in range(3):
-            store(sc.q, row.q_next + a + j, load(sc.q, row.q + a + j) + h * load(sc.v, row.v_next + k + j))
+            store(
+                sc.q,
+                row.q_next + a + j,
+                load(sc.q, row.q + a + j) + h * load(sc.v, row.v_next + k + j),
+            )
         turn = wp.vector(
             h * load(sc.v, row.v_next + k + 3),
             h * load(sc.v, row.v_next + k + 4),
@@ -43,13 +47,17 @@ def new_coordinates(m: Model, sc: Scratch, row: Row, i: int):
         for j in range(4):
             store(sc.q, row.q_next + a + 3 + j, r1[j])
     else:
-        store(sc.q, row.q_next + a, load(sc.q, row.q + a) + h * load(sc.v, row.v_next + k))
+        store(
+            sc.q, row.q_next + a, load(sc.q, row.q + a) + h * load(sc.v, row.v_next + k)
+        )
 
 
 @wp.func
 def sinc_of_square(x: real):
     """sin(sqrt(x)) / sqrt(x) for x >= 0."""
-    y = real(1.0) - x / real(6.0) * (real(1.0) - x / real(20.0) * (real(1.0) - x / real(42.0)))
+    y = real(1.0) - x / real(6.0) * (
+        real(1.0) - x / real(20.0) * (real(1.0) - x / real(42.0))
+    )
     if x > real(1.0e-3):
         root = wp.sqrt(x)
         y = wp.sin(root) / root
@@ -60,7 +68,8 @@ def sinc_of_square(x: real):
 def cos_of_square(x: real):
     """cos(sqrt(x)) for x >= 0."""
     y = real(1.0) - x / real(2.0) * (
-        real(1.0) - x / real(12.0) * (real(1.0) - x / real(30.0) * (real(1.0) - x / real(56.0)))
+        real(1.0)
+        - x / real(12.0) * (real(1.0) - x / real(30.0) * (real(1.0) - x / real(56.0)))
     )
     if x > real(1.0e-3):
         y = wp.cos(wp.sqrt(x))

@@ -19,7 +19,11 @@ def world_frame(m: Model, sc: Scratch, row: Row):
     if m.free_root == 1:
         p = -vec3(load(sc.q, row.q + 0), load(sc.q, row.q + 1), load(sc.q, row.q + 2))
     zero = vec3()
-    store(sc.pose, row.body + 0, transform(p, quat(real(0.0), real(0.0), real(0.0), real(1.0))))
+    store(
+        sc.pose,
+        row.body + 0,
+        transform(p, quat(real(0.0), real(0.0), real(0.0), real(1.0))),
+    )
     store(sc.twist_w, row.body + 0, zero)
     store(sc.twist_v, row.body + 0, zero)
     store(sc.bias_w, row.body + 0, zero)
@@ -31,7 +35,9 @@ def free_joint(m: Model, sc: Scratch, row: Row, i: int):
     """Six dofs: velocity of the body origin, then angular velocity, world axes."""
     a = load(m.q_start, i)
     k = load(m.v_start, i)
-    p = vec3(load(sc.q, row.q + a), load(sc.q, row.q + a + 1), load(sc.q, row.q + a + 2))
+    p = vec3(
+        load(sc.q, row.q + a), load(sc.q, row.q + a + 1), load(sc.q, row.q + a + 2)
+    )
     r = quat(
         load(sc.q, row.q + a + 3),
         load(sc.q, row.q + a + 4),
@@ -41,8 +47,12 @@ def free_joint(m: Model, sc: Scratch, row: Row, i: int):
     x = load(sc.pose, row.body + load(m.body_parent, i)) * transform(p, r)
     store(sc.pose, row.body + i, x)
     at = wp.transform_get_translation(x)
-    vl = vec3(load(sc.v, row.v + k), load(sc.v, row.v + k + 1), load(sc.v, row.v + k + 2))
-    om = vec3(load(sc.v, row.v + k + 3), load(sc.v, row.v + k + 4), load(sc.v, row.v + k + 5))
+    vl = vec3(
+        load(sc.v, row.v + k), load(sc.v, row.v + k + 1), load(sc.v, row.v + k + 2)
+    )
+    om = vec3(
+        load(sc.v, row.v + k + 3), load(sc.v, row.v + k + 4), load(sc.v, row.v + k + 5)
+    )
     store(sc.twist_w, row.body + i, om)
     store(sc.twist_v, row.body + i, vl + wp.cross(at, om))
     store(sc.bias_w, row.body + i, vec3())
@@ -84,7 +94,11 @@ def hinge_joint(m: Model, sc: Scratch, row: Row, i: int):
     vv = load(sc.twist_v, row.body + p) + sv * vk
     store(sc.twist_w, row.body + i, vw)
     store(sc.twist_v, row.body + i, vv)
-    store(sc.bias_w, row.body + i, load(sc.bias_w, row.body + p) + wp.cross(vw, sw) * vk)
-    store(sc.bias_v, row.body + i, (
-        load(sc.bias_v, row.body + p) + (wp.cross(vw, sv) + wp.cross(vv, sw)) * vk
-    ))
+    store(
+        sc.bias_w, row.body + i, load(sc.bias_w, row.body + p) + wp.cross(vw, sw) * vk
+    )
+    store(
+        sc.bias_v,
+        row.body + i,
+        (load(sc.bias_v, row.body + p) + (wp.cross(vw, sv) + wp.cross(vv, sw)) * vk),
+    )

@@ -17,7 +17,7 @@ def kinematics(m: Model, sc: Scratch, row: Row, lane: int, lanes: int):
     """Poses, twists and bias accelerations, root to leaves."""
     if lane == 0:
         world_frame(m, sc, row)
-    sync()
+    sync(lane)
     for level in range(m.body_levels):
         start = load(m.body_level_start, level)
         for p in range(start + lane, load(m.body_level_start, level + 1), lanes):
@@ -26,7 +26,7 @@ def kinematics(m: Model, sc: Scratch, row: Row, lane: int, lanes: int):
                 free_joint(m, sc, row, i)
             else:
                 hinge_joint(m, sc, row, i)
-        sync()
+        sync(lane)
 
 
 @stage
@@ -42,7 +42,7 @@ def linear_solve(m: Model, sc: Scratch, row: Row, lane: int, lanes: int):
             gather(m, sc, row, i)
             if load(m.joint_kind, i) != 0:
                 eliminate_hinge(m, sc, row, i)
-        sync()
+        sync(lane)
     for level in range(m.body_levels):
         start = load(m.body_level_start, level)
         for p in range(start + lane, load(m.body_level_start, level + 1), lanes):
@@ -51,10 +51,10 @@ def linear_solve(m: Model, sc: Scratch, row: Row, lane: int, lanes: int):
                 change_free(m, sc, row, i)
             else:
                 change_hinge(m, sc, row, i)
-        sync()
+        sync(lane)
     for c in range(lane, m.nc, lanes):
         contact_slip(m, sc, row, c)
-    sync()
+    sync(lane)
 
 
 @wp.func
@@ -73,14 +73,14 @@ def simulate(m: Model, sc: Scratch, slot: int, keep: int, lane: int, lanes: int)
                     contact_predictor(m, sc, row, c)
                 else:
                     contact_corrector(m, sc, row, c)
-            sync()
+            sync(lane)
             linear_solve(m, sc, row, lane, lanes)
         last = row_at(m, slot, keep, s, m.passes - 1)
         for k in range(lane, m.nv, lanes):
             new_velocity(sc, last, k)
         for c in range(lane, m.nc, lanes):
             contact_impulse(sc, last, c)
-        sync()
+        sync(lane)
         for i in range(1 + lane, m.nb + 1, lanes):
             new_coordinates(m, sc, last, i)
-        sync()
+        sync(lane)

@@ -32,7 +32,7 @@ def load_world(
         store(sc.v, row.v + k, constant(x, at + m.nq + k))
     for k in range(lane, m.nu, lanes):
         store(sc.ctrl, row.ctrl + k, constant(x, at + m.nq + m.nv + k))
-    sync()
+    sync(lane)
 
 
 @wp.func_grad(load_world)
@@ -49,6 +49,7 @@ def adj_load_world(
     lanes: int,
 ):
     """Hand the adjoints of the inputs to the caller; exactly 0 for a faulty world."""
+    sync(lane)
     at = w * (m.nq + m.nv + m.nu)
     good = sc.fault[slot] == 0
     for k in range(lane, m.nq, lanes):
@@ -63,7 +64,6 @@ def adj_load_world(
         value = load(g.ctrl, row.ctrl + k)
         store(x_bar, at + m.nq + m.nv + k, wp.where(good, value, real(0.0)))
         store(g.ctrl, row.ctrl + k, real(0.0))
-    sync()
 
 
 @wp.func
@@ -88,7 +88,7 @@ def detect_fault(m: Model, sc: Scratch, slot: int, lane: int):
         if not wp.isfinite(total):
             fault = 1
         sc.fault[slot] = fault
-    sync()
+    sync(lane)
 
 
 @wp.func
@@ -142,7 +142,7 @@ def store_impulses(
     lane: int,
     lanes: int,
 ):
-    """Write the contact impulses of world ``w``, none if it is faulty, and the fault."""
+    """Write the contact impulses of world ``w``, zero at a fault, and the fault."""
     good = sc.fault[slot] == 0
     at = w * output_size(m) + m.nq + m.nv
     for i in range(lane, m.nb, lanes):
@@ -202,7 +202,7 @@ def seed_world(
             store(g.impulse, report + c, linear)
             store(g.angular_impulse, report + c, angular)
             store(g.normal_impulse, report + c, normal)
-    sync()
+    sync(lane)
 
 
 @wp.func_grad(seed_world)
@@ -217,10 +217,10 @@ def adj_seed_world(
     lanes: int,
 ):
     """Nothing: seeding is not part of the step."""
-    sync()
+    sync(lane)
 
 
 @wp.func_grad(detect_fault)
 def adj_detect_fault(m: Model, sc: Scratch, slot: int, lane: int):
     """Nothing: a fault has no gradient."""
-    sync()
+    sync(lane)

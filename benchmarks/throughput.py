@@ -1,0 +1,91 @@
+"""Speed of one environment on the present device, forward and with gradient.
+
+Run as ``python benchmarks/throughput.py [--env ant_uni] [--batches 1024 4096]``. A
+figure counts only if every state stays finite; times are medians after a warm-up,
+with the result waited for.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import newton_qd
+
+
+def seconds(run: Callable[[], Any], repetitions: int) -> float:
+    """Median duration of ``run`` [s], after one run that is not counted."""
+    jax.block_until_ready(run())
+    times = []
+    for _ in range(repetitions):
+        start = time.perf_counter()
+        jax.block_until_ready(run())
+        times.append(time.perf_counter() - start)
+    return statistics.median(times)
+
+
+def measure(
+    name: str, batch: int, steps: int, horizon: int, repetitions: int
+) -> tuple[float, float]:
+    """Environment steps per second, forward and with gradient.
+
+    Args:
+        name: Environment.
+        batch: Number of worlds.
+        steps: Control steps of a forward run.
+        horizon: Control steps that a gradient walks back.
+        repetitions: Runs that the median is taken of.
+
+    Raises:
+        RuntimeError: A state or a gradient is not finite.
+    """
+    env = newton_qd.create(name)
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), batch))
+    shape = (steps, batch, env.action_size)
+    actions = jax.random.uniform(jax.random.key(1), shape, jnp.float32, -1, 1)
+
+    def rewards(actions: jax.Array) -> tuple[Any, jax.Array]:
+        def step(carry: Any, action: jax.Array) -> tuple[Any, jax.Array]:
+            carry = jax.vmap(env.step)(carry, action)
+            return carry, carry.reward
+
+        return jax.lax.scan(step, state, actions)
+
+    forward = jax.jit(rewards)
+    gradient = jax.jit(jax.grad(lambda actions: rewards(actions)[1].sum()))
+    last = forward(actions)[0]
+    slope = gradient(actions[:horizon])
+    if not (np.isfinite(last.obs).all() and np.isfinite(slope).all()):
+        raise RuntimeError(f"{name}, batch {batch}: a value is not finite")
+    forward_time = seconds(lambda: forward(actions), repetitions)
+    gradient_time = seconds(lambda: gradient(actions[:horizon]), repetitions)
+    return batch * steps / forward_time, batch * horizon / gradient_time
+
+
+def main() -> None:
+    """Print a table of speeds."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--env", default="ant_uni")
+    parser.add_argument("--batches", type=int, nargs="+", default=[128, 1024])
+    parser.add_argument("--steps", type=int, default=100)
+    parser.add_argument("--horizon", type=int, default=32)
+    parser.add_argument("--repetitions", type=int, default=5)
+    options = parser.parse_args()
+    print(f"{options.env} on {jax.devices()[0]}, thousand environment steps per second")
+    print("| batch | forward | forward + backward |\n|---|---|---|")
+    for batch in options.batches:
+        forward, gradient = measure(
+            options.env, batch, options.steps, options.horizon, options.repetitions
+        )
+        print(f"| {batch} | {forward / 1e3:.1f} | {gradient / 1e3:.1f} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,184 @@
+"""What the physics tests share: random states, compiled steps, reference formulas."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from urdf_text import row, write
+
+from newton_qd import physics
+from newton_qd.physics import reference
+from newton_qd.physics.model import build_system
+from newton_qd.physics.system import JointKind, PhysicsState, System
+from newton_qd.robots import Contact, Material, Robot
+
+Arrays = tuple[np.ndarray, ...]
+
+
+def variant(robot: Robot, dtype: str, **changes: Any) -> System:
+    """A system of a changed row; cached, because a system compiles its own calls."""
+    return physics.load_system(dataclasses.replace(robot, **changes), dtype)
+
+
+def random_states(system: System, rng: np.random.Generator, worlds: int) -> Arrays:
+    """Coordinates (n, nq), velocities (n, nv), actions (n, nu) of a legged robot.
+
+    The first half sinks, its lowest foot 10 to 20 mm deep in the ground; the second
+    half is up to 0.5 m above it.
+    """
+    q = np.tile(system.rest_q, (worlds, 1))
+    for body in np.flatnonzero(system.joint_kind != JointKind.FREE):
+        dof, at = system.v_start[body], system.q_start[body]
+        lower, upper = system.limit_lower[dof], system.limit_upper[dof]
+        q[:, at] = rng.uniform(lower - 0.1, upper + 0.1, worlds)
+    tilt = 0.15 * rng.normal(size=(worlds, 4)) + np.array([0.0, 0.0, 0.0, 1.0])
+    q[:, 3:7] = tilt / np.linalg.norm(tilt, axis=1, keepdims=True)
+    q[:, :2] = 5.0 * rng.normal(size=(worlds, 2))
+    half = worlds // 2
+    height = rng.uniform(-0.02, -0.01, worlds)
+    height[half:] = rng.uniform(0.0, 0.5, worlds - half)
+    for world in range(worlds):
+        q[world, 2] += height[world] - reference.lowest_contact(system, q[world])
+    v = rng.normal(size=(worlds, system.nv))
+    v[:half, 2] = -np.abs(v[:half, 2])
+    return q, v, rng.uniform(-1.0, 1.0, (worlds, system.nu))
+
+
+def one_step(system: System) -> Callable[..., tuple[jax.Array, ...]]:
+    """The step of one world as a function of arrays: q, v, impulse, normal, fault."""
+
+    def step(q: jax.Array, v: jax.Array, control: jax.Array) -> tuple[jax.Array, ...]:
+        state = physics.initial_state(system, q, v)
+        after, fault = physics.step(system, state, control)
+        return after.q, after.v, after.impulse, after.normal_impulse, fault
+
+    return step
+
+
+@functools.cache
+def batched_step(system: System) -> Callable[..., tuple[jax.Array, ...]]:
+    """The jitted step of a batch of worlds."""
+    return jax.jit(jax.vmap(one_step(system)))
+
+
+@functools.cache
+def rollout(system: System) -> Callable[..., PhysicsState]:
+    """A jitted rollout of one world: states (steps, ...) under controls (steps, nu)."""
+
+    def run(q: jax.Array, v: jax.Array, controls: jax.Array) -> PhysicsState:
+        def advance(state: PhysicsState, control: jax.Array) -> Any:
+            after, _ = physics.step(system, state, control)
+            return after, after
+
+        return jax.lax.scan(advance, physics.initial_state(system, q, v), controls)[1]
+
+    return jax.jit(run)
+
+
+def passive(system: System, steps: int) -> jax.Array:
+    """Controls (steps, nu) of zero."""
+    return jnp.zeros((steps, system.nu), system.dtype)
+
+
+@functools.cache
+def momentum(system: System) -> Callable[..., tuple[jax.Array, jax.Array]]:
+    """Linear momentum (3,), and angular momentum (3,) about the centre of mass."""
+    mass = np.asarray(system.mass, system.dtype)[:, None]
+    inertia = np.asarray(system.inertia, system.dtype)
+
+    def compute(q: jax.Array, v: jax.Array) -> tuple[jax.Array, jax.Array]:
+        bodies = physics.forward_kinematics(system, q, v)
+        x, y, z, w = (bodies.rotation[:, i] for i in range(4))
+        rows = (
+            (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+            (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+            (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+        )
+        rotation = jnp.stack([jnp.stack(r, axis=-1) for r in rows], axis=-2)
+        world = rotation @ inertia @ rotation.swapaxes(-1, -2)
+        spin = (world @ bodies.angular_velocity[:, :, None])[:, :, 0]
+        linear = mass * bodies.linear_velocity
+        centre = (mass * bodies.com).sum(axis=0) / mass.sum()
+        orbit = jnp.cross(bodies.com - centre, linear)
+        return linear.sum(axis=0), (orbit + spin).sum(axis=0)
+
+    return jax.jit(compute)
+
+
+def report(figure: str, value: object) -> None:
+    """Prints a measured figure: ``pytest -rP`` shows it."""
+    print(f"{figure}: {value}")
+
+
+def order(steps: np.ndarray, errors: np.ndarray) -> float:
+    """Slope of error against step size, both logarithmic."""
+    return float(np.polyfit(np.log(steps), np.log(errors), 1)[0])
+
+
+def penetration(gap: Any, width: float) -> np.ndarray:
+    """The smooth max(-gap, 0) of the contact law, design in docs/physics.md."""
+    u = np.clip(width - gap, 0.0, None)
+    inside = u**3 * (3 * width + gap) / (16 * width**3)
+    return np.where(gap <= -width, -gap, inside)
+
+
+BOX_MASS = 4.0  # [kg]
+BOX_HEIGHT = 0.07  # of its centre when its spheres just touch [m]
+_RADIUS = 0.02  # of its corner spheres [m]
+_BOX = f"""<robot name="box"><link name="box">
+  <inertial><mass value="{BOX_MASS}"/>
+    <inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial>
+  <collision><geometry><sphere radius="{_RADIUS}"/></geometry></collision>
+</link></robot>"""
+
+
+def box_system(folder: Path, angle: float, **material: Any) -> System:
+    """A free box on four corner spheres, on a plane that descends along x.
+
+    Args:
+        folder: Where to write the URDF file.
+        angle: Slope of the plane [rad].
+        **material: Changes of the default material.
+    """
+    robot = row(
+        write(folder, _BOX),
+        "box",
+        contacts=(Contact("box"),),
+        dt=0.01,
+        substeps=1,
+        material=Material(**material),
+    )
+    system = build_system(robot, "float64")
+    down = _RADIUS - BOX_HEIGHT
+    corners = [[x, y, down] for x in (-0.2, 0.2) for y in (-0.2, 0.2)]
+    tilt = reference.axis_quaternion(np.array([0.0, 1.0, 0.0]), angle)
+    return dataclasses.replace(
+        system,
+        contact_body=np.zeros(4, np.int32),
+        contact_obstacle=np.zeros(4, np.int32),
+        contact_position=np.array(corners),
+        contact_radius=np.full(4, _RADIUS),
+        obstacle_frame=np.concatenate([np.zeros(3), tilt])[None],
+    )
+
+
+def resting_gap(system: System, gravity: float) -> float:
+    """Gap at which the contacts carry the weight, found by bisection [m]."""
+    carried = system.total_mass * gravity / len(system.contact_body)
+    deep = carried / system.contact_stiffness
+    width = system.robot.material.smoothing
+    low, high = -max(deep, width), width
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        if penetration(middle, width) > deep:
+            low = middle
+        else:
+            high = middle
+    return low
