@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
 import os
 import threading
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import warp as wp
@@ -13,6 +11,7 @@ import warp as wp
 from newton_qd.physics import buffers
 from newton_qd.physics.precision import kernels
 from newton_qd.physics.system import System
+from newton_qd.physics.workers import Worker
 
 LANES = (1, 2, 4, 8, 16, 32)
 _GPU_BLOCK = 256
@@ -65,7 +64,7 @@ class Launcher:
         self._block = 1 if device.is_cpu else _GPU_BLOCK
         self._scratch: dict[tuple[bool, Any], tuple[int, Any]] = {}
         self._commands: dict[tuple[str, Any], Any] = {}
-        self._pool: ThreadPoolExecutor | None = None
+        self._workers: list[Worker] = []
         self._lock = threading.Lock()
 
     def prepare(self, kernel: Any) -> None:
@@ -132,23 +131,21 @@ class Launcher:
         """Split the worlds over threads; each walks through its share in one slot."""
         threads = min(thread_count(), -(-worlds // _MIN_WORLDS_PER_THREAD))
         bounds = [worlds * n // threads for n in range(threads + 1)]
-        if threads > 1 and self._pool is None:
-            self._pool = ThreadPoolExecutor(
-                thread_count(), thread_name_prefix="newton_qd"
-            )
+        while len(self._workers) < threads - 1:
+            self._workers.append(Worker(f"newton_qd-{len(self._workers) + 1}"))
         # memory of its own for each thread: shared cache lines would slow all down
         commands = [
             self._command(kernel, thread, 1, arrays, adjoint)
             for thread in range(threads)
         ]
-        shares = [
-            self._pool.submit(_send, commands[n], arrays, end - first, first, 0, 1)  # type: ignore[union-attr]
-            for n, (first, end) in enumerate(itertools.pairwise(bounds))
-            if n > 0
-        ]
-        _send(commands[0], arrays, bounds[1], 0, 0, 1)
-        for share in shares:
-            share.result()
+        for n, worker in enumerate(self._workers[: threads - 1], 1):
+            count = bounds[n + 1] - bounds[n]
+            worker.start(_send, commands[n], arrays, count, bounds[n], 0, 1)
+        try:
+            _send(commands[0], arrays, bounds[1], 0, 0, 1)
+        finally:
+            for worker in self._workers[: threads - 1]:
+                worker.wait()
 
     def _command(
         self,
