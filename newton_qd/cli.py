@@ -174,7 +174,9 @@ def _integers(text: str, separator: str) -> tuple[int, ...]:
 def _envs() -> int:
     """Prints a table of the registered environments."""
     import newton_qd
+    from newton_qd.physics.precision import quiet
 
+    quiet()
     rows = [("name", "observation", "action", "descriptor", "reward offset")]
     for name in newton_qd.registered_envs():
         env: Any = newton_qd.create(name)
@@ -202,10 +204,12 @@ def _evolve(
             f"{arguments.checkpoint_seconds!r}"
         )
     # Imports JAX and the physics: an argument error above does not wait for it.
+    from newton_qd.physics.precision import quiet
     from newton_qd.qd.evolve import evolve
     from newton_qd.qd.search import SearchError
     from newton_qd.qd.task import make_task
 
+    quiet()
     try:
         result = evolve(
             config,

@@ -27,7 +27,9 @@ def thread_count() -> int:
     """
     text = os.environ.get("NEWTON_QD_THREADS")
     if text is None:
-        return len(os.sched_getaffinity(0))
+        if hasattr(os, "sched_getaffinity"):  # Linux
+            return len(os.sched_getaffinity(0))
+        return os.cpu_count() or 1
     if not text.isdecimal() or int(text) < 1:
         raise ValueError(
             f"NEWTON_QD_THREADS={text!r}: expected an integer of 1 or more"
@@ -43,7 +45,7 @@ def lane_count(worlds: int) -> int:
     """
     text = os.environ.get("NEWTON_QD_LANES")
     if text is None:
-        return 8 if worlds <= 4096 else 4
+        return 16 if worlds <= 8192 else 8
     if not text.isdecimal() or int(text) not in LANES:
         raise ValueError(f"NEWTON_QD_LANES={text!r}: expected one of {LANES}")
     return int(text)

@@ -42,3 +42,8 @@ def kernels(dtype: str) -> SimpleNamespace:
         if (_TEMPLATE / f"{module}.py").exists()
     }
     return SimpleNamespace(package=package, **loaded)
+
+
+def quiet() -> None:
+    """Keep Warp's notices off the terminal, for programs with output of their own."""
+    wp.config.log_level = wp.LOG_WARNING

@@ -41,8 +41,9 @@ def step(
 
     Returns:
         The next state, and the fault () int32: 0, or 1 where anything was not
-        finite; then ``q`` and ``v`` are the given ones, the impulses are zero and
-        every gradient through the step is exactly zero.
+        finite; then ``q`` and ``v`` are the given ones (the default pose at rest if
+        those are not finite), the impulses are zero and every gradient through the
+        step is exactly zero.
     """
     q, v, impulse, normal_impulse, fault = bridge.control_step(system)(
         state.q, state.v, control
