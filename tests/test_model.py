@@ -154,14 +154,14 @@ def test_arrays_are_typed_and_read_only(ant: System) -> None:
 
 def test_reference_agrees_with_newton(ant: System) -> None:
     path = str(find_urdf("ant.urdf"))
-    built = model.newton_builder(path, True, 9.8).finalize(device="cpu")
+    built = model.newton_builder(path, True, 9.8).finalize()
     rng = np.random.default_rng(0)
     for _ in range(5):
         q = rng.normal(size=ant.nq)
         q[3:7] /= np.linalg.norm(q[3:7])
         state = built.state()
-        coordinates = wp.array(q, dtype=wp.float32, device="cpu")
-        speeds = wp.zeros(ant.nv, dtype=wp.float32, device="cpu")
+        coordinates = wp.array(q, dtype=wp.float32, device=built.device)
+        speeds = wp.zeros(ant.nv, dtype=wp.float32, device=built.device)
         newton.eval_fk(built, coordinates, speeds, state)
         frames = reference.body_frames(ant, q)
         assert state.body_q is not None

@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import math
 import warnings
+from typing import Any
 
 import newton
 import numpy as np
@@ -100,7 +101,7 @@ class NewtonQDSolver(SolverBase):
         """
         super().__init__(model)
         self.robot = robot
-        self._reference = _one_world(robot)
+        self._reference = _one_world(robot, model.device)
         _check_model(model, self._reference, robot)
         self._system = load_system(robot, "float32")
         self._worlds = model.world_count
@@ -201,7 +202,7 @@ def _launcher(system: System, device: wp.Device, dt: float) -> Launcher:
     return Launcher(driven, device)
 
 
-def _one_world(robot: Robot) -> newton.Model:
+def _one_world(robot: Robot, device: Any) -> newton.Model:
     """Returns what Newton makes of the robot alone, as its users would build it."""
     path = find_urdf(robot.urdf)
     floating = read_description(path).floating
@@ -209,7 +210,7 @@ def _one_world(robot: Robot) -> newton.Model:
     with warnings.catch_warnings():
         # that it corrects inertias it has said of the caller's model already
         warnings.simplefilter("ignore", newton.NewtonWarning)
-        return builder.finalize(device="cpu")
+        return builder.finalize(device=device)
 
 
 def _check_model(model: newton.Model, one: newton.Model, robot: Robot) -> None:
