@@ -10,7 +10,7 @@ import warp as wp
 
 from newton_qd.physics import reference
 from newton_qd.physics.precision import SCALARS, kernels
-from newton_qd.physics.system import JointKind, System
+from newton_qd.physics.system import JointKind, ObstacleKind, System
 from newton_qd.physics.tree import Tree, build_tree
 
 # Scratch arrays by what they hold an entry for.
@@ -113,6 +113,10 @@ def _put_dofs(put: Any, system: System) -> None:
 
 
 def _put_contacts(put: Any, system: System, tree: Tree, p: Any) -> None:
+    if np.any(system.obstacle_kind == ObstacleKind.BOX):
+        raise NotImplementedError(
+            "obstacle_kind: a box has no contact kernel yet; allowed: plane, capsule"
+        )
     put("contact_start", tree.contact, int)
     put("contact_body", system.contact_body + 1, int)
     put("contact_position", system.contact_position, p.vec3)

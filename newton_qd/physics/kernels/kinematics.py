@@ -17,17 +17,17 @@ def world_frame(m: Model, sc: Scratch, row: Row):
     """Pose of the world frame seen from O."""
     p = vec3()
     if m.free_root == 1:
-        p = -vec3(load(sc.q, row.q + 0), load(sc.q, row.q + 1), load(sc.q, row.q + 2))
+        p = -vec3(load(sc.q, row.q), load(sc.q, row.q + 1), load(sc.q, row.q + 2))
     zero = vec3()
     store(
         sc.pose,
-        row.body + 0,
+        row.body,
         transform(p, quat(real(0.0), real(0.0), real(0.0), real(1.0))),
     )
-    store(sc.twist_w, row.body + 0, zero)
-    store(sc.twist_v, row.body + 0, zero)
-    store(sc.bias_w, row.body + 0, zero)
-    store(sc.bias_v, row.body + 0, vec3(real(0.0), real(0.0), m.gravity))
+    store(sc.twist_w, row.body, zero)
+    store(sc.twist_v, row.body, zero)
+    store(sc.bias_w, row.body, zero)
+    store(sc.bias_v, row.body, vec3(real(0.0), real(0.0), m.gravity))
 
 
 @stage
@@ -100,5 +100,5 @@ def hinge_joint(m: Model, sc: Scratch, row: Row, i: int):
     store(
         sc.bias_v,
         row.body + i,
-        (load(sc.bias_v, row.body + p) + (wp.cross(vw, sv) + wp.cross(vv, sw)) * vk),
+        load(sc.bias_v, row.body + p) + (wp.cross(vw, sv) + wp.cross(vv, sw)) * vk,
     )
