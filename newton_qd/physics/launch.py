@@ -83,18 +83,6 @@ class Launcher:
         """
         self.launch(self.kernels.forward.step_forward, worlds, x, y)
 
-    def backward(self, worlds: int, x: Any, y_bar: Any, x_bar: Any) -> None:
-        """Adjoint of one control step.
-
-        Args:
-            worlds: Number of worlds.
-            x: (worlds * inputs,) Warp array to read.
-            y_bar: (worlds * outputs,) adjoints of the outputs, to read.
-            x_bar: (worlds * inputs,) adjoints of the inputs, to write.
-        """
-        kernel = self.kernels.backward.step_backward
-        self.launch(kernel, worlds, x, y_bar, x_bar, adjoint=True)
-
     def launch(
         self,
         kernel: Any,
