@@ -19,11 +19,8 @@ from warp._src.jax.ffi import FfiCallable
 
 from newton_qd.physics import interrupts
 from newton_qd.physics.launch import Launcher
-from newton_qd.physics.precision import SCALARS, kernels
+from newton_qd.physics.precision import SCALARS
 from newton_qd.physics.system import System
-
-# Kernel modules other than ``inspect``: each is compiled as a whole.
-_MODULES = {"step_forward": "forward", "step_backward": "backward"}
 
 
 @functools.cache
@@ -64,16 +61,10 @@ def _kernel_call(system: System, name: str, size: int) -> Any:
         ``output_dims`` says how long. Under ``vmap`` the worlds share one launch.
     """
     real = SCALARS[system.dtype]
-    module = _MODULES.get(name, "inspect")
-    # the kernels that show a system are written for one lane
-    lanes = 1 if module == "inspect" else None
-    loaded = getattr(kernels(system.dtype), module)
-    kernel = getattr(loaded, name)
 
     def forward(x: wp.array(dtype=real), y: wp.array(dtype=real)):
         with _errors_contained():
-            device = launcher(system, x.device)
-            device.launch(kernel, x.shape[0] // size, x, y, lanes=lanes)
+            launcher(system, x.device).launch(name, x.shape[0] // size, x, y)
 
     def backward(
         x: wp.array(dtype=real),
@@ -81,15 +72,14 @@ def _kernel_call(system: System, name: str, size: int) -> Any:
         x_bar: wp.array(dtype=real),
     ):
         with _errors_contained():
-            device = launcher(system, x.device)
             worlds, arrays = x.shape[0] // size, (x, y_bar, x_bar)
-            device.launch(kernel, worlds, *arrays, adjoint=True, lanes=lanes)
+            launcher(system, x.device).launch(name, worlds, *arrays, adjoint=True)
 
-    launcher(system, wp.device_from_jax(jax.devices()[0])).prepare(kernel)
     function = backward if name.endswith("_backward") else forward
     function.__name__ = function.__qualname__ = name
     # Warp loads the module of the function when a call is traced: the kernels' one
-    function.__module__ = loaded.__name__
+    default = launcher(system, wp.device_from_jax(jax.devices()[0]))
+    function.__module__ = default.prepare(name).name
     call = wp.jax_callable(
         function,
         num_outputs=1,

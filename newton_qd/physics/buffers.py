@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from newton_qd.physics import reference
-from newton_qd.physics.precision import SCALARS, kernels
+from newton_qd.physics.precision import kernels, pack_width
 from newton_qd.physics.system import JointKind, ObstacleKind, System
 from newton_qd.physics.tree import Tree, build_tree
 
@@ -39,12 +39,13 @@ def build_model(system: System, device: Any) -> Any:
     Returns:
         The struct of :mod:`newton_qd.physics.kernels.structs`.
     """
-    space = kernels(system.dtype)
-    package, tree = space.package, build_tree(system)
+    space = kernels(system.dtype, pack_width(system.dtype, device))
+    tree = build_tree(system)
     model = space.structs.Model()
     robot, material = system.robot, system.robot.material
 
-    def put(name: str, values: Any, dtype: Any) -> None:
+    def put(name: str, values: Any) -> None:
+        dtype = space.structs.Model.vars[name].type.dtype
         setattr(model, name, wp.array(np.asarray(values), dtype=dtype, device=device))
 
     model.nb, model.nq, model.nv = system.nb, system.nq, system.nv
@@ -53,12 +54,12 @@ def build_model(system: System, device: Any) -> Any:
     model.substeps, model.passes = robot.substeps, 2
     model.h = robot.dt / robot.substeps
     model.gravity = robot.gravity
-    put("rest_q", system.rest_q, package.real)
-    _put_bodies(put, system, tree, package)
+    put("rest_q", system.rest_q)
+    _put_bodies(put, system, tree)
     model.body_levels = len(tree.body_level[0]) - 1
     _put_dofs(put, system)
     model.limit_smoothing = material.limit_smoothing
-    _put_contacts(put, system, tree, package)
+    _put_contacts(put, system, tree)
     model.contact_stiffness = system.contact_stiffness
     model.contact_smoothing = material.smoothing
     model.friction = material.friction
@@ -67,37 +68,36 @@ def build_model(system: System, device: Any) -> Any:
     return model
 
 
-def _put_bodies(put: Any, system: System, tree: Tree, p: Any) -> None:
-    put("body_parent", tree.body_parent, int)
-    put("joint_kind", _with_world(system.joint_kind), int)
-    put("q_start", _with_world(system.q_start), int)
-    put("v_start", _with_world(system.v_start), int)
-    put("joint_axis", _with_world(system.joint_axis), p.vec3)
-    put("parent_frame", _with_world(system.parent_frame), p.transform)
+def _put_bodies(put: Any, system: System, tree: Tree) -> None:
+    put("body_parent", tree.body_parent)
+    put("joint_kind", _with_world(system.joint_kind))
+    put("q_start", _with_world(system.q_start))
+    put("v_start", _with_world(system.v_start))
+    put("joint_axis", _with_world(system.joint_axis))
+    put("parent_frame", _with_world(system.parent_frame))
     inverse = np.asarray([reference.inverse(frame) for frame in system.child_frame])
-    put("child_frame_inverse", _with_world(inverse), p.transform)
+    put("child_frame_inverse", _with_world(inverse))
     identity = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
     moved = np.any(system.child_frame != identity, axis=1)
-    put("child_moved", _with_world(moved.astype(np.int32)), int)
-    put("mass", _with_world(system.mass), p.real)
-    put("com", _with_world(system.com), p.vec3)
-    put("inertia", _with_world(system.inertia), p.mat33)
+    put("child_moved", _with_world(moved.astype(np.int32)))
+    put("mass", _with_world(system.mass))
+    put("com", _with_world(system.com))
+    put("inertia", _with_world(system.inertia))
     ball = system.inertia[:, :1, :1] * np.eye(3)
     isotropic = np.all(system.inertia == ball, axis=(1, 2))
-    put("isotropic", _with_world(isotropic.astype(np.int32)), int)
-    put("body_level_start", tree.body_level[0], int)
-    put("body_level", tree.body_level[1], int)
-    put("child_start", tree.child[0], int)
-    put("child", tree.child[1], int)
+    put("isotropic", _with_world(isotropic.astype(np.int32)))
+    put("body_level_start", tree.body_level[0])
+    put("body_level", tree.body_level[1])
+    put("child_start", tree.child[0])
+    put("child", tree.child[1])
 
 
 def _put_dofs(put: Any, system: System) -> None:
-    real = SCALARS[system.dtype]
     control = np.full(system.nv, -1, np.int32)
     control[system.control_dof] = np.arange(system.nu)
     gear = np.zeros(system.nv)
     gear[system.control_dof] = system.gear
-    put("dof_control", control, int)
+    put("dof_control", control)
     for name, values in {
         "gear": gear,
         "armature": system.armature,
@@ -109,32 +109,32 @@ def _put_dofs(put: Any, system: System) -> None:
         "limit_upper": np.clip(system.limit_upper, -1e9, 1e9),
         "limit_stiffness": system.limit_stiffness,
     }.items():
-        put(name, values, real)
+        put(name, values)
 
 
-def _put_contacts(put: Any, system: System, tree: Tree, p: Any) -> None:
+def _put_contacts(put: Any, system: System, tree: Tree) -> None:
     if np.any(system.obstacle_kind == ObstacleKind.BOX):
         raise NotImplementedError(
             "obstacle_kind: a box has no contact kernel yet; allowed: plane, capsule"
         )
-    put("contact_start", tree.contact, int)
-    put("contact_body", system.contact_body + 1, int)
-    put("contact_position", system.contact_position, p.vec3)
-    put("contact_radius", system.contact_radius, p.real)
-    put("contact_obstacle", system.contact_obstacle, int)
-    put("obstacle_kind", system.obstacle_kind, int)
-    put("obstacle_frame", system.obstacle_frame, p.transform)
-    put("obstacle_size", system.obstacle_size, p.vec3)
+    put("contact_start", tree.contact)
+    put("contact_body", system.contact_body + 1)
+    put("contact_position", system.contact_position)
+    put("contact_radius", system.contact_radius)
+    put("contact_obstacle", system.contact_obstacle)
+    put("obstacle_kind", system.obstacle_kind)
+    put("obstacle_frame", system.obstacle_frame)
+    put("obstacle_size", system.obstacle_size)
 
 
 def build_scratch(
     system: System, slots: int, device: Any, *, adjoint: bool
 ) -> SimpleNamespace:
-    """Allocate the intermediates of ``slots`` worlds in flight.
+    """Allocate the intermediates of ``slots`` packs of worlds in flight.
 
     Args:
         system: The system.
-        slots: Number of worlds that the scratch holds at once.
+        slots: Number of packs that the scratch holds at once.
         device: Warp device.
         adjoint: Whether every substep is kept, with adjoints; otherwise the substeps
             share their memory.
@@ -143,11 +143,12 @@ def build_scratch(
         ``values`` and ``adjoints`` (the latter ``values`` itself without adjoint),
         two ``Scratch`` structs, and ``bytes_per_slot``.
     """
-    space = kernels(system.dtype)
+    space = kernels(system.dtype, pack_width(system.dtype, device))
     values, adjoints = space.structs.Scratch(), space.structs.Scratch()
     n, nc = system.robot.substeps, max(len(system.contact_body), 1)
     steps, solves = (n, 2 * n) if adjoint else (1, 1)
     counts = {
+        "fault": 1,
         "q": (n + 1) * system.nq,
         "v": (n + 1) * system.nv,
         "ctrl": max(system.nu, 1),
@@ -170,7 +171,6 @@ def build_scratch(
         if adjoint:
             setattr(adjoints, name, array.grad)
             size += array.capacity // slots
-    values.fault = wp.zeros(slots, dtype=int, device=device)
     return SimpleNamespace(
         values=values,
         adjoints=adjoints if adjoint else values,

@@ -9,13 +9,15 @@ from typing import Any
 import warp as wp
 
 from newton_qd.physics import buffers
-from newton_qd.physics.precision import kernels
+from newton_qd.physics.precision import kernels, pack_width
 from newton_qd.physics.system import System
 from newton_qd.physics.workers import Worker
 
 LANES = (1, 2, 4, 8, 16, 32)
+# Kernel modules other than ``inspect``, whose kernels are written for one lane; each is
+# compiled as a whole.
+_MODULES = {"step_forward": "forward", "step_backward": "backward"}
 _GPU_BLOCK = 256
-_MIN_WORLDS_PER_THREAD = 4
 _RESIDENT_WORLDS = 16384
 
 
@@ -61,7 +63,8 @@ class Launcher:
     def __init__(self, system: System, device: Any) -> None:
         self.system = system
         self.device = device
-        self.kernels = kernels(system.dtype)
+        self.width = pack_width(system.dtype, device)
+        self.kernels = kernels(system.dtype, self.width)
         self.model = buffers.build_model(system, device)
         self._block = 1 if device.is_cpu else _GPU_BLOCK
         self._scratch: dict[tuple[bool, Any], tuple[int, Any]] = {}
@@ -69,9 +72,11 @@ class Launcher:
         self._workers: list[Worker] = []
         self._lock = threading.Lock()
 
-    def prepare(self, kernel: Any) -> None:
-        """Compile ``kernel`` now, rather than inside a callback."""
-        kernel.module.load(self.device, self._block)
+    def prepare(self, name: str) -> Any:
+        """Compile a kernel now, rather than inside a callback; returns its module."""
+        module = self._kernel(name).module
+        module.load(self.device, self._block)
+        return module
 
     def forward(self, worlds: int, x: Any, y: Any) -> None:
         """One control step; rows as :mod:`~newton_qd.physics.kernels.world` says.
@@ -81,46 +86,49 @@ class Launcher:
             x: (worlds * inputs,) Warp array to read.
             y: (worlds * outputs,) Warp array to write.
         """
-        self.launch(self.kernels.forward.step_forward, worlds, x, y)
+        self.launch("step_forward", worlds, x, y)
 
     def launch(
         self,
-        kernel: Any,
+        name: str,
         worlds: int,
         *arrays: Any,
         adjoint: bool = False,
-        lanes: int | None = None,
     ) -> None:
         """Run a kernel, or its adjoint, on all worlds.
 
         Args:
-            kernel: One whose arguments are the model, first world, slot stride, lanes,
-                scratch (and its adjoint), then ``arrays``.
+            name: Kernel whose arguments are the model, first world, slot stride,
+                worlds, lanes, scratch (and its adjoint), then ``arrays``.
             worlds: Number of worlds.
             *arrays: Warp arrays with a contiguous row per world.
             adjoint: Whether the kernel's adjoint is run.
-            lanes: Lanes per world on a GPU; chosen by the batch size if not given.
         """
         if worlds == 0:
             return
+        kernel = self._kernel(name)
         if self.device.is_cpu:
             with self._lock:
                 self._launch_threads(kernel, worlds, arrays, adjoint)
             return
-        lanes = lanes or lane_count(worlds)
+        lanes = lane_count(worlds) if name in _MODULES else 1
         resident = min(worlds, _RESIDENT_WORLDS)
         owner = wp.get_stream(self.device).cuda_stream
         for first in range(0, worlds, resident):
             count = min(resident, worlds - first)
             command = self._command(kernel, owner, resident, arrays, adjoint)
-            _send(command, arrays, count, first, 1, lanes)
+            _send(command, arrays, first, count, count * lanes, 1, lanes)
+
+    def _kernel(self, name: str) -> Any:
+        return getattr(getattr(self.kernels, _MODULES.get(name, "inspect")), name)
 
     def _launch_threads(
         self, kernel: Any, worlds: int, arrays: tuple[Any, ...], adjoint: bool
     ) -> None:
-        """Split the worlds over threads; each walks through its share in one slot."""
-        threads = min(thread_count(), -(-worlds // _MIN_WORLDS_PER_THREAD))
-        bounds = [worlds * n // threads for n in range(threads + 1)]
+        """Split the packs over threads; each walks through its share in one slot."""
+        packs = -(-worlds // self.width)
+        threads = min(thread_count(), packs)
+        bounds = [packs * n // threads * self.width for n in range(threads)] + [worlds]
         while len(self._workers) < threads - 1:
             self._workers.append(Worker(f"newton_qd-{len(self._workers) + 1}"))
         # memory of its own for each thread: shared cache lines would slow all down
@@ -129,13 +137,18 @@ class Launcher:
             for thread in range(threads)
         ]
         for n, worker in enumerate(self._workers[: threads - 1], 1):
-            count = bounds[n + 1] - bounds[n]
-            worker.start(_send, commands[n], arrays, count, bounds[n], 0, 1)
+            worker.start(self._send_share, commands[n], arrays, *bounds[n : n + 2])
         try:
-            _send(commands[0], arrays, bounds[1], 0, 0, 1)
+            self._send_share(commands[0], arrays, *bounds[:2])
         finally:
             for worker in self._workers[: threads - 1]:
                 worker.wait()
+
+    def _send_share(
+        self, command: Any, arrays: tuple[Any, ...], first: int, end: int
+    ) -> None:
+        worlds = end - first
+        _send(command, arrays, first, worlds, -(-worlds // self.width), 0, 1)
 
     def _command(
         self,
@@ -165,12 +178,12 @@ class Launcher:
         structs = self.kernels.structs
         held = [scratch.values, *([scratch.adjoints] if adjoint else [])]
         # adjoints travel through the scratch and ``arrays``, not through Warp's
-        unused = [structs.Model(), 0, 0, 0, *(structs.Scratch() for _ in held)]
+        unused = [structs.Model(), 0, 0, 0, 0, *(structs.Scratch() for _ in held)]
         unused += [None for _ in arrays]
         return wp.launch(
             kernel,
             dim=1,
-            inputs=[self.model, 0, 0, 1, *held, *arrays],
+            inputs=[self.model, 0, 0, 0, 1, *held, *arrays],
             adj_inputs=unused if adjoint else [],
             adjoint=adjoint,
             device=self.device,
@@ -182,14 +195,15 @@ class Launcher:
 def _send(
     command: Any,
     arrays: tuple[Any, ...],
-    count: int,
     first: int,
+    worlds: int,
+    threads: int,
     slot_stride: int,
     lanes: int,
 ) -> None:
-    """Launch a recorded command on ``count`` worlds from ``first`` on."""
-    command.set_dim(count * lanes)
-    for index, value in enumerate((first, slot_stride, lanes), 1):
+    """Launch a recorded command on ``worlds`` worlds from ``first`` on."""
+    command.set_dim(threads)
+    for index, value in enumerate((first, slot_stride, worlds, lanes), 1):
         command.set_param_at_index(index, value)
     begin = len(command.kernel.adj.args) - len(arrays)
     for index, array in enumerate(arrays, begin):

@@ -1,4 +1,4 @@
-"""The kernels in each precision."""
+"""The kernels in each precision and width."""
 
 from __future__ import annotations
 
@@ -8,31 +8,35 @@ import importlib.util
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
 _TEMPLATE = Path(__file__).parent / "kernels"
+_VECTOR_BYTES = 32
 SCALARS = {"float32": wp.float32, "float64": wp.float64}
 
 
 @functools.cache
-def kernels(dtype: str) -> SimpleNamespace:
-    """Load the kernel package for one scalar type.
+def kernels(dtype: str, width: int) -> SimpleNamespace:
+    """Load the kernel package for one scalar type and one width.
 
     Args:
         dtype: ``"float32"`` or ``"float64"``.
+        width: Worlds of a pack, see :mod:`newton_qd.physics.kernels`.
 
     Returns:
         The modules of :mod:`newton_qd.physics.kernels` as attributes, loaded under a
-        package name of their own so that Warp compiles each precision separately.
+        package name of their own so that Warp compiles each variant separately.
     """
-    name = f"newton_qd.physics.kernels_{dtype}"
+    name = f"newton_qd.physics.kernels_{dtype}_{width}"
     spec = importlib.util.spec_from_file_location(
         name, _TEMPLATE / "__init__.py", submodule_search_locations=[str(_TEMPLATE)]
     )
     assert spec is not None and spec.loader is not None
     package = importlib.util.module_from_spec(spec)
-    package.real = SCALARS[dtype]  # type: ignore[attr-defined]
+    package.scalar = SCALARS[dtype]  # type: ignore[attr-defined]
+    package.width = width  # type: ignore[attr-defined]
     sys.modules[name] = package
     spec.loader.exec_module(package)
     modules = ("structs", "world", "forward", "backward", "inspect")
@@ -42,6 +46,21 @@ def kernels(dtype: str) -> SimpleNamespace:
         if (_TEMPLATE / f"{module}.py").exists()
     }
     return SimpleNamespace(package=package, **loaded)
+
+
+def pack_width(dtype: str, device: Any) -> int:
+    """Worlds that one thread of a device computes side by side.
+
+    Args:
+        dtype: ``"float32"`` or ``"float64"``.
+        device: Warp device.
+
+    Returns:
+        1 on a GPU; on a CPU what fills a vector register of 256 bits.
+    """
+    if not device.is_cpu:
+        return 1
+    return _VECTOR_BYTES // (4 if dtype == "float32" else 8)
 
 
 def quiet() -> None:

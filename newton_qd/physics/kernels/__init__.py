@@ -1,8 +1,13 @@
-"""Warp kernels of one control step, in one precision.
+"""Warp kernels of one control step, in one precision, for packs of worlds.
 
 The package is a template: :func:`newton_qd.physics.precision.kernels` loads it once
-per scalar type under a name of its own, so that float32 and float64 come from one
-source. ``real`` is that type; the modules below import it and its vectors from here.
+per scalar type and width under a name of its own, so that float32 and float64, CPU
+and GPU come from one source. A thread computes ``width`` worlds side by side: as the
+elements of one vector instruction on a CPU, where they fill it, and one on a GPU,
+whose threads are such elements already. So ``real``, ``vec3`` and the other types
+below hold one value for each world of a pack; what :mod:`.algebra` does with them it
+does with each world by itself, and a world's result depends neither on its place in
+the pack nor on its neighbours.
 
 Rules that the adjoint needs (Warp 1.19): every intermediate is stored once per step;
 a function that is marked ``stage`` is skipped when a caller is replayed, so its
@@ -12,13 +17,16 @@ a variable of its own that is only stored afterwards.
 
 import warp as wp
 
-# Set by the loader before this file runs; float32 when imported directly.
-real = globals().get("real", wp.float32)
+# Set by the loader before this file runs; one world in float32 when imported directly.
+scalar = globals().get("scalar", wp.float32)
+width = globals().get("width", 1)
 
-if real is wp.float64:
-    vec3, quat, mat33, transform = wp.vec3d, wp.quatd, wp.mat33d, wp.transformd
-else:
-    vec3, quat, mat33, transform = wp.vec3f, wp.quatf, wp.mat33f, wp.transformf
+# One value for each world of a pack.
+real = wp.types.vector(length=width, dtype=scalar)
+vec3 = wp.types.matrix(shape=(3, width), dtype=scalar)
+quat = wp.types.matrix(shape=(4, width), dtype=scalar)
+transform = wp.types.matrix(shape=(7, width), dtype=scalar)
+mat33 = wp.types.matrix(shape=(9, width), dtype=scalar)
 
 _SYNC = """
 #if defined(__CUDA_ARCH__)

@@ -10,8 +10,25 @@ implicit in its new velocity and sit on its diagonal D.
 
 import warp as wp
 
-from . import mat33, real, stage, vec3
+from . import mat33, real, scalar, stage, vec3
+from .algebra import (
+    add,
+    add_diagonal,
+    component,
+    cross,
+    div,
+    dot,
+    inverse,
+    mul,
+    outer,
+    skew,
+    sub,
+    translation,
+    transpose,
+    vector,
+)
 from .memory import constant, load, store
+from .numbers import uniform
 from .smooth import gate, penetration
 from .structs import Model, Row, Scratch
 
@@ -22,7 +39,7 @@ def point_weight(sc: Scratch, row: Row, c: int):
     n = load(sc.normal, row.contact + c)
     wt = load(sc.weight_t, row.solve_contact + c)
     wn = load(sc.weight_n, row.solve_contact + c)
-    return (wn - wt) * wp.outer(n, n) + wt * wp.identity(n=3, dtype=real)
+    return add_diagonal((wn - wt) * outer(n, n), wt)
 
 
 @stage
@@ -39,13 +56,13 @@ def gather(m: Model, sc: Scratch, row: Row, i: int):
     for c in range(load(m.contact_start, i), load(m.contact_start, i + 1)):
         r = load(sc.point, row.contact + c)
         weight = point_weight(sc, row, c)
-        cross = wp.skew(r)
-        turned = weight * cross
+        lever = skew(r)
+        turned = weight * lever
         p = load(sc.push, row.solve_contact + c)
-        ww = ww - cross * turned
-        wv = wv - wp.transpose(turned)
+        ww = ww - lever * turned
+        wv = wv - transpose(turned)
         vv = vv + weight
-        n = n + wp.cross(r, p)
+        n = n + cross(r, p)
         f = f + p
     for j in range(load(m.child_start, i), load(m.child_start, i + 1)):
         child = row.solve_body + load(m.child, j)
@@ -57,8 +74,8 @@ def gather(m: Model, sc: Scratch, row: Row, i: int):
     at = row.solve_body + i
     body = row.body + i
     store(sc.total_ww, at, ww + load(sc.inertia, body))
-    store(sc.total_wv, at, wv + wp.skew(load(sc.moment, body)))
-    store(sc.total_vv, at, vv + constant(m.mass, i) * wp.identity(n=3, dtype=real))
+    store(sc.total_wv, at, wv + skew(load(sc.moment, body)))
+    store(sc.total_vv, at, add_diagonal(vv, constant(m.mass, i)))
     store(sc.total_w, at, n - m.h * load(sc.wrench_w, body))
     store(sc.total_v, at, f - m.h * load(sc.wrench_v, body))
 
@@ -76,7 +93,7 @@ def eliminate_hinge(m: Model, sc: Scratch, row: Row, i: int):
     ks = constant(m.stiffness, k)
     kl = constant(m.limit_stiffness, k)
     kd = constant(m.damping, k)
-    width = m.limit_smoothing
+    width = uniform(m.limit_smoothing)
     lower = ahead - constant(m.limit_lower, k)
     upper = constant(m.limit_upper, k) - ahead
     force = (
@@ -97,20 +114,20 @@ def eliminate_hinge(m: Model, sc: Scratch, row: Row, i: int):
     n = load(sc.total_w, at)
     f = load(sc.total_v, at)
     uw = ww * sw + wv * sv
-    uv = wp.transpose(wv) * sw + vv * sv
-    d = wp.dot(sw, uw) + wp.dot(sv, uv) + constant(m.armature, k) + implicit
-    inverse = real(1.0) / d
-    effort = h * force + wp.dot(sw, n) + wp.dot(sv, f)
-    scaled_w = inverse * uw
-    scaled_v = inverse * uv
-    store(sc.passed_ww, at, ww - wp.outer(uw, scaled_w))
-    store(sc.passed_wv, at, wv - wp.outer(uw, scaled_v))
-    store(sc.passed_vv, at, vv - wp.outer(uv, scaled_v))
+    uv = sw * wv + vv * sv
+    d = dot(sw, uw) + dot(sv, uv) + constant(m.armature, k) + implicit
+    share = scalar(1.0) / d
+    effort = h * force + dot(sw, n) + dot(sv, f)
+    scaled_w = share * uw
+    scaled_v = share * uv
+    store(sc.passed_ww, at, ww - outer(uw, scaled_w))
+    store(sc.passed_wv, at, wv - outer(uw, scaled_v))
+    store(sc.passed_vv, at, vv - outer(uv, scaled_v))
     store(sc.passed_w, at, n - effort * scaled_w)
     store(sc.passed_v, at, f - effort * scaled_v)
     store(sc.lever_w, at, scaled_w)
     store(sc.lever_v, at, scaled_v)
-    store(sc.effort, at, inverse * effort)
+    store(sc.effort, at, share * effort)
 
 
 @stage
@@ -130,8 +147,8 @@ def change_hinge(m: Model, sc: Scratch, row: Row, i: int):
     v = load(sc.change_v, up)
     dv = (
         load(sc.effort, at)
-        - wp.dot(load(sc.lever_w, at), w)
-        - wp.dot(load(sc.lever_v, at), v)
+        - dot(load(sc.lever_w, at), w)
+        - dot(load(sc.lever_v, at), v)
     )
     store(sc.dv, row.solve_dof + k, dv)
     store(sc.change_w, at, w + dv * load(sc.axis_w, row.dof + k))
@@ -143,39 +160,37 @@ def change_free(m: Model, sc: Scratch, row: Row, i: int):
     """Solve a free root's own equation: 6 x 6, by blocks."""
     at = row.solve_body + i
     k = load(m.v_start, i)
-    p = wp.transform_get_translation(load(sc.pose, row.body + i))
-    fj = m.h * vec3(
+    p = translation(load(sc.pose, row.body + i))
+    fj = m.h * vector(
         free_force(m, sc, row, k),
         free_force(m, sc, row, k + 1),
         free_force(m, sc, row, k + 2),
     )
-    nj = m.h * vec3(
+    nj = m.h * vector(
         free_force(m, sc, row, k + 3),
         free_force(m, sc, row, k + 4),
         free_force(m, sc, row, k + 5),
     )
     wv = load(sc.total_wv, at)
-    n = load(sc.total_w, at) + nj + wp.cross(p, fj)
+    n = load(sc.total_w, at) + nj + cross(p, fj)
     f = load(sc.total_v, at) + fj
-    inverse = wp.inverse(load(sc.total_vv, at))
-    reduced = wv * inverse
-    w = wp.inverse(load(sc.total_ww, at) - reduced * wp.transpose(wv)) * (
-        n - reduced * f
-    )
-    v = inverse * (f - wp.transpose(wv) * w)
+    compliance = inverse(load(sc.total_vv, at))
+    reduced = wv * compliance
+    w = inverse(load(sc.total_ww, at) - reduced * transpose(wv)) * (n - reduced * f)
+    v = compliance * (f - w * wv)
     store(sc.change_w, at, w)
     store(sc.change_v, at, v)
     # the joint's coordinates are the velocity of its origin and the angular velocity
-    origin = v + wp.cross(w, p)
+    origin = v + cross(w, p)
     for j in range(3):
-        store(sc.dv, row.solve_dof + k + j, origin[j])
-        store(sc.dv, row.solve_dof + k + 3 + j, w[j])
+        store(sc.dv, row.solve_dof + k + j, component(origin, j))
+        store(sc.dv, row.solve_dof + k + 3 + j, component(w, j))
 
 
 @wp.func
 def free_force(m: Model, sc: Scratch, row: Row, k: int):
     """Force on dof ``k`` of a free joint [N or N m]; none unless it is driven."""
-    force = real(0.0)
+    force = real()
     u = load(m.dof_control, k)
     if u >= 0:
         force = constant(m.gear, k) * load(sc.ctrl, row.ctrl + u)

@@ -2,10 +2,10 @@
 
 import warp as wp
 
-from . import real
+from . import scalar
 from .simulate import simulate
 from .structs import Model, Scratch, row_at
-from .world import detect_fault, load_world, seed_world
+from .world import detect_fault, load_world, pack_at, seed_world
 
 
 @wp.kernel
@@ -14,14 +14,15 @@ def step_backward(
     m: Model,
     first: int,
     slot_stride: int,
+    worlds: int,
     lanes: int,
     sc: Scratch,
     g: Scratch,
     # in
-    x: wp.array[real],
-    y_bar: wp.array[real],
+    x: wp.array[scalar],
+    y_bar: wp.array[scalar],
     # out
-    x_bar: wp.array[real],
+    x_bar: wp.array[scalar],
 ):
     """Launched with ``adjoint=True``: its forward part fills the scratch again.
 
@@ -30,9 +31,8 @@ def step_backward(
     tid = wp.tid()
     n = tid // lanes
     lane = tid - n * lanes
-    slot = n * slot_stride
-    w = first + n
-    load_world(m, sc, g, row_at(m, slot, 1, 0, 0), slot, x, x_bar, w, lane, lanes)
-    simulate(m, sc, slot, 1, lane, lanes)
-    detect_fault(m, sc, slot, lane)
-    seed_world(m, sc, g, slot, y_bar, w, lane, lanes)
+    pack = pack_at(n, first, worlds, slot_stride)
+    load_world(m, sc, g, row_at(m, pack.slot, 1, 0, 0), pack, x, x_bar, lane, lanes)
+    simulate(m, sc, pack.slot, 1, lane, lanes)
+    detect_fault(m, sc, pack.slot, lane)
+    seed_world(m, sc, g, pack, y_bar, lane, lanes)

@@ -2,10 +2,10 @@
 
 import warp as wp
 
-from . import real
+from . import scalar
 from .simulate import simulate
 from .structs import Model, Scratch, row_at
-from .world import detect_fault, load_world, store_impulses, store_state
+from .world import detect_fault, load_world, pack_at, store_impulses, store_state
 
 wp.set_module_options({"enable_backward": False})
 
@@ -16,21 +16,21 @@ def step_forward(
     m: Model,
     first: int,
     slot_stride: int,
+    worlds: int,
     lanes: int,
     sc: Scratch,
     # in
-    x: wp.array[real],
+    x: wp.array[scalar],
     # out
-    y: wp.array[real],
+    y: wp.array[scalar],
 ):
-    """One control step of worlds from ``first`` on; thread = world * lanes + lane."""
+    """One control step of worlds from ``first`` on; thread = pack * lanes + lane."""
     tid = wp.tid()
     n = tid // lanes
     lane = tid - n * lanes
-    slot = n * slot_stride
-    w = first + n
-    load_world(m, sc, sc, row_at(m, slot, 0, 0, 0), slot, x, x, w, lane, lanes)
-    simulate(m, sc, slot, 0, lane, lanes)
-    detect_fault(m, sc, slot, lane)
-    store_state(m, sc, slot, x, y, w, lane, lanes)
-    store_impulses(m, sc, slot, y, w, lane, lanes)
+    pack = pack_at(n, first, worlds, slot_stride)
+    load_world(m, sc, sc, row_at(m, pack.slot, 0, 0, 0), pack, x, x, lane, lanes)
+    simulate(m, sc, pack.slot, 0, lane, lanes)
+    detect_fault(m, sc, pack.slot, lane)
+    store_state(m, sc, pack, x, y, lane, lanes)
+    store_impulses(m, sc, pack, y, lane, lanes)

@@ -6,11 +6,26 @@ first), both about O; or the mass matrix, row by row, and the bias forces.
 
 import warp as wp
 
-from . import real, sync, transform, vec3
+from . import mat33, real, scalar, sync, vec3
+from .algebra import (
+    add,
+    add_diagonal,
+    component,
+    cross,
+    dot,
+    mul,
+    quaternion,
+    rigid,
+    skew,
+    translation,
+    vector,
+)
 from .inertia import rigid_inertia
-from .memory import constant, load, store
+from .memory import constant, gather, load, scatter, store
+from .numbers import uniform
 from .simulate import kinematics
 from .structs import Model, Row, Scratch, row_at
+from .world import Pack, pack_at
 
 
 @wp.func
@@ -19,16 +34,17 @@ def load_views(
     sc: Scratch,
     g: Scratch,
     row: Row,
-    x: wp.array[real],
-    x_bar: wp.array[real],
-    w: int,
+    x: wp.array[scalar],
+    x_bar: wp.array[scalar],
+    pack: Pack,
 ):
-    """Copy coordinates and velocities of world ``w`` into its slot."""
-    at = w * (m.nq + m.nv)
+    """Copy coordinates and velocities of a pack into its slot."""
+    size = m.nq + m.nv
+    at = pack.first * size
     for k in range(m.nq):
-        store(sc.q, row.q + k, constant(x, at + k))
+        store(sc.q, row.q + k, gather(x, at + k, size, pack.count))
     for k in range(m.nv):
-        store(sc.v, row.v + k, constant(x, at + m.nq + k))
+        store(sc.v, row.v + k, gather(x, at + m.nq + k, size, pack.count))
 
 
 @wp.func_grad(load_views)
@@ -37,18 +53,19 @@ def adj_load_views(
     sc: Scratch,
     g: Scratch,
     row: Row,
-    x: wp.array[real],
-    x_bar: wp.array[real],
-    w: int,
+    x: wp.array[scalar],
+    x_bar: wp.array[scalar],
+    pack: Pack,
 ):
     """Hand the adjoints of coordinates and velocities to the caller."""
-    at = w * (m.nq + m.nv)
+    size = m.nq + m.nv
+    at = pack.first * size
     for k in range(m.nq):
-        store(x_bar, at + k, load(g.q, row.q + k))
-        store(g.q, row.q + k, real(0.0))
+        scatter(x_bar, at + k, size, pack.count, load(g.q, row.q + k))
+        store(g.q, row.q + k, real())
     for k in range(m.nv):
-        store(x_bar, at + m.nq + k, load(g.v, row.v + k))
-        store(g.v, row.v + k, real(0.0))
+        scatter(x_bar, at + m.nq + k, size, pack.count, load(g.v, row.v + k))
+        store(g.v, row.v + k, real())
 
 
 @wp.func
@@ -58,37 +75,53 @@ def run_kinematics(m: Model, sc: Scratch, row: Row):
 
 
 @wp.func
-def store_poses(m: Model, sc: Scratch, row: Row, y: wp.array[real], w: int):
-    """Write poses and twists of world ``w``."""
+def store_poses(m: Model, sc: Scratch, row: Row, y: wp.array[scalar], pack: Pack):
+    """Write poses and twists of a pack."""
+    size = 13 * m.nb
     for i in range(m.nb):
-        at = (w * m.nb + i) * 13
+        at = pack.first * size + 13 * i
+        pose = load(sc.pose, row.body + i + 1)
         for j in range(7):
-            store(y, at + j, load(sc.pose, row.body + i + 1)[j])
+            scatter(y, at + j, size, pack.count, component(pose, j))
+        angular = load(sc.twist_w, row.body + i + 1)
+        linear = load(sc.twist_v, row.body + i + 1)
         for j in range(3):
-            store(y, at + 7 + j, load(sc.twist_w, row.body + i + 1)[j])
-            store(y, at + 10 + j, load(sc.twist_v, row.body + i + 1)[j])
+            scatter(y, at + 7 + j, size, pack.count, component(angular, j))
+            scatter(y, at + 10 + j, size, pack.count, component(linear, j))
 
 
 @wp.func
-def seed_poses(m: Model, g: Scratch, row: Row, y_bar: wp.array[real], w: int):
+def seed_vector(y_bar: wp.array[scalar], at: int, size: int, count: int) -> vec3:
+    """Three entries from ``at`` on of each row."""
+    return vector(
+        gather(y_bar, at, size, count),
+        gather(y_bar, at + 1, size, count),
+        gather(y_bar, at + 2, size, count),
+    )
+
+
+@wp.func
+def seed_poses(m: Model, g: Scratch, row: Row, y_bar: wp.array[scalar], pack: Pack):
     """Start the reverse pass with the caller's adjoints of poses and twists."""
+    size = 13 * m.nb
     for i in range(m.nb):
-        at = (w * m.nb + i) * 13
-        p = transform()
-        for j in range(7):
-            p[j] = constant(y_bar, at + j)
-        store(g.pose, row.body + i + 1, p)
-        angular = vec3()
-        linear = vec3()
-        for j in range(3):
-            angular[j] = constant(y_bar, at + 7 + j)
-            linear[j] = constant(y_bar, at + 10 + j)
+        at = pack.first * size + 13 * i
+        p = seed_vector(y_bar, at, size, pack.count)
+        r = quaternion(
+            gather(y_bar, at + 3, size, pack.count),
+            gather(y_bar, at + 4, size, pack.count),
+            gather(y_bar, at + 5, size, pack.count),
+            gather(y_bar, at + 6, size, pack.count),
+        )
+        store(g.pose, row.body + i + 1, rigid(p, r))
+        angular = seed_vector(y_bar, at + 7, size, pack.count)
+        linear = seed_vector(y_bar, at + 10, size, pack.count)
         store(g.twist_w, row.body + i + 1, angular)
         store(g.twist_v, row.body + i + 1, linear)
 
 
 @wp.func_grad(seed_poses)
-def adj_seed_poses(m: Model, g: Scratch, row: Row, y_bar: wp.array[real], w: int):
+def adj_seed_poses(m: Model, g: Scratch, row: Row, y_bar: wp.array[scalar], pack: Pack):
     """Nothing: seeding is not part of the kinematics."""
     sync(0)
 
@@ -99,17 +132,17 @@ def composite(m: Model, sc: Scratch, row: Row, i: int):
     at = row.solve_body + i
     body = row.body + i
     ww = load(sc.inertia, body)
-    wv = wp.skew(load(sc.moment, body))
-    vv = constant(m.mass, i) * wp.identity(n=3, dtype=real)
+    wv = skew(load(sc.moment, body))
+    vv = add_diagonal(mat33(), constant(m.mass, i))
     n = load(sc.wrench_w, body)
     f = load(sc.wrench_v, body)
     for j in range(load(m.child_start, i), load(m.child_start, i + 1)):
         child = row.solve_body + load(m.child, j)
-        ww += load(sc.total_ww, child)
-        wv += load(sc.total_wv, child)
-        vv += load(sc.total_vv, child)
-        n += load(sc.total_w, child)
-        f += load(sc.total_v, child)
+        ww = ww + load(sc.total_ww, child)
+        wv = wv + load(sc.total_wv, child)
+        vv = vv + load(sc.total_vv, child)
+        n = n + load(sc.total_w, child)
+        f = f + load(sc.total_v, child)
     store(sc.total_ww, at, ww)
     store(sc.total_wv, at, wv)
     store(sc.total_vv, at, vv)
@@ -132,11 +165,16 @@ def dof_axis(m: Model, sc: Scratch, row: Row, i: int, a: int):
     w = vec3()
     v = vec3()
     if load(m.joint_kind, i) == 0:
+        unit = vector(
+            uniform(scalar(a % 3 == 0)),
+            uniform(scalar(a % 3 == 1)),
+            uniform(scalar(a % 3 == 2)),
+        )
         if a < 3:
-            v[a] = real(1.0)
+            v = unit
         else:
-            w[a - 3] = real(1.0)
-            v = wp.cross(wp.transform_get_translation(load(sc.pose, row.body + i)), w)
+            w = unit
+            v = cross(translation(load(sc.pose, row.body + i)), unit)
     else:
         w = load(sc.axis_w, row.dof + load(m.v_start, i))
         v = load(sc.axis_v, row.dof + load(m.v_start, i))
@@ -144,8 +182,12 @@ def dof_axis(m: Model, sc: Scratch, row: Row, i: int, a: int):
 
 
 @wp.func
-def store_body(m: Model, sc: Scratch, row: Row, y: wp.array[real], out: int, i: int):
+def store_body(
+    m: Model, sc: Scratch, row: Row, y: wp.array[scalar], pack: Pack, i: int
+):
     """Rows of joint ``i``: M_kj = S_j . I_c S_k (Featherstone 2008, table 6.2)."""
+    size = m.nv * (m.nv + 1)
+    out = pack.first * size
     at = row.solve_body + i
     ww = load(sc.total_ww, at)
     wv = load(sc.total_wv, at)
@@ -153,36 +195,36 @@ def store_body(m: Model, sc: Scratch, row: Row, y: wp.array[real], out: int, i: 
     for a in range(dof_count(m, i)):
         k = load(m.v_start, i) + a
         sw, sv = dof_axis(m, sc, row, i, a)
-        bias = wp.dot(sw, load(sc.total_w, at)) + wp.dot(sv, load(sc.total_v, at))
-        store(y, out + m.nv * m.nv + k, bias)
+        bias = dot(sw, load(sc.total_w, at)) + dot(sv, load(sc.total_v, at))
+        scatter(y, out + m.nv * m.nv + k, size, pack.count, bias)
         angular = ww * sw + wv * sv
-        linear = wp.transpose(wv) * sw + vv * sv
+        linear = sw * wv + vv * sv
         up = int(i)
         while up > 0:
             for b in range(dof_count(m, up)):
                 tw, tv = dof_axis(m, sc, row, up, b)
                 j = load(m.v_start, up) + b
-                value = wp.dot(tw, angular) + wp.dot(tv, linear)
+                value = dot(tw, angular) + dot(tv, linear)
                 if j == k:
-                    value += constant(m.armature, k)
-                store(y, out + k * m.nv + j, value)
-                store(y, out + j * m.nv + k, value)
+                    value = value + constant(m.armature, k)
+                scatter(y, out + k * m.nv + j, size, pack.count, value)
+                scatter(y, out + j * m.nv + k, size, pack.count, value)
             up = load(m.body_parent, up)
 
 
 @wp.func
-def store_dynamics(m: Model, sc: Scratch, row: Row, y: wp.array[real], w: int):
-    """Write the mass matrix and the bias forces of world ``w``."""
+def store_dynamics(m: Model, sc: Scratch, row: Row, y: wp.array[scalar], pack: Pack):
+    """Write the mass matrix and the bias forces of a pack."""
     for i in range(1, m.nb + 1):
         rigid_inertia(m, sc, row, i)
     # children come after their parents
     for n in range(m.nb):
         composite(m, sc, row, m.nb - n)
-    out = w * m.nv * (m.nv + 1)
+    size = m.nv * (m.nv + 1)
     for k in range(m.nv * m.nv):
-        store(y, out + k, real(0.0))
+        scatter(y, pack.first * size + k, size, pack.count, real())
     for i in range(1, m.nb + 1):
-        store_body(m, sc, row, y, out, i)
+        store_body(m, sc, row, y, pack, i)
 
 
 @wp.kernel(enable_backward=False)
@@ -190,19 +232,18 @@ def dynamics_forward(
     m: Model,
     first: int,
     slot_stride: int,
+    worlds: int,
     lanes: int,
     sc: Scratch,
-    x: wp.array[real],
-    y: wp.array[real],
+    x: wp.array[scalar],
+    y: wp.array[scalar],
 ):
     """Mass matrix and bias forces."""
-    n = wp.tid()
-    w = first + n
-    slot = n * slot_stride
-    row = row_at(m, slot, 0, 0, 0)
-    load_views(m, sc, sc, row, x, x, w)
+    pack = pack_at(wp.tid(), first, worlds, slot_stride)
+    row = row_at(m, pack.slot, 0, 0, 0)
+    load_views(m, sc, sc, row, x, x, pack)
     kinematics(m, sc, row, 0, 1)
-    store_dynamics(m, sc, row, y, w)
+    store_dynamics(m, sc, row, y, pack)
 
 
 @wp.kernel(enable_backward=False)
@@ -210,19 +251,18 @@ def kinematics_forward(
     m: Model,
     first: int,
     slot_stride: int,
+    worlds: int,
     lanes: int,
     sc: Scratch,
-    x: wp.array[real],
-    y: wp.array[real],
+    x: wp.array[scalar],
+    y: wp.array[scalar],
 ):
     """Poses and twists."""
-    n = wp.tid()
-    w = first + n
-    slot = n * slot_stride
-    row = row_at(m, slot, 0, 0, 0)
-    load_views(m, sc, sc, row, x, x, w)
+    pack = pack_at(wp.tid(), first, worlds, slot_stride)
+    row = row_at(m, pack.slot, 0, 0, 0)
+    load_views(m, sc, sc, row, x, x, pack)
     kinematics(m, sc, row, 0, 1)
-    store_poses(m, sc, row, y, w)
+    store_poses(m, sc, row, y, pack)
 
 
 @wp.kernel
@@ -230,18 +270,17 @@ def kinematics_backward(
     m: Model,
     first: int,
     slot_stride: int,
+    worlds: int,
     lanes: int,
     sc: Scratch,
     g: Scratch,
-    x: wp.array[real],
-    y_bar: wp.array[real],
-    x_bar: wp.array[real],
+    x: wp.array[scalar],
+    y_bar: wp.array[scalar],
+    x_bar: wp.array[scalar],
 ):
     """Adjoint of the kinematics; launched with ``adjoint=True``."""
-    n = wp.tid()
-    w = first + n
-    slot = n * slot_stride
-    row = row_at(m, slot, 1, 0, 0)
-    load_views(m, sc, g, row, x, x_bar, w)
+    pack = pack_at(wp.tid(), first, worlds, slot_stride)
+    row = row_at(m, pack.slot, 1, 0, 0)
+    load_views(m, sc, g, row, x, x_bar, pack)
     run_kinematics(m, sc, row)
-    seed_poses(m, g, row, y_bar, w)
+    seed_poses(m, g, row, y_bar, pack)

@@ -1,100 +1,106 @@
 """Reading and writing one element of a contiguous array.
 
 Warp's own indexing multiplies by strides that it reads from memory, three times for
-a three-dimensional array; the step spends most of its time there. These compile to
-one instruction. As with Warp's, a load adds to the element's adjoint, and a store
+a three-dimensional array; the step would spend most of its time there. These compile
+to one address. As with Warp's, a load adds to the element's adjoint, and a store
 hands it over and clears it; a store is not repeated when a function is replayed.
 """
 
 import warp as wp
 
-from . import mat33, real, transform, vec3
+from . import mat33, real, scalar, transform, vec3, width
+from .native import CPP, PRELUDE
 
-_LOAD = "return a.data[i];"
-_ADJ_LOAD = """
+_LOAD = PRELUDE + "return Pack::out(Pack::in(a.data[i]));"
+_ADJ_LOAD = f"""
 #if defined(__CUDA_ARCH__)
 wp::atomic_add(a.grad + i, adj_ret);
 #else
-a.grad[i] = wp::add(a.grad[i], adj_ret);
+{PRELUDE}
+Pack::more(Pack::in(adj_ret), a.grad[i]);
 #endif
 """
-_STORE = "a.data[i] = value;"
-_ADJ_STORE = "adj_value = wp::add(adj_value, a.grad[i]); a.grad[i] = {};"
+_STORE = PRELUDE + "Pack::out(Pack::in(value), a.data[i]);"
+_ADJ_STORE = PRELUDE + "Pack::more(Pack::in(a.grad[i]), adj_value); a.grad[i] = {};"
 
 
-@wp.func_native(snippet=_LOAD, adj_snippet="")
+@wp.func_native(snippet="return a.data[i];", adj_snippet="")
 def load(a: wp.array[int], i: int) -> int:
     """Element ``i`` of ``a``."""
     ...
 
 
-@wp.func_native(snippet=_LOAD, adj_snippet="")
-def constant(a: wp.array[real], i: int) -> real:
-    """Element ``i`` of an array that has no adjoint."""
+for _pack in (real, vec3, transform, mat33):
+
+    @wp.func_native(snippet=_LOAD, adj_snippet=_ADJ_LOAD)
+    def load(a: wp.array[_pack], i: int) -> _pack:
+        """Element ``i`` of ``a``."""
+        ...
+
+    @wp.func_native(snippet=_STORE, adj_snippet=_ADJ_STORE, replay_snippet="")
+    def store(a: wp.array[_pack], i: int, value: _pack):
+        """Write element ``i`` of ``a``."""
+        ...
+
+
+# Entries of a table that all worlds share, and what they are in a pack.
+TABLES = {
+    real: scalar,
+    vec3: wp.types.vector(length=3, dtype=scalar),
+    mat33: wp.types.matrix(shape=(3, 3), dtype=scalar),
+    transform: wp.types.transformation(dtype=scalar),
+}
+
+for _pack, _entry in TABLES.items():
+    _CONSTANT = f"""
+{PRELUDE}
+{CPP[_pack][0]} value;
+for (int j = 0; j < sizeof(value) / sizeof(Real); ++j)
+    ((Real*)&value)[j] = Real(((const Number*)&a.data[i])[j]);
+return Pack::out(value);
+"""
+
+    @wp.func_native(snippet=_CONSTANT, adj_snippet="")
+    def constant(a: wp.array[_entry], i: int) -> _pack:
+        """Element ``i`` of a table without adjoint, the same for all worlds."""
+        ...
+
+
+@wp.func_native(
+    snippet=f"""
+{PRELUDE}
+Real value;
+#if defined(__CUDA_ARCH__)
+value = a.data[i];
+#else
+for (int j = 0; j < {width}; ++j)
+    value[j] = a.data[i + (j < count ? j : count - 1) * stride];
+#endif
+return Pack::out(value);""",
+    adj_snippet="",
+)
+def gather(a: wp.array[scalar], i: int, stride: int, count: int) -> real:
+    """Element ``i`` of a row and of the next ``count - 1`` rows, one world each.
+
+    Worlds of the pack beyond ``count`` repeat the last one. Without adjoint.
+    """
     ...
 
 
-@wp.func_native(snippet=_LOAD, adj_snippet="")
-def constant(a: wp.array[vec3], i: int) -> vec3:  # noqa: F811
-    """Element ``i`` of an array that has no adjoint."""
-    ...
-
-
-@wp.func_native(snippet=_LOAD, adj_snippet="")
-def constant(a: wp.array[mat33], i: int) -> mat33:  # noqa: F811
-    """Element ``i`` of an array that has no adjoint."""
-    ...
-
-
-@wp.func_native(snippet=_LOAD, adj_snippet="")
-def constant(a: wp.array[transform], i: int) -> transform:  # noqa: F811
-    """Element ``i`` of an array that has no adjoint."""
-    ...
-
-
-@wp.func_native(snippet=_LOAD, adj_snippet=_ADJ_LOAD)
-def load(a: wp.array[real], i: int) -> real:  # noqa: F811
-    """Element ``i`` of ``a``."""
-    ...
-
-
-@wp.func_native(snippet=_LOAD, adj_snippet=_ADJ_LOAD)
-def load(a: wp.array[vec3], i: int) -> vec3:  # noqa: F811
-    """Element ``i`` of ``a``."""
-    ...
-
-
-@wp.func_native(snippet=_LOAD, adj_snippet=_ADJ_LOAD)
-def load(a: wp.array[mat33], i: int) -> mat33:  # noqa: F811
-    """Element ``i`` of ``a``."""
-    ...
-
-
-@wp.func_native(snippet=_LOAD, adj_snippet=_ADJ_LOAD)
-def load(a: wp.array[transform], i: int) -> transform:  # noqa: F811
-    """Element ``i`` of ``a``."""
-    ...
-
-
-@wp.func_native(snippet=_STORE, adj_snippet=_ADJ_STORE, replay_snippet="")
-def store(a: wp.array[real], i: int, value: real):
-    """Write element ``i`` of ``a``."""
-    ...
-
-
-@wp.func_native(snippet=_STORE, adj_snippet=_ADJ_STORE, replay_snippet="")
-def store(a: wp.array[vec3], i: int, value: vec3):  # noqa: F811
-    """Write element ``i`` of ``a``."""
-    ...
-
-
-@wp.func_native(snippet=_STORE, adj_snippet=_ADJ_STORE, replay_snippet="")
-def store(a: wp.array[mat33], i: int, value: mat33):  # noqa: F811
-    """Write element ``i`` of ``a``."""
-    ...
-
-
-@wp.func_native(snippet=_STORE, adj_snippet=_ADJ_STORE, replay_snippet="")
-def store(a: wp.array[transform], i: int, value: transform):  # noqa: F811
-    """Write element ``i`` of ``a``."""
+@wp.func_native(
+    snippet=f"""
+{PRELUDE}
+Real it = Pack::in(value);
+#if defined(__CUDA_ARCH__)
+a.data[i] = it;
+#else
+for (int j = 0; j < {width}; ++j)
+    if (j < count) a.data[i + j * stride] = it[j];
+#endif
+""",
+    adj_snippet="",
+    replay_snippet="",
+)
+def scatter(a: wp.array[scalar], i: int, stride: int, count: int, value: real):
+    """Write element ``i`` of a row and of the next ``count - 1`` rows."""
     ...

@@ -1,29 +1,134 @@
-"""Compact, twice differentiable one-sided functions."""
+"""Smooth functions without a division by zero.
+
+The one-sided ones are compact and twice differentiable; those of a rotation are taken
+of its angle squared.
+"""
 
 import warp as wp
 
-from . import real
+from . import quat, real, vec3
+from .native import native
+
+_ZONES = """
+Real zero = Real(0), one = Real(1);
+Real u = WIDTH - GAP, s = WIDTH + GAP, cube = WIDTH * WIDTH * WIDTH;
+auto zones = [&](Real deep, Real near) {
+    return GAP <= -WIDTH ? deep : (GAP < WIDTH ? near : zero);
+};
+"""
 
 
-@wp.func
-def penetration(gap: real, width: real):
+@wp.func_native(
+    *native(
+        "zones(-GAP, u * u * u * (WIDTH + WIDTH + s) / (Real(16) * cube))",
+        """
+Real slope = u * u * (WIDTH + s) / (Real(4) * cube);
+Real widening = Real(3) * u * u * s * s / (Real(16) * cube * WIDTH);
+adj_GAP -= zones(one, slope) * adj_RET;
+adj_WIDTH += zones(zero, widening) * adj_RET;
+""",
+        _ZONES,
+    )
+)
+def penetration(gap: real, width: real) -> real:
     """Smooth ``max(-gap, 0)``: exact outside ``|gap| < width``."""
-    x = real(0.0)
-    if gap <= -width:
-        x = -gap
-    elif gap < width:
-        u = width - gap
-        x = u * u * u * (real(3.0) * width + gap) / (real(16.0) * width * width * width)
-    return x
+    ...
 
 
-@wp.func
-def gate(gap: real, width: real):
+@wp.func_native(
+    *native(
+        "zones(one, u * u * (WIDTH + s) / (Real(4) * cube))",
+        """
+Real slope = Real(3) * u * s / (Real(4) * cube);
+Real widening = Real(3) * u * s * GAP / (Real(4) * cube * WIDTH);
+adj_GAP -= zones(zero, slope) * adj_RET;
+adj_WIDTH += zones(zero, widening) * adj_RET;
+""",
+        _ZONES,
+    )
+)
+def gate(gap: real, width: real) -> real:
     """Slope ``-d penetration / d gap``, between 0 and 1."""
-    g = real(0.0)
-    if gap <= -width:
-        g = real(1.0)
-    elif gap < width:
-        u = width - gap
-        g = u * u * (real(2.0) * width + gap) / (real(4.0) * width * width * width)
-    return g
+    ...
+
+
+# sin(r) / r and cos(r) of x = r^2: by their series up to r = 1, which is accurate to
+# 1e-16 there, and world by world beyond
+_TRIGONOMETRY = """
+struct Trigonometry {
+    Real sinc, cosine;
+    CUDA_CALLABLE Trigonometry(Real x) {
+        sinc = cosine = Real(1);
+        for (int n = 16; n > 0; n -= 2) {
+            sinc = Real(1) - x * sinc * Real(Number(1) / (n * (n + 1)));
+            cosine = Real(1) - x * cosine * Real(Number(1) / (n * (n - 1)));
+        }
+#if defined(__CUDA_ARCH__)
+        if (x > Real(1)) set(x, sinc, cosine);
+#else
+        if (__builtin_reduce_max(x) > Number(1))
+            for (int i = 0; i < sizeof(Real) / sizeof(Number); ++i)
+                if (x[i] > Number(1)) {
+                    Number s, c;
+                    set(x[i], s, c);
+                    sinc[i] = s;
+                    cosine[i] = c;
+                }
+#endif
+    }
+    static CUDA_CALLABLE void set(Number x, Number& s, Number& c) {
+        Number r = wp::sqrt(x);
+        s = wp::sin(r) / r;
+        c = wp::cos(r);
+    }
+};
+"""
+
+
+@wp.func_native(
+    *native(
+        "Quat(AXIS[0] * s, AXIS[1] * s, AXIS[2] * s, t.cosine)",
+        """
+Vec3 d(adj_RET.x, adj_RET.y, adj_RET.z);
+adj_ANGLE += Real(0.5) * (t.cosine * wp::dot(AXIS, d) - s * adj_RET.w);
+for (int i = 0; i < 3; ++i) adj_AXIS[i] += s * d[i];
+""",
+        _TRIGONOMETRY
+        + """
+Real half = Real(0.5) * ANGLE;
+Trigonometry t(half * half);
+Real s = half * t.sinc;
+""",
+    )
+)
+def turn_about(axis: vec3, angle: real) -> quat:
+    """Rotation by an angle about a unit axis."""
+    ...
+
+
+@wp.func_native(
+    *native(
+        "Quat(A[0] * s, A[1] * s, A[2] * s, t.cosine)",
+        """
+// derivative of sinc with respect to x: (cos - sinc) / 2x, its series up to r = 1
+Real slope = Real(1);
+for (int n = 16; n > 2; n -= 2)
+    slope = Real(1) - x * slope * Real(Number(n) / ((n - 2) * n * (n + 1)));
+slope *= Real(Number(-1) / 6);
+slope = x > Real(1) ? (t.cosine - t.sinc) / (x + x) : slope;
+Vec3 d(adj_RET.x, adj_RET.y, adj_RET.z);
+// d x / d A = A / 2
+Real inward = Real(0.25) * (wp::dot(A, d) * slope - adj_RET.w * t.sinc);
+for (int i = 0; i < 3; ++i) adj_A[i] += s * d[i] + inward * A[i];
+""",
+        _TRIGONOMETRY
+        + """
+Real x = Real(0.25) * wp::dot(A, A);
+Trigonometry t(x);
+Real s = Real(0.5) * t.sinc;
+""",
+    )
+)
+def turn_by(a: vec3) -> quat:
+    """Exponential map: the rotation by the length of ``a`` about ``a``."""
+    ...

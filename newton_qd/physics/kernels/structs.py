@@ -2,7 +2,10 @@
 
 import warp as wp
 
-from . import mat33, real, transform, vec3
+from . import mat33, real, scalar, transform, vec3
+from .memory import TABLES
+
+_vec3, _mat33, _transform = TABLES[vec3], TABLES[mat33], TABLES[transform]
 
 
 @wp.struct
@@ -21,21 +24,21 @@ class Model:
     free_root: int  # 1: the origin O follows the position of the first joint
     substeps: int
     passes: int  # solves of a substep: predictor and corrector
-    h: real  # [s]
-    gravity: real  # [m/s^2]
-    rest_q: wp.array[real]  # (nq,)
+    h: scalar  # [s]
+    gravity: scalar  # [m/s^2]
+    rest_q: wp.array[scalar]  # (nq,)
     # bodies, (nb + 1)
     body_parent: wp.array[int]
     joint_kind: wp.array[int]
     q_start: wp.array[int]
     v_start: wp.array[int]
-    joint_axis: wp.array[vec3]
-    parent_frame: wp.array[transform]
-    child_frame_inverse: wp.array[transform]
+    joint_axis: wp.array[_vec3]
+    parent_frame: wp.array[_transform]
+    child_frame_inverse: wp.array[_transform]
     child_moved: wp.array[int]  # 0: the child frame is the identity
-    mass: wp.array[real]
-    com: wp.array[vec3]
-    inertia: wp.array[mat33]
+    mass: wp.array[scalar]
+    com: wp.array[_vec3]
+    inertia: wp.array[_mat33]
     isotropic: wp.array[int]  # 1: the inertia does not depend on the rotation
     body_levels: int
     body_level_start: wp.array[int]
@@ -44,42 +47,43 @@ class Model:
     child: wp.array[int]
     # degrees of freedom, (nv)
     dof_control: wp.array[int]  # index in ctrl, -1 if not driven
-    gear: wp.array[real]
-    armature: wp.array[real]
-    damping: wp.array[real]
-    stiffness: wp.array[real]
-    spring_rest: wp.array[real]
-    limit_lower: wp.array[real]
-    limit_upper: wp.array[real]
-    limit_stiffness: wp.array[real]
-    limit_smoothing: real
+    gear: wp.array[scalar]
+    armature: wp.array[scalar]
+    damping: wp.array[scalar]
+    stiffness: wp.array[scalar]
+    spring_rest: wp.array[scalar]
+    limit_lower: wp.array[scalar]
+    limit_upper: wp.array[scalar]
+    limit_stiffness: wp.array[scalar]
+    limit_smoothing: scalar
     # contacts, (nc)
     contact_start: wp.array[int]  # (nb + 2)
     contact_body: wp.array[int]
-    contact_position: wp.array[vec3]
-    contact_radius: wp.array[real]
+    contact_position: wp.array[_vec3]
+    contact_radius: wp.array[scalar]
     contact_obstacle: wp.array[int]
     obstacle_kind: wp.array[int]
-    obstacle_frame: wp.array[transform]
-    obstacle_size: wp.array[vec3]
-    contact_stiffness: real
-    contact_smoothing: real
-    friction: real
-    slip_velocity: real
-    dissipation: real
+    obstacle_frame: wp.array[_transform]
+    obstacle_size: wp.array[_vec3]
+    contact_stiffness: scalar
+    contact_smoothing: scalar
+    friction: scalar
+    slip_velocity: scalar
+    dissipation: scalar
 
 
 @wp.struct
 class Scratch:
     """Intermediates of one control step; also the layout of their adjoints.
 
-    Contiguous, one-dimensional; :class:`Row` says where a substep's entries begin.
+    Contiguous, one-dimensional; a slot holds one pack of worlds, and :class:`Row` says
+    where a substep's entries begin.
     """
 
     q: wp.array[real]
     v: wp.array[real]
     ctrl: wp.array[real]
-    fault: wp.array[int]  # (slots,)
+    fault: wp.array[real]  # (slots,), 0 or 1
     # bodies; world axes, spatial vectors about O
     pose: wp.array[transform]
     twist_w: wp.array[vec3]

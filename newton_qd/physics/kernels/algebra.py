@@ -1,0 +1,379 @@
+"""Algebra on packs of worlds.
+
+Warp calls ``add``, ``sub``, ``mul`` and ``div`` for the operators of a module that
+imports them, and its own where none of these fits.
+"""
+
+import warp as wp
+
+from . import mat33, quat, real, scalar, transform, vec3
+from .native import native
+from .numbers import ROOT
+
+_EACH = """
+auto each = [](auto x, auto y, auto function) {
+    for (int i = 0; i < sizeof(x) / sizeof(Real); ++i)
+        ((Real*)&x)[i] = function(((Real*)&x)[i], ((Real*)&y)[i]);
+    return x;
+};
+auto plus = [](Real x, Real y) { return x + y; };
+auto minus = [](Real x, Real y) { return x - y; };
+"""
+# Sums and products.
+
+for _pack in (real, vec3, mat33):
+
+    @wp.func_native(
+        *native(
+            "each(A, B, plus)",
+            "adj_A = each(adj_A, adj_RET, plus); adj_B = each(adj_B, adj_RET, plus);",
+            _EACH,
+        )
+    )
+    def add(a: _pack, b: _pack) -> _pack:
+        """Sum."""
+        ...
+
+    @wp.func_native(
+        *native(
+            "each(A, B, minus)",
+            "adj_A = each(adj_A, adj_RET, plus); adj_B = each(adj_B, adj_RET, minus);",
+            _EACH,
+        )
+    )
+    def sub(a: _pack, b: _pack) -> _pack:
+        """Difference."""
+        ...
+
+    @wp.func_native(
+        *native(
+            "each(A, A, [](Real x, Real) { return -x; })",
+            "adj_A = each(adj_A, adj_RET, minus);",
+            _EACH,
+        )
+    )
+    def neg(a: _pack) -> _pack:
+        """Negative."""
+        ...
+
+    # the number of all worlds has no adjoint: it comes from the model
+    @wp.func_native(
+        *native(
+            "each(A, A, [s](Real x, Real) { return Real(s) * x; })",
+            "adj_A = each(adj_A, adj_RET, "
+            "[s](Real x, Real y) { return x + Real(s) * y; });",
+            _EACH,
+        )
+    )
+    def mul(s: scalar, a: _pack) -> _pack:
+        """Product with one number for all worlds."""
+        ...
+
+
+for _pack in (vec3, mat33):
+
+    @wp.func_native(
+        *native(
+            "each(A, A, [&](Real x, Real) { return B * x; })",
+            "each(A, adj_RET, [&](Real x, Real y) { adj_B += x * y; return x; });"
+            "adj_A = each(adj_A, adj_RET, [&](Real x, Real y) { return x + B * y; });",
+            _EACH,
+        )
+    )
+    def mul(b: real, a: _pack) -> _pack:
+        """Product with a number."""
+        ...
+
+
+@wp.func_native(*native("A * B", "adj_A += B * adj_RET; adj_B += A * adj_RET;"))
+def mul(a: real, b: real) -> real:
+    """Product."""
+    ...
+
+
+@wp.func_native(*native("A / B", "Real x = adj_RET / B; adj_A += x; adj_B -= x * RET;"))
+def div(a: real, b: real) -> real:
+    """Quotient."""
+    ...
+
+
+@wp.func_native(*native("Real(s) / A", "adj_A -= adj_RET / A * RET;"))
+def div(s: scalar, a: real) -> real:
+    """Quotient of one number for all worlds."""
+    ...
+
+
+@wp.func_native(*native("Real(s) + A", "adj_A += adj_RET;"))
+def add(s: scalar, a: real) -> real:
+    """Sum with one number for all worlds."""
+    ...
+
+
+@wp.func_native(*native("A - Real(s)", "adj_A += adj_RET;"))
+def sub(a: real, s: scalar) -> real:
+    """Difference from one number for all worlds."""
+    ...
+
+
+@wp.func_native(*native("Real(s) - A", "adj_A -= adj_RET;"))
+def sub(s: scalar, a: real) -> real:
+    """Difference of one number for all worlds."""
+    ...
+
+
+# Vectors.
+
+
+@wp.func_native(
+    *native(
+        "Vec3(A, B, C)",
+        "adj_A += adj_RET[0]; adj_B += adj_RET[1]; adj_C += adj_RET[2];",
+    )
+)
+def vector(a: real, b: real, c: real) -> vec3:
+    """Vector of its components."""
+    ...
+
+
+for _pack in (vec3, quat, transform):
+
+    @wp.func_native(*native("((Real*)&A)[i]", "((Real*)&adj_A)[i] += adj_RET;"))
+    def component(a: _pack, i: int) -> real:
+        """Component ``i``; a transform's are its translation, then its rotation."""
+        ...
+
+
+@wp.func_native(*native("wp::dot(A, B)", "wp::adj_dot(A, B, adj_A, adj_B, adj_RET);"))
+def dot(a: vec3, b: vec3) -> real:
+    """Scalar product."""
+    ...
+
+
+@wp.func_native(
+    *native("wp::cross(A, B)", "wp::adj_cross(A, B, adj_A, adj_B, adj_RET);")
+)
+def cross(a: vec3, b: vec3) -> vec3:
+    """Vector product."""
+    ...
+
+
+@wp.func_native(
+    *native(
+        "root(wp::dot(A, A))",
+        "Real d = adj_RET / RET; for (int i = 0; i < 3; ++i) adj_A[i] += d * A[i];",
+        ROOT,
+    )
+)
+def length(a: vec3) -> real:
+    """Length of a vector that is not zero."""
+    ...
+
+
+for _pack in (vec3, quat):
+
+    @wp.func_native(
+        *native(
+            "each(A, A, [d](Real x, Real) { return d * x; })",
+            "Real along = wp::dot(RET, adj_RET);"
+            "auto across = "
+            "each(adj_RET, RET, [&](Real x, Real y) { return x - along * y; });"
+            "adj_A = each(adj_A, across, [d](Real x, Real y) { return x + d * y; });",
+            _EACH + ROOT + "Real d = Real(1) / root(wp::dot(A, A));",
+        )
+    )
+    def normalize(a: _pack) -> _pack:
+        """``a``, which is not zero, divided by its length."""
+        ...
+
+
+# 3 x 3 matrices.
+
+
+@wp.func_native(*native("wp::mul(A, B)", "wp::adj_mul(A, B, adj_A, adj_B, adj_RET);"))
+def mul(a: mat33, b: vec3) -> vec3:
+    """Product of a matrix and a vector."""
+    ...
+
+
+@wp.func_native(*native("wp::mul(A, B)", "wp::adj_mul(A, B, adj_A, adj_B, adj_RET);"))
+def mul(a: mat33, b: mat33) -> mat33:
+    """Product of two matrices."""
+    ...
+
+
+@wp.func_native(*native("wp::mul(A, B)", "wp::adj_mul(A, B, adj_A, adj_B, adj_RET);"))
+def mul(a: vec3, b: mat33) -> vec3:
+    """Product of a row vector and a matrix: of its transpose and the vector."""
+    ...
+
+
+@wp.func_native(
+    *native("wp::transpose(A)", "adj_A = wp::add(adj_A, wp::transpose(adj_RET));")
+)
+def transpose(a: mat33) -> mat33:
+    """Transpose."""
+    ...
+
+
+@wp.func_native(
+    *native("wp::outer(A, B)", "wp::adj_outer(A, B, adj_A, adj_B, adj_RET);")
+)
+def outer(a: vec3, b: vec3) -> mat33:
+    """Product of a column and a row vector."""
+    ...
+
+
+@wp.func_native(*native("wp::skew(A)", "wp::adj_skew(A, adj_A, adj_RET);"))
+def skew(a: vec3) -> mat33:
+    """Matrix of the vector product with ``a`` from the left."""
+    ...
+
+
+@wp.func_native(
+    *native(
+        "sum(A, B)",
+        """
+adj_A = wp::add(adj_A, adj_RET);
+adj_B += adj_RET.data[0][0] + adj_RET.data[1][1] + adj_RET.data[2][2];
+""",
+        """
+auto sum = [](Mat33 x, Real y) {
+    for (int i = 0; i < 3; ++i) x.data[i][i] += y;
+    return x;
+};
+""",
+    )
+)
+def add_diagonal(a: mat33, b: real) -> mat33:
+    """``a`` plus ``b`` times the identity."""
+    ...
+
+
+@wp.func_native(
+    *native(
+        "inverse(A)",
+        """
+Mat33 turned = wp::transpose(RET);
+adj_A = wp::sub(adj_A, wp::mul(turned, wp::mul(adj_RET, turned)));
+""",
+        """
+auto inverse = [](const Mat33& m) {
+    Vec3 x(m.data[0][0], m.data[1][0], m.data[2][0]);
+    Vec3 y(m.data[0][1], m.data[1][1], m.data[2][1]);
+    Vec3 z(m.data[0][2], m.data[1][2], m.data[2][2]);
+    Vec3 yz = wp::cross(y, z), zx = wp::cross(z, x), xy = wp::cross(x, y);
+    Real scale = Real(1) / wp::dot(x, yz);
+    Mat33 result;
+    for (int i = 0; i < 3; ++i) {
+        result.data[0][i] = scale * yz[i];
+        result.data[1][i] = scale * zx[i];
+        result.data[2][i] = scale * xy[i];
+    }
+    return result;
+};
+""",
+    )
+)
+def inverse(a: mat33) -> mat33:
+    """Inverse of a regular matrix."""
+    ...
+
+
+# Rotations and rigid transforms.
+
+
+@wp.func_native(
+    *native(
+        "Quat(A, B, C, D)",
+        """
+adj_A += adj_RET.x;
+adj_B += adj_RET.y;
+adj_C += adj_RET.z;
+adj_D += adj_RET.w;
+""",
+    )
+)
+def quaternion(a: real, b: real, c: real, d: real) -> quat:
+    """Quaternion of its components, the real part last."""
+    ...
+
+
+@wp.func_native(*native("wp::mul(A, B)", "wp::adj_mul(A, B, adj_A, adj_B, adj_RET);"))
+def mul(a: quat, b: quat) -> quat:
+    """The rotation ``b``, then ``a``."""
+    ...
+
+
+@wp.func_native(
+    *native(
+        "wp::quat_rotate(A, B)",
+        "wp::adj_quat_rotate(A, B, adj_A, adj_B, adj_RET);",
+    )
+)
+def rotate(a: quat, b: vec3) -> vec3:
+    """A vector, rotated."""
+    ...
+
+
+@wp.func_native(
+    *native(
+        "wp::quat_rotate_inv(A, B)",
+        "wp::adj_quat_rotate_inv(A, B, adj_A, adj_B, adj_RET);",
+    )
+)
+def rotate_back(a: quat, b: vec3) -> vec3:
+    """A vector, rotated by the inverse."""
+    ...
+
+
+@wp.func_native(
+    *native("wp::quat_to_matrix(A)", "wp::adj_quat_to_matrix(A, adj_A, adj_RET);")
+)
+def matrix(a: quat) -> mat33:
+    """Matrix of a rotation."""
+    ...
+
+
+@wp.func_native(
+    *native(
+        "Transform(A, B)",
+        "adj_A = wp::add(adj_A, adj_RET.p); adj_B = wp::add(adj_B, adj_RET.q);",
+    )
+)
+def rigid(a: vec3, b: quat) -> transform:
+    """Transform of its translation and rotation."""
+    ...
+
+
+@wp.func_native(*native("A.p", "adj_A.p = wp::add(adj_A.p, adj_RET);"))
+def translation(a: transform) -> vec3:
+    """Translation of a transform."""
+    ...
+
+
+@wp.func_native(*native("A.q", "adj_A.q = wp::add(adj_A.q, adj_RET);"))
+def rotation(a: transform) -> quat:
+    """Rotation of a transform."""
+    ...
+
+
+@wp.func_native(
+    *native(
+        "wp::transform_multiply(A, B)",
+        "wp::adj_transform_multiply(A, B, adj_A, adj_B, adj_RET);",
+    )
+)
+def mul(a: transform, b: transform) -> transform:
+    """The transform ``b``, then ``a``."""
+    ...
+
+
+@wp.func_native(
+    *native(
+        "wp::transform_point(A, B)",
+        "wp::adj_transform_point(A, B, adj_A, adj_B, adj_RET);",
+    )
+)
+def transform_point(a: transform, b: vec3) -> vec3:
+    """A point, transformed."""
+    ...

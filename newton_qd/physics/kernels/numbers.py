@@ -1,0 +1,59 @@
+"""Functions of one number for each world of a pack."""
+
+import warp as wp
+
+from . import real, scalar
+from .native import native
+
+ROOT = """
+#if defined(__CUDA_ARCH__)
+auto root = [](Real x) { return wp::sqrt(x); };
+#else
+auto root = [](Real x) { return __builtin_elementwise_sqrt(x); };
+#endif
+"""
+
+
+@wp.func_native(*native("root(A)", "adj_A += adj_RET / (RET + RET);", ROOT))
+def sqrt(a: real) -> real:
+    """Square root of a positive number."""
+    ...
+
+
+@wp.func_native(*native("Real(s)"))
+def uniform(s: scalar) -> real:
+    """One number for all worlds."""
+    ...
+
+
+@wp.func_native(
+    *native(
+        "A < B ? B : (C < A ? C : A)",
+        """
+Real zero = Real(0);
+adj_B += A < B ? adj_RET : zero;
+adj_C += A < B ? zero : (C < A ? adj_RET : zero);
+adj_A += A < B ? zero : (C < A ? zero : adj_RET);
+""",
+    )
+)
+def clamp(a: real, b: real, c: real) -> real:
+    """``a`` between ``b`` and ``c``."""
+    ...
+
+
+@wp.func_native(
+    *native(
+        "rest == rest ? zero : one",
+        before="Real zero = Real(0), one = Real(1), rest = A - A;",
+    )
+)
+def broken(a: real) -> real:
+    """1 where a number is not finite, else 0; without adjoint."""
+    ...
+
+
+@wp.func_native(*native("C != Real(0) ? A : B"))
+def choose(c: real, a: real, b: real) -> real:
+    """``a`` where ``c`` is not 0, else ``b``; without adjoint."""
+    ...
