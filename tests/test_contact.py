@@ -215,12 +215,6 @@ def test_normal_impulse_is_never_negative(
     np.testing.assert_array_equal(impulse[..., 2], normal)
 
 
-@pytest.mark.xfail(
-    strict=True,
-    raises=AssertionError,
-    reason="measured: 4.84 at most, 2.9 % of the contacts above 1.5; the corrector's "
-    "friction weight lags where the predictor sticks and the corrector slides",
-)
 def test_friction_cone(struggle: tuple[System, np.ndarray, np.ndarray]) -> None:
     system, impulse, normal = struggle
     touching = np.unique(system.contact_body)

@@ -13,6 +13,8 @@ from newton_qd.physics.precision import kernels, pack_width
 from newton_qd.physics.system import JointKind, ObstacleKind, System
 from newton_qd.physics.tree import Tree, build_tree
 
+# Solves of a substep: the predictor and two correctors.
+_SOLVES = 3
 # Scratch arrays by what they hold an entry for.
 _PER_BODY = ("pose", "twist_w", "twist_v", "bias_w", "bias_v", "inertia", "moment")
 _PER_BODY += ("wrench_w", "wrench_v")
@@ -51,9 +53,10 @@ def build_model(system: System, device: Any) -> Any:
     model.nb, model.nq, model.nv = system.nb, system.nq, system.nv
     model.nu, model.nc = system.nu, len(system.contact_body)
     model.free_root = int(system.joint_kind[0] == JointKind.FREE)
-    model.substeps, model.passes = robot.substeps, 2
+    model.substeps, model.passes = robot.substeps, _SOLVES
     model.h = robot.dt / robot.substeps
     model.gravity = robot.gravity
+    model.total_mass = system.total_mass
     put("rest_q", system.rest_q)
     _put_bodies(put, system, tree)
     model.body_levels = len(tree.body_level[0]) - 1
@@ -146,7 +149,7 @@ def build_scratch(
     space = kernels(system.dtype, pack_width(system.dtype, device))
     values, adjoints = space.structs.Scratch(), space.structs.Scratch()
     n, nc = system.robot.substeps, max(len(system.contact_body), 1)
-    steps, solves = (n, 2 * n) if adjoint else (1, 1)
+    steps, solves = (n, _SOLVES * n) if adjoint else (1, 1)
     counts = {
         "fault": 1,
         "q": (n + 1) * system.nq,

@@ -17,6 +17,9 @@ LANES = (1, 2, 4, 8, 16, 32)
 # Kernel modules other than ``inspect``, whose kernels are written for one lane; each is
 # compiled as a whole.
 _MODULES = {"step_forward": "forward", "step_backward": "backward"}
+# Packs below which another thread costs more than it takes over, without and with
+# adjoint: it is woken by Python.
+_PACKS_PER_THREAD = {False: 16, True: 4}
 _GPU_BLOCK = 256
 _RESIDENT_WORLDS = 16384
 
@@ -127,7 +130,7 @@ class Launcher:
     ) -> None:
         """Split the packs over threads; each walks through its share in one slot."""
         packs = -(-worlds // self.width)
-        threads = min(thread_count(), packs)
+        threads = min(thread_count(), -(-packs // _PACKS_PER_THREAD[adjoint]))
         bounds = [packs * n // threads * self.width for n in range(threads)] + [worlds]
         while len(self._workers) < threads - 1:
             self._workers.append(Worker(f"newton_qd-{len(self._workers) + 1}"))

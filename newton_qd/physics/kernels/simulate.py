@@ -4,7 +4,13 @@ import warp as wp
 
 from . import stage, sync
 from .articulation import change_free, change_hinge, eliminate_hinge, gather, rest_world
-from .contact import contact_corrector, contact_impulse, contact_predictor, contact_slip
+from .contact import (
+    contact_clip,
+    contact_corrector,
+    contact_impulse,
+    contact_predictor,
+    contact_slip,
+)
 from .inertia import rigid_inertia
 from .integration import new_coordinates, new_velocity
 from .kinematics import free_joint, hinge_joint, world_frame
@@ -65,13 +71,15 @@ def simulate(m: Model, sc: Scratch, slot: int, keep: int, lane: int, lanes: int)
         kinematics(m, sc, first, lane, lanes)
         for i in range(1 + lane, m.nb + 1, lanes):
             rigid_inertia(m, sc, first, i)
-        # predictor, then corrector
+        # predictor, then correctors
         for p in range(m.passes):
             row = row_at(m, slot, keep, s, p)
             for c in range(lane, m.nc, lanes):
                 if p == 0:
                     contact_predictor(m, sc, row, c)
                 else:
+                    if p == 1:
+                        contact_clip(m, sc, row, c)
                     contact_corrector(m, sc, row, c)
             sync(lane)
             linear_solve(m, sc, row, lane, lanes)

@@ -23,7 +23,8 @@ class Model:
     nc: int
     free_root: int  # 1: the origin O follows the position of the first joint
     substeps: int
-    passes: int  # solves of a substep: predictor and corrector
+    total_mass: scalar  # [kg]
+    passes: int  # solves of a substep: predictor and correctors
     h: scalar  # [s]
     gravity: scalar  # [m/s^2]
     rest_q: wp.array[scalar]  # (nq,)
@@ -145,7 +146,7 @@ class Row:
     dof: int
     contact: int
     report: int
-    predictor: int  # contacts of the substep's first solve
+    before: int  # contacts of the solve before
     solve_body: int
     solve_dof: int
     solve_contact: int
@@ -160,11 +161,11 @@ def row_at(m: Model, slot: int, keep: int, s: int, p: int):
     """
     step = slot
     solve = slot
-    first = slot
+    before = slot
     if keep == 1:
         step = slot * m.substeps + s
-        first = 2 * step
-        solve = first + p
+        solve = m.passes * step + p
+        before = solve - 1
     r = Row()
     r.q = (slot * (m.substeps + 1) + s) * m.nq
     r.q_next = r.q + m.nq
@@ -175,7 +176,7 @@ def row_at(m: Model, slot: int, keep: int, s: int, p: int):
     r.dof = step * m.nv
     r.contact = step * m.nc
     r.report = (slot * m.substeps + s) * m.nc
-    r.predictor = first * m.nc
+    r.before = before * m.nc
     r.solve_body = solve * (m.nb + 1)
     r.solve_dof = solve * m.nv
     r.solve_contact = solve * m.nc
