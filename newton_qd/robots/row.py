@@ -1,12 +1,14 @@
-"""Robots as data: everything about a robot that its URDF file cannot hold.
+"""What a robot row holds: everything about a robot that its URDF file cannot.
 
 Masses, inertias, joint frames, limits, damping and colliders are in ``urdf/``;
-gears, the contact material and the time steps are in the rows below.
+gears, the contact material and the time steps are in rows of this type.
 """
 
 from __future__ import annotations
 
 import dataclasses
+
+DEGREE = 3.141592653589793 / 180.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,32 +87,3 @@ class Robot:
     rest_height: float | None = None
     gravity: float = 9.81
     material: Material = Material()
-
-
-_DEGREE = 3.141592653589793 / 180.0
-_ANT_LEGS = ("1", "2", "3", "4")
-
-ANT = Robot(
-    name="ant",
-    urdf="ant.urdf",
-    torso="torso",
-    feet=tuple(f"foot_{leg}" for leg in _ANT_LEGS),
-    actuators=tuple(
-        (f"{joint}_{leg}", 350.0) for leg in _ANT_LEGS for joint in ("hip", "ankle")
-    ),
-    contacts=(
-        Contact("torso"),
-        *(Contact(f"foot_{leg}", end=-1) for leg in _ANT_LEGS),
-    ),
-    rest_pose=(
-        ("ankle_1", 50 * _DEGREE),
-        ("ankle_2", -50 * _DEGREE),
-        ("ankle_3", -50 * _DEGREE),
-        ("ankle_4", 50 * _DEGREE),
-    ),
-    dt=0.05,
-    substeps=5,
-    gravity=9.8,
-)
-
-ROBOTS = {robot.name: robot for robot in (ANT,)}
