@@ -1,0 +1,137 @@
+"""Write the page of the environments from their code.
+
+python docs/generate.py            writes docs/environments.md
+python docs/generate.py --check    fails if the page is out of date
+"""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+import re
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import cast
+
+import jax
+import numpy as np
+
+import newton_qd
+from newton_qd.envs.base import Env, PhysicsEnv, QDEnv
+
+PAGE = Path(__file__).with_name("environments.md")
+
+HEAD = """# Environments
+
+What every name of `newton_qd.create` observes, drives and is rewarded for. This page is
+written by `docs/generate.py` from the code.
+
+| name | robot or task | observation | action | step [s] | state descriptor |
+|---|---|---|---|---|---|
+"""
+
+
+def _table(head: tuple[str, ...], rows: Sequence[tuple[object, ...]]) -> str:
+    lines = [head, tuple("---" for _ in head), *rows]
+    return "".join(
+        "| " + " | ".join(str(cell) for cell in row) + " |\n" for row in lines
+    )
+
+
+def _numbers(values: object) -> str:
+    return ", ".join(f"{value:g}" for value in np.asarray(values).ravel())
+
+
+def _summary(name: str, env: Env) -> tuple[object, ...]:
+    descriptor = "-"
+    if name in newton_qd.descriptor_extractor:
+        qd = cast(QDEnv, env)
+        descriptor = f"`{qd.state_descriptor_name}` ({qd.state_descriptor_length})"
+    link = f"[`{name}`](#{name})"
+    sizes = env.observation_size, env.action_size, f"{env.dt:g}"
+    return (link, f"`{env.name}`", *sizes, descriptor)
+
+
+def _options(base: type) -> list[tuple[object, ...]]:
+    """Constructor options, with the defaults of the signature and their docstring."""
+    text = inspect.getdoc(base.__init__) or ""
+    rows = []
+    for parameter in inspect.signature(base).parameters.values():
+        found = re.search(
+            rf"^ +{parameter.name}: (.*(?:\n {{8,}}.*)*)", text, flags=re.MULTILINE
+        )
+        meaning = " ".join(found.group(1).split()) if found else ""
+        rows.append((f"`{parameter.name}`", f"`{parameter.default!r}`", meaning))
+    return rows
+
+
+def _observation(env: PhysicsEnv) -> list[tuple[object, ...]]:
+    rows, first = [], 0
+    for block, size in env.observation_layout:
+        last = first + size - 1
+        rows.append((first if size == 1 else f"{first} to {last}", block))
+        first += size
+    return rows
+
+
+def _descriptor(name: str, env: QDEnv) -> str:
+    low, high = env.state_descriptor_limits
+    extractor = newton_qd.descriptor_extractor[name].__name__
+    offset = newton_qd.reward_offset[name]
+    return (
+        f"\nState descriptor: `{env.state_descriptor_name}`, from ({_numbers(low)}) to "
+        f"({_numbers(high)}). Descriptor of an episode: `{extractor}`. Reward offset: "
+        f"{offset:g}.\n"
+    )
+
+
+def _robot(env: PhysicsEnv) -> str:
+    """What all environments of one base share."""
+    text = "\n" + _table(("entries of the observation", "meaning"), _observation(env))
+    drives = [
+        (index, f"`{joint}`", f"{gear:g}")
+        for index, (joint, gear) in enumerate(env.robot.actuators)
+    ]
+    text += "\n" + _table(("action", "joint", "torque of 1 [N m]"), drives)
+    state = jax.eval_shape(env.reset, jax.random.key(0))
+    named = ", ".join(f"`{key}`" for key in state.metrics)
+    text += f"\nMetrics, the terms of the reward among them: {named}.\n"
+    return text + "\n" + _table(("option", "default", "meaning"), _options(type(env)))
+
+
+def page() -> str:
+    """Returns the text of the page."""
+    summary, sections = [], ""
+    described: dict[type, str] = {}
+    for name in newton_qd.registered_envs():
+        env = newton_qd.create(name, auto_reset=False)
+        base = env.unwrapped
+        summary.append(_summary(name, env))
+        sections += f"\n## {name}\n\n"
+        known = described.setdefault(type(base), name)
+        if known != name:
+            sections += f"The task of [`{known}`](#{known}) with a state descriptor.\n"
+        else:
+            sections += f"{inspect.getdoc(type(base))}\n"
+        if name in newton_qd.descriptor_extractor:
+            sections += _descriptor(name, cast(QDEnv, env))
+        if known == name and isinstance(base, PhysicsEnv):
+            sections += _robot(base)
+    rows = "".join(_table(row, []).splitlines(keepends=True)[0] for row in summary)
+    return HEAD + rows + sections
+
+
+def main() -> int:
+    """Writes the page, or compares it."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--check", action="store_true")
+    text = page()
+    if parser.parse_args().check:
+        return int(PAGE.read_text(encoding="utf-8") != text)
+    PAGE.write_text(text, encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
