@@ -1,0 +1,98 @@
+"""Locomotion of any robot with a free root: a start for tasks of one's own."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from newton_qd.envs.base import PhysicsEnv, ordered_sum
+from newton_qd.physics.system import JointKind, PhysicsState
+from newton_qd.robots import Robot
+from newton_qd.types import Action, Metrics
+
+_ROOT_Q, _ROOT_V = 7, 6  # a free root has 7 coordinates and 6 velocities
+
+
+class Locomotion(PhysicsEnv):
+    """Any robot with a free root, rewarded for velocity along x.
+
+    Reward: weighted velocity of the root along x, plus a bonus for being healthy, minus
+    a cost of control. Done when the root leaves the healthy heights. A subclass with
+    another ``_outcome`` has other rewards.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        forward_reward_weight: float = 1.0,
+        ctrl_cost_weight: float = 0.5,
+        healthy_reward: float = 1.0,
+        healthy_z_range: tuple[float, float] = (0.0, float("inf")),
+        reset_noise_scale: float = 0.1,
+        dtype: str = "float32",
+    ) -> None:
+        """Loads a robot.
+
+        Args:
+            robot: Row of the robot; its first joint is free.
+            forward_reward_weight: Weight of the velocity along x [s/m].
+            ctrl_cost_weight: Cost of the sum of squared actions [-].
+            healthy_reward: Bonus of a step [-].
+            healthy_z_range: Lowest and highest healthy height of the root [m].
+            reset_noise_scale: Half width of the uniform noise on joint angles [rad]
+                and joint velocities [rad/s] at a reset.
+            dtype: ``"float32"``, or ``"float64"`` with JAX x64 on.
+
+        Raises:
+            ValueError: The robot's first joint is not free, or the range is empty.
+        """
+        low, high = healthy_z_range
+        if not low < high:
+            raise ValueError(
+                f"healthy_z_range={healthy_z_range!r}: allowed: lowest below highest"
+            )
+        self._forward_reward_weight = forward_reward_weight
+        self._ctrl_cost_weight = ctrl_cost_weight
+        self._healthy_reward = healthy_reward
+        self._healthy_z_range = healthy_z_range
+        super().__init__(robot, reset_noise_scale=reset_noise_scale, dtype=dtype)
+        kind = JointKind(self.system.joint_kind[0])
+        if kind != JointKind.FREE:
+            raise ValueError(
+                f"robot={robot.name!r}: its first joint is {kind.name.lower()}; "
+                "allowed: a robot whose root link moves freely"
+            )
+
+    def _observe(self, state: PhysicsState) -> dict[str, jax.Array]:
+        """Returns the blocks of the observation."""
+        q, v = state.q, state.v
+        return {
+            "root height [m]": q[2:3],
+            "root orientation w x y z": jnp.concatenate([q[6:7], q[3:6]]),
+            "joint angles [rad]": q[_ROOT_Q:],
+            "root velocity x y z [m/s]": v[:3],
+            "root angular velocity x y z [rad/s]": v[3:_ROOT_V],
+            "joint velocities [rad/s]": v[_ROOT_V:],
+        }
+
+    def _outcome(
+        self, before: PhysicsState, after: PhysicsState, action: Action
+    ) -> tuple[jax.Array, jax.Array, Metrics]:
+        """Returns reward, done and metrics of a step."""
+        x_velocity = (after.q[0] - before.q[0]) / self.dt
+        low, high = self._healthy_z_range
+        height = after.q[2]
+        healthy = ((height >= low) & (height <= high)).astype(self.dtype)
+        forward = self._forward_reward_weight * x_velocity
+        bonus = jnp.full_like(forward, self._healthy_reward)
+        control = self._ctrl_cost_weight * ordered_sum(jnp.square(action))
+        metrics = {
+            "reward_forward": forward,
+            "reward_survive": bonus,
+            "reward_ctrl": -control,
+            "x_position": after.q[0],
+            "y_position": after.q[1],
+            "x_velocity": x_velocity,
+        }
+        return forward + bonus - control, 1 - healthy, metrics

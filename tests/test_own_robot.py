@@ -1,0 +1,74 @@
+"""A robot that is not part of the suite, as ``examples/own_robot.py`` makes it."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import newton_qd
+from newton_qd import registry
+from newton_qd.envs.locomotion import Locomotion
+
+EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "own_robot.py"
+
+
+@pytest.fixture(scope="module")
+def example() -> Iterator[ModuleType]:
+    """The example, whose names are known while this file's tests run."""
+    rows = dict(registry._ROWS)
+    spec = importlib.util.spec_from_file_location("own_robot", EXAMPLE)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    yield module
+    registry._ROWS.clear()
+    registry._ROWS.update(rows)
+
+
+def test_tripod_is_a_task(example: ModuleType) -> None:
+    del example  # its import registers the name
+    env = newton_qd.create("tripod_uni", episode_length=20, auto_reset=False)
+    actions = jax.random.uniform(jax.random.key(1), (20, env.action_size), minval=-1.0)
+
+    @jax.jit
+    def rollout(key: jax.Array) -> newton_qd.State:
+        def advance(state: newton_qd.State, action: jax.Array):
+            state = env.step(state, action)
+            return state, state
+
+        return jax.lax.scan(advance, env.reset(key), actions)[1]
+
+    states = rollout(jax.random.key(0))
+    newton_qd.check(jax.tree.map(lambda leaf: leaf[-1], states))
+    assert states.obs.shape == (20, env.observation_size) == (20, 23)
+    assert states.info["state_descriptor"].shape == (20, 3)
+    assert float(states.info["state_descriptor"].max()) == 1.0
+    x = np.asarray(states.pipeline_state.q[:-1, 0])
+    velocity = np.diff(x) / env.dt
+    cost = 0.5 * np.sum(np.square(actions[1:-1]), axis=1)
+    expected = velocity + 1.0 - cost
+    np.testing.assert_allclose(states.reward[1:-1], expected, atol=1e-4)
+
+
+def test_reward_has_a_gradient(example: ModuleType) -> None:
+    env = Locomotion(example.TRIPOD)
+    state = jax.jit(env.reset)(jax.random.key(0))
+    slope = jax.jit(jax.grad(lambda action: env.step(state, action).reward))
+    gradient = slope(jnp.zeros(env.action_size))
+    assert np.isfinite(gradient).all()
+    assert np.abs(gradient).max() > 0
+
+
+def test_bad_options(example: ModuleType) -> None:
+    with pytest.raises(ValueError, match=r"healthy_z_range=\(1.0, 0.5\).*allowed"):
+        Locomotion(example.TRIPOD, healthy_z_range=(1.0, 0.5))
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        Locomotion(dataclasses.replace(example.TRIPOD, urdf="./nowhere.urdf"))
