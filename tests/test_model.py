@@ -297,6 +297,14 @@ def test_planar_root(tmp_path: Path) -> None:
     np.testing.assert_allclose(system.rest_q, [0, -0.55, 0, 0], atol=1e-15)
 
 
+@pytest.mark.parametrize("limits", [(0.0, 0.5), (-1.0, 0.0)])
+def test_a_limit_may_be_zero(limits: tuple[float, float], tmp_path: Path) -> None:
+    lower, upper = limits
+    text = PLANAR.replace('lower="-1" upper="0.5"', f'lower="{lower}" upper="{upper}"')
+    system = build_system(row(write(tmp_path, text), "body"), "float32")
+    assert (system.limit_lower[3], system.limit_upper[3]) == limits
+
+
 def test_rest_height(tmp_path: Path) -> None:
     planar = build_system(planar_row(tmp_path, rest_height=1.25), "float32")
     np.testing.assert_allclose(planar.rest_q, [0, -1.25, 0, 0], atol=1e-15)

@@ -136,7 +136,7 @@ def _read_newton(model: newton.Model, description: Description) -> BuiltModel:
 
     def limits(array: object, empty: float) -> np.ndarray:
         rows = per_joint(array, empty)
-        return np.where(np.abs(rows) >= UNLIMITED, np.sign(rows) * np.inf, rows)
+        return np.where(np.abs(rows) >= UNLIMITED, np.copysign(np.inf, rows), rows)
 
     joint_names = [model.joint_label[joint].removeprefix(prefix) for joint in order]
     return BuiltModel(
