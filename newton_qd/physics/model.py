@@ -206,6 +206,8 @@ def _dof_arrays(
     gear = np.full(nv, control["gear"].max(initial=0.0) or _DEFAULT_GEAR)
     gear[control["control_dof"]] = control["gear"]
     limited = np.isfinite(lower) | np.isfinite(upper)
+    width, overshoot = robot.material.limit_smoothing, robot.material.limit_overshoot
+    compressed = reference.penetration(width - overshoot, width)
     return {
         "armature": np.zeros(nv),
         "damping": damping,
@@ -213,9 +215,7 @@ def _dof_arrays(
         "spring_rest": np.zeros(nv),
         "limit_lower": lower,
         "limit_upper": upper,
-        "limit_stiffness": np.where(
-            limited, gear / robot.material.limit_overshoot, 0.0
-        ),
+        "limit_stiffness": np.where(limited, gear / compressed, 0.0),
     }
 
 

@@ -37,10 +37,10 @@ class Material:
         smoothing: Half width of the zone in which a contact switches on [m].
         slip_velocity: Velocity below which friction is viscous [m/s].
         dissipation: Hunt-Crossley dissipation [s/m].
-        limit_overshoot: Angle by which a joint's full gear passes its limit
+        limit_overshoot: Angle by which a joint's full gear holds it past its limit
             [rad]; sets the stiffness of the limits.
         limit_smoothing: Half width of the zone in which a limit switches on
-            [rad].
+            [rad]; the zone begins at the limit, where nothing is felt yet.
     """
 
     friction: float = 1.0
