@@ -131,7 +131,7 @@ def test_every_robot_rests_on_the_ground(name: str) -> None:
 def test_colliders_are_drawn(name: str) -> None:
     """Viewers draw what collides: every collider is a visual too."""
     shapes = re.findall(
-        r"<(visual|collision)>.*?<origin ([^/]*)/>\s*<geometry>(.*?)</geometry>",
+        r"<(visual|collision)[^>]*>.*?<origin ([^/]*)/>\s*<geometry>(.*?)</geometry>",
         find_urdf(ROBOTS[name].urdf).read_text(encoding="utf-8"),
         re.DOTALL,
     )
@@ -335,6 +335,23 @@ def test_fixed_links_join_their_parent(tmp_path: Path) -> None:
     assert system.feet.tolist() == [0]
     np.testing.assert_allclose(system.contact_position, [[0.4, 0, 0]], atol=1e-12)
     np.testing.assert_allclose(system.parent_frame[1, :3], [1.3, 0, 0], atol=1e-12)
+
+
+TWO_CAPSULES = "".join(
+    f"""<collision name="{name}"><origin xyz="0 0 {height}"/><geometry>
+    <capsule radius="0.1" height="0.4"/></geometry></collision>"""
+    for name, height in (("low", 0), ("high", 1))
+)
+
+
+def test_contacts_name_one_of_several_colliders(tmp_path: Path) -> None:
+    path = write(tmp_path, f'<robot name="two">{link("base", TWO_CAPSULES)}</robot>')
+    contacts = (Contact("base", 1, "high"), Contact("base", -1, "low"))
+    system = build_system(row(path, "base", contacts=contacts), "float32")
+    np.testing.assert_allclose(system.contact_position[:, 2], [1.2, -0.2])
+    unclear = row(path, "base", contacts=(Contact("base", 1),))
+    with pytest.raises(RobotDescriptionError, match=r"the link has 2; .* are several"):
+        build_system(unclear, "float32")
 
 
 def test_robot_without_joints(tmp_path: Path) -> None:

@@ -19,10 +19,13 @@ class Contact:
         link: URDF link whose collider carries the sphere.
         end: Which end of a capsule's axis: ``+1`` or ``-1`` along the local z
             axis of the collider; ``0`` for a sphere.
+        collider: Name of the collider in the URDF file; ``None`` where the link has
+            only one of its kind.
     """
 
     link: str
     end: int = 0
+    collider: str | None = None
 
 
 @dataclasses.dataclass(frozen=True)
