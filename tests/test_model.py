@@ -85,7 +85,7 @@ def test_numbers_of_the_ant(ant: System) -> None:
     limits = np.stack([ant.limit_lower, ant.limit_upper], axis=1)
     np.testing.assert_allclose(limits[6:], np.radians(degrees), rtol=1e-14)
     assert np.array_equal(limits[:6], [(-np.inf, np.inf)] * 6)
-    np.testing.assert_allclose(ant.limit_stiffness, [0.0] * 6 + [3500.0] * 8)
+    np.testing.assert_allclose(ant.limit_stiffness, [0.0] * 6 + [7000.0] * 8)
     assert ant.contact_stiffness == pytest.approx(18.0 * 9.8 / (4 * 0.003))
     assert not ant.armature.any() and not ant.stiffness.any()
 
@@ -131,7 +131,7 @@ def test_every_robot_rests_on_the_ground(name: str) -> None:
 def test_colliders_are_drawn(name: str) -> None:
     """Viewers draw what collides: every collider is a visual too."""
     shapes = re.findall(
-        r"<(visual|collision)>.*?<origin ([^/]*)/>\s*<geometry>(.*?)</geometry>",
+        r"<(visual|collision)[^>]*>.*?<origin ([^/]*)/>\s*<geometry>(.*?)</geometry>",
         find_urdf(ROBOTS[name].urdf).read_text(encoding="utf-8"),
         re.DOTALL,
     )
@@ -291,10 +291,18 @@ def test_planar_root(tmp_path: Path) -> None:
     assert system.mass.tolist() == [0, 0, 1, 1]
     assert system.joint_axis[3].tolist() == [0, 1, 0]
     # Free joints have no limits; the knee's are as stiff as its gear.
-    assert system.limit_stiffness.tolist() == [0, 0, 0, 300]
+    np.testing.assert_allclose(system.limit_stiffness, [0, 0, 0, 600])
     assert system.contact_body.tolist() == [2, 3]
     # The z axis points down, and the lower sphere ends 0.55 m below the origin.
     np.testing.assert_allclose(system.rest_q, [0, -0.55, 0, 0], atol=1e-15)
+
+
+@pytest.mark.parametrize("limits", [(0.0, 0.5), (-1.0, 0.0)])
+def test_a_limit_may_be_zero(limits: tuple[float, float], tmp_path: Path) -> None:
+    lower, upper = limits
+    text = PLANAR.replace('lower="-1" upper="0.5"', f'lower="{lower}" upper="{upper}"')
+    system = build_system(row(write(tmp_path, text), "body"), "float32")
+    assert (system.limit_lower[3], system.limit_upper[3]) == limits
 
 
 def test_rest_height(tmp_path: Path) -> None:
@@ -307,9 +315,10 @@ def test_rest_height(tmp_path: Path) -> None:
 def test_limits_of_joints_without_gear(tmp_path: Path) -> None:
     weaker = dataclasses.replace(ANT, actuators=(("hip_1", 50.0), ("ankle_2", 70.0)))
     stiffness = build_system(weaker, "float32").limit_stiffness
-    assert stiffness[6:].tolist() == [500, 700, 700, 700, 700, 700, 700, 700]
+    np.testing.assert_allclose(stiffness[6:], [1000] + [1400] * 7)
     passive = dataclasses.replace(ANT, actuators=())
-    assert build_system(passive, "float32").limit_stiffness[6:].tolist() == [1000] * 8
+    stiffness = build_system(passive, "float32").limit_stiffness
+    np.testing.assert_allclose(stiffness[6:], 2000)
 
 
 def test_fixed_links_join_their_parent(tmp_path: Path) -> None:
@@ -326,6 +335,23 @@ def test_fixed_links_join_their_parent(tmp_path: Path) -> None:
     assert system.feet.tolist() == [0]
     np.testing.assert_allclose(system.contact_position, [[0.4, 0, 0]], atol=1e-12)
     np.testing.assert_allclose(system.parent_frame[1, :3], [1.3, 0, 0], atol=1e-12)
+
+
+TWO_CAPSULES = "".join(
+    f"""<collision name="{name}"><origin xyz="0 0 {height}"/><geometry>
+    <capsule radius="0.1" height="0.4"/></geometry></collision>"""
+    for name, height in (("low", 0), ("high", 1))
+)
+
+
+def test_contacts_name_one_of_several_colliders(tmp_path: Path) -> None:
+    path = write(tmp_path, f'<robot name="two">{link("base", TWO_CAPSULES)}</robot>')
+    contacts = (Contact("base", 1, "high"), Contact("base", -1, "low"))
+    system = build_system(row(path, "base", contacts=contacts), "float32")
+    np.testing.assert_allclose(system.contact_position[:, 2], [1.2, -0.2])
+    unclear = row(path, "base", contacts=(Contact("base", 1),))
+    with pytest.raises(RobotDescriptionError, match=r"the link has 2; .* are several"):
+        build_system(unclear, "float32")
 
 
 def test_robot_without_joints(tmp_path: Path) -> None:

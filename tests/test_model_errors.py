@@ -165,6 +165,10 @@ BAD_ROWS = {
         changed(contacts=(Contact("torso", 1),), feet=()),
         "end=1 of link 'torso' needs a capsule collider and the link has 0",
     ),
+    "collider": (
+        changed(contacts=(Contact("foot_1", 1, "toe"),), feet=()),
+        "needs a capsule collider named 'toe' and the link has 0",
+    ),
     "end": (changed(contacts=(Contact("foot_1", 2),), feet=()), "end=2 .* -1, 0, 1"),
     "rest in limits": (changed(rest_pose=()), "'ankle_1' rests at 0; allowed: 0.523"),
     "dt": (changed(dt=NAN), "dt=nan; allowed: finite, > 0"),

@@ -150,8 +150,6 @@ class PhysicsEnv(Env):
     passes. Other worlds do not notice.
     """
 
-    _vertical = 2  # coordinate that raises the robot: z of a free root
-
     def __init__(
         self, robot: Robot, *, reset_noise_scale: float, dtype: str = "float32"
     ) -> None:
@@ -171,6 +169,7 @@ class PhysicsEnv(Env):
         joints = np.flatnonzero(np.isin(system.v_start, system.control_dof))
         self._joint_q = system.q_start[joints].astype(np.int32)
         self._joint_v = system.v_start[joints].astype(np.int32)
+        self._raising = physics.raising_coordinate(system)
         rest = jax.eval_shape(self._rest)
         action = jax.ShapeDtypeStruct((system.nu,), self._dtype)
         self._layout: tuple[tuple[str, int], ...] = ()
@@ -193,9 +192,9 @@ class PhysicsEnv(Env):
         _, angle_key, velocity_key = jax.random.split(rng, 3)
         rest = self._rest()
         q = rest.q.at[self._joint_q].add(self._noise(angle_key))
-        if self.robot.rest_height is None:
-            height = physics.lowest_contact(self.system, q)
-            q = q.at[self._vertical].add(-height)
+        if self.robot.rest_height is None and self._raising is not None:
+            coordinate, sign = self._raising
+            q = q.at[coordinate].add(-sign * physics.lowest_contact(self.system, q))
         v = rest.v.at[self._joint_v].set(self._noise(velocity_key))
         return self._first_state(physics.initial_state(self.system, q, v))
 

@@ -9,6 +9,7 @@ from newton_qd.physics.inspection import (
     mass_matrix,
 )
 from newton_qd.physics.model import load_system
+from newton_qd.physics.rest import raising_coordinate
 from newton_qd.physics.step import initial_state, step
 from newton_qd.physics.system import PhysicsState, System
 
@@ -23,6 +24,7 @@ __all__ = [
     "load_system",
     "lowest_contact",
     "mass_matrix",
+    "raising_coordinate",
     "step",
     "to_jax",
 ]

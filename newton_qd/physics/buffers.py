@@ -100,6 +100,8 @@ def _put_dofs(put: Any, system: System) -> None:
     control[system.control_dof] = np.arange(system.nu)
     gear = np.zeros(system.nv)
     gear[system.control_dof] = system.gear
+    # The zone in which a limit switches on begins at the limit.
+    width = system.robot.material.limit_smoothing
     put("dof_control", control)
     for name, values in {
         "gear": gear,
@@ -108,8 +110,8 @@ def _put_dofs(put: Any, system: System) -> None:
         "stiffness": system.stiffness,
         "spring_rest": system.spring_rest,
         # far beyond any angle, and finite: infinity times zero stiffness is NaN
-        "limit_lower": np.clip(system.limit_lower, -1e9, 1e9),
-        "limit_upper": np.clip(system.limit_upper, -1e9, 1e9),
+        "limit_lower": np.clip(system.limit_lower - width, -1e9, 1e9),
+        "limit_upper": np.clip(system.limit_upper + width, -1e9, 1e9),
         "limit_stiffness": system.limit_stiffness,
     }.items():
         put(name, values)

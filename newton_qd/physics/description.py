@@ -44,12 +44,14 @@ class Shape:
         frame: (7,) position [m] and quaternion xyzw in the body.
         size: (3,) as Newton stores it: sphere: radius; capsule and cylinder:
             radius, half of the straight part; box: half extents [m].
+        name: Name of the collider in the file; empty if it has none.
     """
 
     link: str
     kind: str
     frame: np.ndarray
     size: np.ndarray
+    name: str = ""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -133,7 +135,7 @@ def _read_shape(reader: XmlReader, element: ElementTree.Element, link: str) -> S
                 f"height={shape.get('height')!r} and length={shape.get('length')!r} "
                 "both mean the straight part and must be equal",
             )
-    return Shape(link, shape.tag, reader.frame(element), size)
+    return Shape(link, shape.tag, reader.frame(element), size, element.get("name", ""))
 
 
 def _read_inertial(

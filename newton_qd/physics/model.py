@@ -28,7 +28,7 @@ from newton_qd.physics.row import check_row, index_of
 from newton_qd.physics.system import JointKind, ObstacleKind, System
 from newton_qd.physics.verify import BuiltModel, ModelMismatchError, verify
 from newton_qd.physics.xml_reader import IDENTITY, RobotDescriptionError
-from newton_qd.robots import Robot
+from newton_qd.robots import Contact, Robot
 
 if TYPE_CHECKING:
     import newton
@@ -136,7 +136,7 @@ def _read_newton(model: newton.Model, description: Description) -> BuiltModel:
 
     def limits(array: object, empty: float) -> np.ndarray:
         rows = per_joint(array, empty)
-        return np.where(np.abs(rows) >= UNLIMITED, np.sign(rows) * np.inf, rows)
+        return np.where(np.abs(rows) >= UNLIMITED, np.copysign(np.inf, rows), rows)
 
     joint_names = [model.joint_label[joint].removeprefix(prefix) for joint in order]
     return BuiltModel(
@@ -206,6 +206,8 @@ def _dof_arrays(
     gear = np.full(nv, control["gear"].max(initial=0.0) or _DEFAULT_GEAR)
     gear[control["control_dof"]] = control["gear"]
     limited = np.isfinite(lower) | np.isfinite(upper)
+    width, overshoot = robot.material.limit_smoothing, robot.material.limit_overshoot
+    compressed = reference.penetration(width - overshoot, width)
     return {
         "armature": np.zeros(nv),
         "damping": damping,
@@ -213,9 +215,7 @@ def _dof_arrays(
         "spring_rest": np.zeros(nv),
         "limit_lower": lower,
         "limit_upper": upper,
-        "limit_stiffness": np.where(
-            limited, gear / robot.material.limit_overshoot, 0.0
-        ),
+        "limit_stiffness": np.where(limited, gear / compressed, 0.0),
     }
 
 
@@ -226,22 +226,32 @@ def _contact_sphere(shape: Shape, end: int) -> tuple[np.ndarray, float]:
     return shape.frame[:3] + end * half_length * axis, float(shape.size[0])
 
 
+def _collider(robot: Robot, contact: Contact, body: Body) -> Shape:
+    """Returns the one collider of a body that a row's contact means."""
+    kind = "capsule" if contact.end else "sphere"
+    found = [s for s in body.shapes if s.link == contact.link and s.kind == kind]
+    if contact.collider is not None:
+        found = [shape for shape in found if shape.name == contact.collider]
+    if len(found) != 1:
+        named = "" if contact.collider is None else f" named {contact.collider!r}"
+        raise RobotDescriptionError(
+            f"robot {robot.name!r}, contacts: end={contact.end} of link "
+            f"{contact.link!r} needs a {kind} collider{named} and the link has "
+            f"{len(found)}; allowed: exactly one, with end 0 for a sphere, 1 or -1 "
+            "for a capsule, and its name in the file where there are several"
+        )
+    return found[0]
+
+
 def _contacts(
     robot: Robot, bodies: list[Body], obstacles: int
 ) -> dict[str, np.ndarray]:
     """Pairs every contact sphere with every obstacle, sorted by body."""
     rows = []
     for contact in robot.contacts:
-        name, kind = contact.link, "capsule" if contact.end else "sphere"
-        body = _body_of(robot, "contacts", name, bodies)
-        found = [s for s in bodies[body].shapes if s.link == name and s.kind == kind]
-        if len(found) != 1:
-            raise RobotDescriptionError(
-                f"robot {robot.name!r}, contacts: end={contact.end} of link {name!r} "
-                f"needs a {kind} collider and the link has {len(found)}; allowed: "
-                "exactly one, with end 0 for a sphere, 1 or -1 for a capsule"
-            )
-        centre, radius = _contact_sphere(found[0], contact.end)
+        body = _body_of(robot, "contacts", contact.link, bodies)
+        shape = _collider(robot, contact, bodies[body])
+        centre, radius = _contact_sphere(shape, contact.end)
         rows += [(body, row, centre, radius) for row in range(obstacles)]
     rows.sort(key=lambda row: row[0])
     return {

@@ -135,6 +135,13 @@ def mass_matrix(system: System, q: np.ndarray) -> np.ndarray:
     return total
 
 
+def penetration(gap: float, width: float) -> float:
+    """Returns the smooth ``max(-gap, 0)`` of the kernels: exact beyond ``width``."""
+    if abs(gap) >= width:
+        return max(-gap, 0.0)
+    return (width - gap) ** 3 * (3 * width + gap) / (16 * width**3)
+
+
 def lowest_contact(system: System, q: np.ndarray) -> float:
     """Returns the height of the lowest contact sphere's bottom over z = 0 [m]."""
     frames = body_frames(system, q)

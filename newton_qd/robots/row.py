@@ -19,10 +19,13 @@ class Contact:
         link: URDF link whose collider carries the sphere.
         end: Which end of a capsule's axis: ``+1`` or ``-1`` along the local z
             axis of the collider; ``0`` for a sphere.
+        collider: Name of the collider in the URDF file; ``None`` where the link has
+            only one of its kind.
     """
 
     link: str
     end: int = 0
+    collider: str | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,10 +40,10 @@ class Material:
         smoothing: Half width of the zone in which a contact switches on [m].
         slip_velocity: Velocity below which friction is viscous [m/s].
         dissipation: Hunt-Crossley dissipation [s/m].
-        limit_overshoot: Angle by which a joint's full gear passes its limit
+        limit_overshoot: Angle by which a joint's full gear holds it past its limit
             [rad]; sets the stiffness of the limits.
         limit_smoothing: Half width of the zone in which a limit switches on
-            [rad].
+            [rad]; the zone begins at the limit, where nothing is felt yet.
     """
 
     friction: float = 1.0

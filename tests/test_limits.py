@@ -1,0 +1,83 @@
+"""Joint limits of every robot: nothing is felt on them, and full gear is held."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+from physics_helpers import batched_step, report, rollout, variant
+
+from newton_qd.physics.system import JointKind, System
+from newton_qd.robots import ROBOTS
+
+SECONDS = 4.0  # after which a joint under full gear is still
+
+
+def floating(name: str, **changes: object) -> System:
+    """A robot without weight and ground, so that only its joints act."""
+    row = ROBOTS[name]
+    return variant(
+        row, "float32", gravity=0.0, contacts=(), feet=(), rest_height=None, **changes
+    )
+
+
+def on_limits(system: System) -> np.ndarray:
+    """Coordinates (2, nq) with every limited joint on its lower or upper limit."""
+    q = np.tile(system.rest_q, (2, 1))
+    for body in np.flatnonzero(system.joint_kind == JointKind.REVOLUTE):
+        dof, at = system.v_start[body], system.q_start[body]
+        for side, limit in enumerate(
+            (system.limit_lower[dof], system.limit_upper[dof])
+        ):
+            q[side, at] = limit if np.isfinite(limit) else q[side, at]
+    return q.astype(np.float32)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_a_pose_on_its_limits_feels_nothing(name: str) -> None:
+    """Less than 2 % of what the gear of the joint does in the same time."""
+    system = floating(name)
+    q = on_limits(system)
+    still = np.zeros((2, system.nv), np.float32)
+    none = np.zeros((2, system.nu), np.float32)
+    inward = np.array([[1.0], [-1.0]], np.float32) + none
+    let_go = np.asarray(batched_step(system)(q, still, none)[1])
+    driven = np.asarray(batched_step(system)(q, still, inward)[1])
+    share = np.abs(let_go).max() / np.abs(driven).max(axis=1).min()
+    report("share of the gear", share)
+    assert share < 0.02
+
+
+def pushed(system: System, on_limit: bool) -> np.ndarray:
+    """Angles beyond the limit (2 nu, steps) of each joint under its full gear alone."""
+    steps = round(SECONDS / system.robot.dt)
+    rows = [(side, joint) for joint in range(system.nu) for side in (-1.0, 1.0)]
+    q = np.tile(system.rest_q, (len(rows), 1))
+    controls = np.zeros((len(rows), steps, system.nu))
+    at, limit = [], []
+    for row, (side, joint) in enumerate(rows):
+        dof = system.control_dof[joint]
+        at.append(int(system.q_start[system.v_start == dof][0]))
+        limit.append((system.limit_upper if side > 0 else system.limit_lower)[dof])
+        controls[row, :, joint] = side
+        if on_limit:
+            q[row, at[row]] = limit[row]
+    still = np.zeros((len(rows), system.nv))
+    states = (x.astype(np.float32) for x in (q, still, controls))
+    path = np.asarray(jax.vmap(rollout(system))(*states).q)
+    angles = path[np.arange(len(rows)), :, at]
+    return np.array([side for side, _ in rows])[:, None] * (
+        angles - np.array(limit)[:, None]
+    )
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_full_gear_is_held_at_the_stated_angle(name: str) -> None:
+    """From the default pose, and from on the limit without a large swing."""
+    system = floating(name)
+    stated = system.robot.material.limit_overshoot
+    for on_limit in (False, True):
+        beyond = pushed(system, on_limit)
+        report("peak beyond the limit [rad]", beyond.max())
+        np.testing.assert_allclose(beyond[:, -1], stated, rtol=0.02)
+    assert beyond.max() < 1.5 * stated
