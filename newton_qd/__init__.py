@@ -19,7 +19,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from newton_qd.envs.base import Env, State, check
+    from newton_qd.envs.base import Env
+    from newton_qd.envs.state import State, check
     from newton_qd.errors import FaultError, MissingExtra, UnknownEnvironment
     from newton_qd.registry import (
         behavior_descriptor_extractor,
@@ -53,10 +54,10 @@ _HOME = {
     "Env": "newton_qd.envs.base",
     "FaultError": "newton_qd.errors",
     "MissingExtra": "newton_qd.errors",
-    "State": "newton_qd.envs.base",
+    "State": "newton_qd.envs.state",
     "UnknownEnvironment": "newton_qd.errors",
     "behavior_descriptor_extractor": "newton_qd.registry",
-    "check": "newton_qd.envs.base",
+    "check": "newton_qd.envs.state",
     "create": "newton_qd.registry",
     "create_fn": "newton_qd.registry",
     "descriptor_extractor": "newton_qd.registry",

@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import newton_qd
-from newton_qd.envs.base import Env, State
+from newton_qd.envs.base import Env
+from newton_qd.envs.state import State
 
 NAMES = newton_qd.registered_envs()
 STACKS: dict[str, dict[str, Any]] = {

@@ -23,7 +23,7 @@ from contract import (
 )
 
 import newton_qd
-from newton_qd.envs.base import State
+from newton_qd.envs.state import State
 
 
 def spoil(state: State, actions: jax.Array, kind: str) -> tuple[State, jax.Array]:

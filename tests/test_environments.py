@@ -33,7 +33,8 @@ from contract import (
 )
 
 import newton_qd
-from newton_qd.envs.base import Env, PhysicsEnv, State
+from newton_qd.envs.base import Env, PhysicsEnv
+from newton_qd.envs.state import State
 from newton_qd.types import INFO_KEYS
 
 

@@ -13,8 +13,9 @@ import pytest
 
 import newton_qd
 from newton_qd.envs.ant import Ant
-from newton_qd.envs.base import Env, PhysicsEnv, State
+from newton_qd.envs.base import Env, PhysicsEnv
 from newton_qd.envs.feet import feet_contact, load_fraction, smooth_feet_contact
+from newton_qd.envs.state import State
 from newton_qd.physics.system import PhysicsState
 from newton_qd.types import Params
 from newton_qd.wrappers import (

@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from newton_qd.envs.base import Env, State
+from newton_qd.envs.base import Env
+from newton_qd.envs.state import State
 from newton_qd.types import Action, Params, RNGKey
 
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from newton_qd.envs.base import Env, PhysicsEnv, QDEnv, State
+from newton_qd.envs.base import Env, PhysicsEnv, QDEnv
 from newton_qd.envs.feet import feet_contact, smooth_feet_contact
+from newton_qd.envs.state import State
 from newton_qd.types import Action, Descriptor, Params, RNGKey
 from newton_qd.wrappers.base import Wrapper
 

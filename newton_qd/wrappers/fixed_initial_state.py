@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from newton_qd.envs.base import Env, PhysicsEnv, State
+from newton_qd.envs.base import Env, PhysicsEnv
+from newton_qd.envs.state import State
 from newton_qd.types import RNGKey
 from newton_qd.wrappers.base import Wrapper
 
