@@ -9,8 +9,9 @@ from typing import Any, Generic, TypeVar
 
 from newton_qd.envs.ant import Ant
 from newton_qd.envs.base import Env
+from newton_qd.envs.pointmaze import PointMaze
 from newton_qd.errors import UnknownEnvironment
-from newton_qd.extractors import get_feet_contact_proportion
+from newton_qd.extractors import get_feet_contact_proportion, get_final_xy_position
 from newton_qd.wrappers import (
     AutoResetWrapper,
     CompletedEvalWrapper,
@@ -65,6 +66,12 @@ _ROWS: dict[str, EnvironmentRow] = {
         wrappers=(WrapperRow(FeetContactWrapper),),
         descriptor_extractor=get_feet_contact_proportion,
         reward_offset=3.24,
+    ),
+    "pointmaze": EnvironmentRow(
+        PointMaze,
+        "pointmaze",
+        descriptor_extractor=get_final_xy_position,
+        reward_offset=2.3431,
     ),
 }
 
@@ -188,7 +195,7 @@ def create(
         )
     env = row.base(**kwargs)
     if fixed_init_state:
-        env = FixedInitialStateWrapper(env)
+        env = FixedInitialStateWrapper(env, row.base_name)
     for wrapper_row, chosen in zip(row.wrappers, options, strict=True):
         env = wrapper_row.wrapper(env, row.base_name, **chosen)
     if episode_length is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -70,6 +71,15 @@ class Env(abc.ABC):
     def unwrapped(self) -> Env:
         """The environment inside all wrappers."""
         return self
+
+    def with_base(self, change: Callable[[Env], Env]) -> Env:
+        """Returns the same wrappers around another environment.
+
+        Args:
+            change: Makes the new inside from ``unwrapped``; this environment and its
+                wrappers stay as they are.
+        """
+        return change(self)
 
 
 class QDEnv(Env):
