@@ -19,7 +19,9 @@ from newton_qd.wrappers import (
     EvalWrapper,
     FeetContactWrapper,
     FixedInitialStateWrapper,
+    NoForwardRewardWrapper,
     VectorWrapper,
+    XYPositionWrapper,
 )
 
 Extractor = Callable[[Any, Any], Any]
@@ -58,6 +60,13 @@ class EnvironmentRow:
     reward_offset: float | None = None
 
 
+def _xy_position(
+    minval: tuple[float, float], maxval: tuple[float, float]
+) -> WrapperRow:
+    """Returns the wrapper for a position within limits [m] as the descriptor."""
+    return WrapperRow(XYPositionWrapper, {"minval": minval, "maxval": maxval})
+
+
 _ROWS: dict[str, EnvironmentRow] = {
     "ant": EnvironmentRow(Ant, "ant"),
     "ant_uni": EnvironmentRow(
@@ -66,6 +75,23 @@ _ROWS: dict[str, EnvironmentRow] = {
         wrappers=(WrapperRow(FeetContactWrapper),),
         descriptor_extractor=get_feet_contact_proportion,
         reward_offset=3.24,
+    ),
+    "ant_omni": EnvironmentRow(
+        Ant,
+        "ant",
+        wrappers=(
+            _xy_position((-30.0, -30.0), (30.0, 30.0)),
+            WrapperRow(NoForwardRewardWrapper),
+        ),
+        descriptor_extractor=get_final_xy_position,
+        reward_offset=3.0,
+    ),
+    "antnotrap": EnvironmentRow(
+        Ant,
+        "ant",
+        wrappers=(_xy_position((0.0, -8.0), (70.0, 8.0)),),
+        descriptor_extractor=get_final_xy_position,
+        reward_offset=3.38,
     ),
     "pointmaze": EnvironmentRow(
         PointMaze,

@@ -50,7 +50,13 @@ def rows(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 def test_names() -> None:
-    assert newton_qd.registered_envs() == ("ant", "ant_uni", "pointmaze")
+    assert newton_qd.registered_envs() == (
+        "ant",
+        "ant_uni",
+        "ant_omni",
+        "antnotrap",
+        "pointmaze",
+    )
 
 
 def test_wrappers_are_stacked_in_order() -> None:
@@ -134,14 +140,21 @@ def test_tables_are_columns_of_the_rows() -> None:
     extractors = newton_qd.behavior_descriptor_extractor
     assert dict(extractors) == {
         "ant_uni": get_feet_contact_proportion,
+        "ant_omni": get_final_xy_position,
+        "antnotrap": get_final_xy_position,
         "pointmaze": get_final_xy_position,
     }
     assert newton_qd.descriptor_extractor is extractors
-    assert dict(newton_qd.reward_offset) == {"ant_uni": 3.24, "pointmaze": 2.3431}
-    assert len(newton_qd.reward_offset) == 2 and "ant" not in newton_qd.reward_offset
+    assert dict(newton_qd.reward_offset) == {
+        "ant_uni": 3.24,
+        "ant_omni": 3.0,
+        "antnotrap": 3.38,
+        "pointmaze": 2.3431,
+    }
+    assert len(newton_qd.reward_offset) == 4 and "ant" not in newton_qd.reward_offset
     assert "ant_uni" in repr(newton_qd.reward_offset)
     with pytest.raises(
-        KeyError, match="'ant' has no reward_offset; known: ant_uni, poi"
+        KeyError, match="'ant' has no reward_offset; known: ant_uni, ant_"
     ):
         newton_qd.reward_offset["ant"]
 

@@ -22,6 +22,8 @@ class Ant(PhysicsEnv):
     being healthy, minus costs of control and of contact. Done when unhealthy.
     """
 
+    forward_reward_name = "reward_forward"
+
     def __init__(
         self,
         *,

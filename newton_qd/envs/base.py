@@ -127,6 +127,9 @@ class PhysicsEnv(Env):
     passes. Other worlds do not notice.
     """
 
+    forward_reward_name: str | None = None
+    """Metric that is the forward part of the reward; ``None``: there is none."""
+
     _vertical = 2  # coordinate that raises the robot: z of a free root
 
     def __init__(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
 import jax
@@ -59,6 +59,21 @@ def select(condition: jax.Array, chosen: Tree, other: Tree) -> Tree:
         return jnp.where(condition.reshape(axes), a, b)
 
     return jax.tree.map(leaf, chosen, other)
+
+
+def per_world(read: Callable[[Any], Tree], state: State) -> Tree:
+    """Reads the simulation of every world of a state.
+
+    Args:
+        read: Function of the ``pipeline_state`` of one world.
+        state: State of one world or of any batch.
+
+    Returns:
+        What ``read`` returns, with the batch axes in front.
+    """
+    for _ in range(jnp.ndim(state.done)):
+        read = jax.vmap(read)
+    return read(state.pipeline_state)
 
 
 def check(state: State) -> None:
