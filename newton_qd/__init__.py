@@ -8,6 +8,8 @@ The facade:
 - ``check(state)``: raises ``FaultError`` where a world was frozen
 - ``behavior_descriptor_extractor``, ``descriptor_extractor``, ``reward_offset``:
   tables by environment name
+- ``FEET_NAMES``, ``COG_NAMES``, ``FORWARD_REWARD_NAMES``: read-only tables of links
+  and metrics by the name of the environment inside; ``register`` extends them
 
 Importing the package imports none of its parts: each name is loaded when it is
 first used.
@@ -19,9 +21,13 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from newton_qd.envs.base import Env, State, check
+    from newton_qd.envs.base import Env
+    from newton_qd.envs.state import State, check
     from newton_qd.errors import FaultError, MissingExtra, UnknownEnvironment
     from newton_qd.registry import (
+        COG_NAMES,
+        FEET_NAMES,
+        FORWARD_REWARD_NAMES,
         behavior_descriptor_extractor,
         create,
         create_fn,
@@ -34,6 +40,9 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
+    "COG_NAMES",
+    "FEET_NAMES",
+    "FORWARD_REWARD_NAMES",
     "Env",
     "FaultError",
     "MissingExtra",
@@ -50,13 +59,16 @@ __all__ = [
 ]
 
 _HOME = {
+    "COG_NAMES": "newton_qd.registry",
+    "FEET_NAMES": "newton_qd.registry",
+    "FORWARD_REWARD_NAMES": "newton_qd.registry",
     "Env": "newton_qd.envs.base",
     "FaultError": "newton_qd.errors",
     "MissingExtra": "newton_qd.errors",
-    "State": "newton_qd.envs.base",
+    "State": "newton_qd.envs.state",
     "UnknownEnvironment": "newton_qd.errors",
     "behavior_descriptor_extractor": "newton_qd.registry",
-    "check": "newton_qd.envs.base",
+    "check": "newton_qd.envs.state",
     "create": "newton_qd.registry",
     "create_fn": "newton_qd.registry",
     "descriptor_extractor": "newton_qd.registry",

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+import dataclasses
+from typing import Any, Protocol, Self
 
 import jax
 import jax.numpy as jnp
 
-from newton_qd.types import Descriptor, Mask
+from newton_qd.types import Descriptor, Mask, Observation
 
 
 def folded_sum(values: jax.Array, axis: int) -> jax.Array:
@@ -61,3 +62,80 @@ def get_feet_contact_proportion(data: Any, mask: Mask) -> Descriptor:
     """
     valid = (1.0 - mask)[..., None].astype(data.state_desc.dtype)
     return folded_sum(data.state_desc * valid, 1) / folded_sum(valid, 1)
+
+
+class Encoder(Protocol):
+    """A model with parameters outside of it, as a module of Flax."""
+
+    def encode(self, observations: jax.Array) -> jax.Array:
+        """Returns the encoding of observations."""
+        ...
+
+    def apply(self, variables: Any, *args: Any, method: Any) -> Any:
+        """Calls a method of the model with given parameters."""
+        ...
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
+class AuroraExtraInfo:
+    """What AURORA keeps besides a repertoire; a pytree.
+
+    Attributes:
+        model_params: Parameters of the model that reduces observations.
+    """
+
+    model_params: Any
+
+    def replace(self, **changes: Any) -> Self:
+        """Returns a copy with some fields replaced."""
+        return dataclasses.replace(self, **changes)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
+class AuroraExtraInfoNormalization(AuroraExtraInfo):
+    """What AURORA keeps, with the normalization of observations.
+
+    Attributes:
+        model_params: Parameters of the model that reduces observations.
+        mean_observations: Mean, of a shape that broadcasts to the observations.
+        std_observations: Standard deviation, likewise.
+    """
+
+    mean_observations: jax.Array
+    std_observations: jax.Array
+
+    @classmethod
+    def create(
+        cls,
+        model_params: Any,
+        mean_observations: jax.Array,
+        std_observations: jax.Array,
+    ) -> Self:
+        """Returns the three together."""
+        return cls(model_params, mean_observations, std_observations)
+
+
+def get_aurora_encoding(
+    observations: Observation,
+    aurora_extra_info: AuroraExtraInfoNormalization,
+    model: Encoder,
+) -> Descriptor:
+    """Descriptors learned from observations, by AURORA's model.
+
+    Args:
+        observations: (n, t, no) observations, or what the model takes.
+        aurora_extra_info: Parameters and normalization. A standard deviation of 0
+            belongs to a component that never changes: it becomes its distance from
+            the mean, which is 0.
+        model: Flax module with a method ``encode``; static under ``jax.jit``.
+
+    Returns:
+        (n, nd) encodings, without axes of length 1.
+    """
+    deviation = aurora_extra_info.std_observations
+    scale = jnp.where(deviation == 0, jnp.ones_like(deviation), deviation)
+    normalized = (observations - aurora_extra_info.mean_observations) / scale
+    variables = {"params": aurora_extra_info.model_params}
+    return model.apply(variables, normalized, method=model.encode).squeeze()

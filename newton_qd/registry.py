@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import inspect
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Generic, TypeVar
 
 from newton_qd.envs.ant import Ant
 from newton_qd.envs.base import Env
+from newton_qd.envs.pointmaze import PointMaze
 from newton_qd.errors import UnknownEnvironment
-from newton_qd.extractors import get_feet_contact_proportion
+from newton_qd.extractors import get_feet_contact_proportion, get_final_xy_position
+from newton_qd.robots import ROBOTS, Robot
 from newton_qd.wrappers import (
     AutoResetWrapper,
     CompletedEvalWrapper,
@@ -18,7 +21,9 @@ from newton_qd.wrappers import (
     EvalWrapper,
     FeetContactWrapper,
     FixedInitialStateWrapper,
+    NoForwardRewardWrapper,
     VectorWrapper,
+    XYPositionWrapper,
 )
 
 Extractor = Callable[[Any, Any], Any]
@@ -48,6 +53,8 @@ class EnvironmentRow:
         wrappers: From the inside to the outside.
         descriptor_extractor: Reads the descriptor of an episode, for QD tasks.
         reward_offset: Added to each step's reward to keep QD scores positive.
+        robot: Row of the robot inside; ``None``: that of ``ROBOTS`` called
+            ``base_name``, if there is one.
     """
 
     base: Callable[..., Env]
@@ -55,6 +62,34 @@ class EnvironmentRow:
     wrappers: tuple[WrapperRow, ...] = ()
     descriptor_extractor: Extractor | None = None
     reward_offset: float | None = None
+    robot: Robot | None = None
+
+    @property
+    def feet(self) -> tuple[str, ...] | None:
+        """Links of the robot's feet; ``None`` where it has none."""
+        robot = self._robot
+        return robot.feet if robot is not None and robot.feet else None
+
+    @property
+    def torso(self) -> str | None:
+        """Link of the robot's torso; ``None`` where there is no robot."""
+        return None if self._robot is None else self._robot.torso
+
+    @property
+    def forward_reward(self) -> str | None:
+        """Metric that is the forward part of the reward; ``None``: there is none."""
+        return getattr(self.base, "forward_reward_name", None)
+
+    @property
+    def _robot(self) -> Robot | None:
+        return self.robot or ROBOTS.get(self.base_name)
+
+
+def _xy_position(
+    minval: tuple[float, float], maxval: tuple[float, float]
+) -> WrapperRow:
+    """Returns the wrapper for a position within limits [m] as the descriptor."""
+    return WrapperRow(XYPositionWrapper, {"minval": minval, "maxval": maxval})
 
 
 _ROWS: dict[str, EnvironmentRow] = {
@@ -66,6 +101,29 @@ _ROWS: dict[str, EnvironmentRow] = {
         descriptor_extractor=get_feet_contact_proportion,
         reward_offset=3.24,
     ),
+    "ant_omni": EnvironmentRow(
+        Ant,
+        "ant",
+        wrappers=(
+            _xy_position((-30.0, -30.0), (30.0, 30.0)),
+            WrapperRow(NoForwardRewardWrapper),
+        ),
+        descriptor_extractor=get_final_xy_position,
+        reward_offset=3.0,
+    ),
+    "antnotrap": EnvironmentRow(
+        Ant,
+        "ant",
+        wrappers=(_xy_position((0.0, -8.0), (70.0, 8.0)),),
+        descriptor_extractor=get_final_xy_position,
+        reward_offset=3.38,
+    ),
+    "pointmaze": EnvironmentRow(
+        PointMaze,
+        "pointmaze",
+        descriptor_extractor=get_final_xy_position,
+        reward_offset=2.3431,
+    ),
 }
 
 
@@ -76,17 +134,15 @@ class _Column(Mapping[str, Value], Generic[Value]):
         self._attribute = attribute
 
     def __getitem__(self, env_name: str) -> Value:
-        row = _ROWS.get(env_name)
-        value = None if row is None else getattr(row, self._attribute)
-        if value is None:
-            raise KeyError(
-                f"{env_name!r} has no {self._attribute}; known: {', '.join(self)}"
-            )
-        return value
+        for name, value in self._items():
+            if name == env_name:
+                return value
+        raise KeyError(
+            f"{env_name!r} has no {self._attribute}; known: {', '.join(self)}"
+        )
 
     def __iter__(self) -> Iterator[str]:
-        rows = _ROWS.items()
-        return (name for name, row in rows if getattr(row, self._attribute) is not None)
+        return iter(dict(self._items()))
 
     def __len__(self) -> int:
         return sum(1 for _ in self)
@@ -94,10 +150,30 @@ class _Column(Mapping[str, Value], Generic[Value]):
     def __repr__(self) -> str:
         return repr(dict(self))
 
+    def _items(self) -> Iterator[tuple[str, Value]]:
+        for name, row in self._rows():
+            value = getattr(row, self._attribute)
+            if value is not None:
+                yield name, value
+
+    def _rows(self) -> Iterator[tuple[str, EnvironmentRow]]:
+        yield from _ROWS.items()
+
+
+class _BaseColumn(_Column[Value]):
+    """Read-only table of one attribute by the name that the wrappers receive."""
+
+    def _rows(self) -> Iterator[tuple[str, EnvironmentRow]]:
+        for row in _ROWS.values():
+            yield row.base_name, row
+
 
 descriptor_extractor: Mapping[str, Extractor] = _Column("descriptor_extractor")
 behavior_descriptor_extractor: Mapping[str, Extractor] = descriptor_extractor
 reward_offset: Mapping[str, float] = _Column("reward_offset")
+FEET_NAMES: Mapping[str, tuple[str, ...]] = _BaseColumn("feet")
+COG_NAMES: Mapping[str, str] = _BaseColumn("torso")
+FORWARD_REWARD_NAMES: Mapping[str, str] = _BaseColumn("forward_reward")
 
 
 def registered_envs() -> tuple[str, ...]:
@@ -113,6 +189,7 @@ def register(
     wrappers: Sequence[WrapperRow] = (),
     descriptor_extractor: Extractor | None = None,
     reward_offset: float | None = None,
+    robot: Robot | None = None,
 ) -> None:
     """Adds an environment to the names that ``create`` knows.
 
@@ -123,6 +200,7 @@ def register(
         wrappers: Wrappers, from the inside to the outside.
         descriptor_extractor: Reads the descriptor of an episode, for QD tasks.
         reward_offset: Added to each step's reward to keep QD scores positive.
+        robot: Row of the robot inside, for ``FEET_NAMES`` and ``COG_NAMES``.
 
     Raises:
         ValueError: The name is taken, or is not a name.
@@ -141,6 +219,7 @@ def register(
         tuple(wrappers),
         descriptor_extractor,
         reward_offset,
+        robot,
     )
 
 
@@ -175,6 +254,7 @@ def create(
 
     Raises:
         UnknownEnvironment: ``env_name`` is not registered.
+        TypeError: A keyword argument is unknown.
         ValueError: A value or a combination is not allowed.
     """
     row = _ROWS.get(env_name) if isinstance(env_name, str) else None
@@ -186,9 +266,10 @@ def create(
             f"episode_length=None with action_repeat={action_repeat!r}, eval_metrics="
             f"{eval_metrics!r}; allowed: 1 and False, or an episode length"
         )
+    _require_keywords(env_name, row.base, kwargs)
     env = row.base(**kwargs)
     if fixed_init_state:
-        env = FixedInitialStateWrapper(env)
+        env = FixedInitialStateWrapper(env, row.base_name)
     for wrapper_row, chosen in zip(row.wrappers, options, strict=True):
         env = wrapper_row.wrapper(env, row.base_name, **chosen)
     if episode_length is not None:
@@ -205,6 +286,22 @@ def create(
 def create_fn(env_name: str, **kwargs: Any) -> Callable[..., Env]:
     """Returns ``create`` with its arguments filled in; nothing is built yet."""
     return functools.partial(create, env_name, **kwargs)
+
+
+def _require_keywords(
+    env_name: str, base: Callable[..., Env], given: Mapping[str, Any]
+) -> None:
+    """Raises for keyword arguments that the environment inside does not take."""
+    parameters = inspect.signature(base).parameters.values()
+    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
+        return
+    allowed = [p.name for p in parameters if p.kind is not p.POSITIONAL_ONLY]
+    for name in given:
+        if name not in allowed:
+            raise TypeError(
+                f"{name}={given[name]!r}: not an argument of {env_name!r}; allowed: "
+                f"those of create, and {', '.join(allowed) or 'no other'}"
+            )
 
 
 def _wrapper_options(

@@ -23,11 +23,16 @@ INFO_KEYS: Mapping[str, str] = types.MappingProxyType(
         "steps": "() control steps since the episode began",
         "truncation": "() 1 where the episode ended by its length alone, else 0",
         "state_descriptor": "(nd,) descriptor of the state that this step reached",
+        "xy_position": "(2,) x and y of the torso [m], also beyond the limits",
         "first_pipeline_state": "physics state to which an auto-reset returns",
         "first_obs": "(no,) observation to which an auto-reset returns",
         "first_state_descriptor": "(nd,) descriptor to which an auto-reset returns",
+        "first_xy_position": "(2,) position to which an auto-reset returns [m]",
         "eval_metrics": "EvalMetrics: sums over the first episode",
         "completed_eval_metrics": "CompletedEvalMetrics: sums over ended episodes",
     }
 )
 """Every key that the environments and wrappers write into ``State.info``."""
+
+READINGS = ("state_descriptor", "xy_position")
+"""Keys of ``State.info`` that read the simulation and follow it at an auto-reset."""

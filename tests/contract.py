@@ -11,7 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import newton_qd
-from newton_qd.envs.base import Env, State
+from newton_qd.envs.base import Env
+from newton_qd.envs.state import State
+from newton_qd.physics.system import PhysicsState
 
 NAMES = newton_qd.registered_envs()
 STACKS: dict[str, dict[str, Any]] = {
@@ -104,13 +106,30 @@ def reshaped(tree: Any, old_axes: int, new: tuple[int, ...]) -> Any:
     )
 
 
+def observation_layout(env: Env) -> tuple[tuple[str, int], ...]:
+    base: Any = env.unwrapped
+    return base.observation_layout
+
+
+def coordinates(state: State) -> jax.Array:
+    """What a simulation starts from: of an environment without physics, its obs."""
+    physics = state.pipeline_state
+    return physics.q if isinstance(physics, PhysicsState) else state.obs
+
+
+def with_coordinates(state: State, q: jax.Array) -> State:
+    physics = state.pipeline_state
+    if isinstance(physics, PhysicsState):
+        return state.replace(pipeline_state=dataclasses.replace(physics, q=q))
+    return state.replace(obs=q)
+
+
 @functools.cache
 def gradient(env: Env) -> Any:
-    """Jitted gradient, to q and actions, of a sum over everything that is returned."""
+    """Jitted gradient, to coordinates and actions, of a sum over what is returned."""
 
     def total(q: jax.Array, actions: jax.Array, state: State) -> jax.Array:
-        start = dataclasses.replace(state.pipeline_state, q=q)
-        states = rollout(env)(state.replace(pipeline_state=start), actions)
+        states = rollout(env)(with_coordinates(state, q), actions)
         parts = (states.reward, states.obs, states.pipeline_state, states.metrics)
         zero = jnp.zeros((), env.dtype)
         return sum((jnp.sum(jnp.sin(x)) for x in jax.tree.leaves(parts)), zero)

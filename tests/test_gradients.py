@@ -14,7 +14,8 @@ from physics_helpers import batched_step, one_step, random_states, report
 
 import newton_qd
 from newton_qd import physics
-from newton_qd.envs.base import Env, State
+from newton_qd.envs.base import Env
+from newton_qd.envs.state import State
 from newton_qd.physics.system import System
 from newton_qd.robots import ANT
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import pickle
 import tomllib
 from collections.abc import Iterator
@@ -16,12 +17,14 @@ import pytest
 import newton_qd
 from newton_qd import registry
 from newton_qd.envs.ant import Ant
-from newton_qd.envs.base import Env
+from newton_qd.envs.base import Env, PhysicsEnv
+from newton_qd.envs.pointmaze import PointMaze
 from newton_qd.extractors import (
     folded_sum,
     get_feet_contact_proportion,
     get_final_xy_position,
 )
+from newton_qd.robots import ANT
 from newton_qd.wrappers import (
     AutoResetWrapper,
     CompletedEvalWrapper,
@@ -50,7 +53,13 @@ def rows(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 def test_names() -> None:
-    assert newton_qd.registered_envs() == ("ant", "ant_uni")
+    assert newton_qd.registered_envs() == (
+        "ant",
+        "ant_uni",
+        "ant_omni",
+        "antnotrap",
+        "pointmaze",
+    )
 
 
 def test_wrappers_are_stacked_in_order() -> None:
@@ -83,8 +92,12 @@ def test_keywords_reach_the_environment() -> None:
     assert env.observation_size == 27
     env = newton_qd.create("ant", exclude_current_positions_from_observation=False)
     assert env.observation_size == 89
-    with pytest.raises(TypeError, match="legacy_spring"):
+    with pytest.raises(
+        TypeError, match=r"legacy_spring=True: .*'ant'; allowed: .*ctrl_cost_weight, "
+    ):
         newton_qd.create("ant", legacy_spring=True)
+    with pytest.raises(TypeError, match=r"zone=1: .*'pointmaze'; .*zone_width, "):
+        newton_qd.create("pointmaze", zone=1)
 
 
 def test_create_fn_is_lazy() -> None:
@@ -132,13 +145,62 @@ def test_float64_needs_x64() -> None:
 
 def test_tables_are_columns_of_the_rows() -> None:
     extractors = newton_qd.behavior_descriptor_extractor
-    assert dict(extractors) == {"ant_uni": get_feet_contact_proportion}
+    assert dict(extractors) == {
+        "ant_uni": get_feet_contact_proportion,
+        "ant_omni": get_final_xy_position,
+        "antnotrap": get_final_xy_position,
+        "pointmaze": get_final_xy_position,
+    }
     assert newton_qd.descriptor_extractor is extractors
-    assert dict(newton_qd.reward_offset) == {"ant_uni": 3.24}
-    assert len(newton_qd.reward_offset) == 1 and "ant" not in newton_qd.reward_offset
+    assert dict(newton_qd.reward_offset) == {
+        "ant_uni": 3.24,
+        "ant_omni": 3.0,
+        "antnotrap": 3.38,
+        "pointmaze": 2.3431,
+    }
+    assert len(newton_qd.reward_offset) == 4 and "ant" not in newton_qd.reward_offset
     assert "ant_uni" in repr(newton_qd.reward_offset)
-    with pytest.raises(KeyError, match="'ant' has no reward_offset; known: ant_uni"):
+    with pytest.raises(
+        KeyError, match="'ant' has no reward_offset; known: ant_uni, ant_"
+    ):
         newton_qd.reward_offset["ant"]
+
+
+def test_tables_of_links_and_metrics_are_views(rows: None) -> None:
+    assert newton_qd.FEET_NAMES["ant"] == ("foot_1", "foot_2", "foot_3", "foot_4")
+    assert newton_qd.COG_NAMES["ant"] == "torso"
+    assert newton_qd.FORWARD_REWARD_NAMES["ant"] == "reward_forward"
+    tables = newton_qd.FEET_NAMES, newton_qd.COG_NAMES, newton_qd.FORWARD_REWARD_NAMES
+    for table in tables:
+        assert "ant_uni" not in table and "pointmaze" not in table
+        assert len(table) == len(set(table)) == len(dict(table))
+        with pytest.raises(TypeError):
+            table["mine"] = ("a",)  # pyright: ignore[reportIndexIssue]
+        with pytest.raises(KeyError, match=r"'pointmaze' has no .*known: ant"):
+            table["pointmaze"]
+
+    class Walker(Ant):
+        forward_reward_name = "x_velocity"
+
+    robot = dataclasses.replace(ANT, feet=("foot_2",), torso="aux_1")
+    newton_qd.register("mine", Walker, robot=robot)
+    assert newton_qd.FEET_NAMES["mine"] == ("foot_2",)
+    assert newton_qd.COG_NAMES["mine"] == "aux_1"
+    assert newton_qd.FORWARD_REWARD_NAMES["mine"] == "x_velocity"
+    # an environment that is not a robot's
+    newton_qd.register("footless", PointMaze)
+    assert not any("footless" in table for table in tables)
+
+
+def test_tables_agree_with_the_environments() -> None:
+    for name in newton_qd.registered_envs():
+        base = newton_qd.create(name).unwrapped
+        if isinstance(base, PhysicsEnv):
+            inside = registry._ROWS[name].base_name
+            assert newton_qd.FEET_NAMES.get(inside, ()) == base.robot.feet
+            assert newton_qd.COG_NAMES[inside] == base.robot.torso
+            forward = newton_qd.FORWARD_REWARD_NAMES.get(inside)
+            assert forward == base.forward_reward_name
 
 
 def test_register(rows: None) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import pickle
 from types import SimpleNamespace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,8 +14,9 @@ import pytest
 
 import newton_qd
 from newton_qd.envs.ant import Ant
-from newton_qd.envs.base import Env, PhysicsEnv, State
+from newton_qd.envs.base import Env, PhysicsEnv
 from newton_qd.envs.feet import feet_contact, load_fraction, smooth_feet_contact
+from newton_qd.envs.state import State
 from newton_qd.physics.system import PhysicsState
 from newton_qd.types import Params
 from newton_qd.wrappers import (
@@ -280,13 +282,38 @@ def test_eval_leaves_the_old_state_alone() -> None:
     assert env.step(state, jnp.ones(1)).obs == first.obs
 
 
-def test_fixed_initial_state_needs_a_bare_robot() -> None:
+def test_fixed_initial_state_goes_inside_all_wrappers() -> None:
     ant = Ant()
-    state = FixedInitialStateWrapper(ant).reset(KEY)
-    assert state.obs.tolist() == ant.fixed_state().obs.tolist()
-    for other in (Line(), EpisodeWrapper(ant, 3, 1)):
-        with pytest.raises(NotImplementedError, match=r"does not support .* yet"):
-            FixedInitialStateWrapper(other)
+    expected = ant.fixed_state().obs.tolist()
+    assert FixedInitialStateWrapper(ant).reset(KEY).obs.tolist() == expected
+    inside = AutoResetWrapper(EpisodeWrapper(VectorWrapper(ant, 2), 1, 1))
+    env = FixedInitialStateWrapper(inside, "ant")
+    assert env.unwrapped is ant and env.batch_size == 2
+    state = jax.jit(env.reset)(KEY)
+    assert state.obs.tolist() == state.info["first_obs"].tolist() == [expected] * 2
+    ended = jax.jit(env.step)(state, jnp.ones((2, 8), np.float32))
+    assert ended.done.tolist() == [1, 1] and ended.obs.tolist() == [expected] * 2
+    # the environment that was given is as it was
+    assert jax.jit(inside.reset)(KEY).obs[0].tolist() != expected
+
+
+def test_fixed_initial_state_needs_one() -> None:
+    for env in (Line(), EpisodeWrapper(Line(), 3, 1)):
+        with pytest.raises(
+            NotImplementedError, match=r"^This wrapper does not support line yet\."
+        ):
+            FixedInitialStateWrapper(env, "line")
+
+
+def test_with_base_keeps_the_wrappers() -> None:
+    env: Any = AutoResetWrapper(EpisodeWrapper(Line(), 3, 1))
+    changed: Any = env.with_base(lambda base: VectorWrapper(base, 2))
+    assert [type(e) for e in (changed, changed.env, changed.env.env)] == [
+        AutoResetWrapper,
+        EpisodeWrapper,
+        VectorWrapper,
+    ]
+    assert changed.unwrapped is env.unwrapped and env.env.env is env.unwrapped
 
 
 def physics_with(env: PhysicsEnv, fraction: float) -> PhysicsState:

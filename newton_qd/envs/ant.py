@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from newton_qd.envs.base import PhysicsEnv, ordered_sum
+from newton_qd.envs.base import PhysicsEnv, ordered_sum, safe_norm
 from newton_qd.physics.system import PhysicsState, System
 from newton_qd.robots import ANT
 from newton_qd.types import Action, Metrics
@@ -21,6 +21,8 @@ class Ant(PhysicsEnv):
     Observation: ``observation_layout``. Reward: velocity along x, plus a bonus for
     being healthy, minus costs of control and of contact. Done when unhealthy.
     """
+
+    forward_reward_name = "reward_forward"
 
     def __init__(
         self,
@@ -106,7 +108,7 @@ class Ant(PhysicsEnv):
             "reward_contact": -contact,
             "x_position": position[0],
             "y_position": position[1],
-            "distance_from_origin": _length(position),
+            "distance_from_origin": safe_norm(position),
             "x_velocity": velocity[0],
             "y_velocity": velocity[1],
         }
@@ -152,11 +154,3 @@ def _rows(changes: jax.Array) -> jax.Array:
     # The ground never moves; its row is kept for the layout that policies know.
     ground = jnp.zeros((1, 3), changes.dtype)
     return jnp.concatenate([changes, ground]).reshape(-1)
-
-
-def _length(vector: jax.Array) -> jax.Array:
-    """Returns the norm of (n,), with gradient 0 instead of nan at 0."""
-    square = ordered_sum(jnp.square(vector))
-    positive = square > 0
-    root = jnp.sqrt(jnp.where(positive, square, jnp.ones_like(square)))
-    return jnp.where(positive, root, jnp.zeros_like(root))

@@ -3,50 +3,18 @@
 from __future__ import annotations
 
 import abc
-import dataclasses
-from collections.abc import Mapping
-from typing import Any, TypeVar
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 
 from newton_qd import physics
-from newton_qd.errors import FaultError
+from newton_qd.envs.inputs import checked_action, refuse_params, require_precision
+from newton_qd.envs.state import State, select
 from newton_qd.physics.system import PhysicsState, System
 from newton_qd.robots import Robot
-from newton_qd.types import Action, Info, Metrics, Observation, Params, RNGKey
-
-Tree = TypeVar("Tree")
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True, eq=False)
-class State:
-    """What ``reset`` and ``step`` return; a pytree that never changes its shape.
-
-    Every leaf of a batched state has the batch axis in front.
-
-    Attributes:
-        pipeline_state: What the simulation needs to go on: a ``PhysicsState``.
-        obs: (no,) observation.
-        reward: () reward of the step that led here; 0 after a reset.
-        done: () 1 where the episode has ended, else 0.
-        metrics: Parts of the reward and other () readings, 0 after a reset.
-        info: What wrappers remember; ``newton_qd.types.INFO_KEYS`` lists the keys.
-    """
-
-    pipeline_state: Any
-    obs: Observation
-    reward: jax.Array
-    done: jax.Array
-    metrics: Metrics
-    info: Info
-
-    def replace(self, **changes: Any) -> State:
-        """Returns a copy with some fields replaced."""
-        return dataclasses.replace(self, **changes)
+from newton_qd.types import Action, Metrics, Observation, Params, RNGKey
 
 
 class Env(abc.ABC):
@@ -104,6 +72,15 @@ class Env(abc.ABC):
         """The environment inside all wrappers."""
         return self
 
+    def with_base(self, change: Callable[[Env], Env]) -> Env:
+        """Returns the same wrappers around another environment.
+
+        Args:
+            change: Makes the new inside from ``unwrapped``; this environment and its
+                wrappers stay as they are.
+        """
+        return change(self)
+
 
 class QDEnv(Env):
     """An environment that writes ``info["state_descriptor"]``.
@@ -150,6 +127,9 @@ class PhysicsEnv(Env):
     passes. Other worlds do not notice.
     """
 
+    forward_reward_name: str | None = None
+    """Metric that is the forward part of the reward; ``None``: there is none."""
+
     def __init__(
         self, robot: Robot, *, reset_noise_scale: float, dtype: str = "float32"
     ) -> None:
@@ -188,7 +168,7 @@ class PhysicsEnv(Env):
 
     def reset(self, rng: RNGKey) -> State:
         """Begins an episode in the default pose with noise on the joints."""
-        self._require_precision()
+        require_precision(self._dtype)
         _, angle_key, velocity_key = jax.random.split(rng, 3)
         rest = self._rest()
         q = rest.q.at[self._joint_q].add(self._noise(angle_key))
@@ -200,23 +180,19 @@ class PhysicsEnv(Env):
 
     def fixed_state(self) -> State:
         """Returns the state of a reset without noise: the default pose, at rest."""
-        self._require_precision()
+        require_precision(self._dtype)
         return self._first_state(self._rest())
 
     def step(self, state: State, action: Action, params: Params = None) -> State:
         """Advances by one control step, or freezes a world at fault."""
-        self._require_precision()
-        if params is not None:
-            raise ValueError(
-                f"params={params!r}: per-world parameters are not available yet; "
-                "allowed: None"
-            )
-        action = self._checked_action(action)
+        require_precision(self._dtype)
+        refuse_params(params)
+        action = checked_action(action, self.action_size, self._dtype)
         # The physics freezes a world at fault and passes no gradient through it; a
         # world that was at fault before is handed over as one. The outcome sees zeros
         # instead, so that its zero gradient is not 0 * nan (double where).
         start: PhysicsState = state.pipeline_state
-        sound = _all_finite(action) & (state.info["fault"] == 0)
+        sound = jnp.all(jnp.isfinite(action)) & (state.info["fault"] == 0)
         nan = jnp.full_like(action, jnp.nan)
         after, fault = physics.step(self.system, start, jnp.where(sound, action, nan))
         fault = jnp.maximum(state.info["fault"], fault)
@@ -293,46 +269,6 @@ class PhysicsEnv(Env):
             info={"fault": jnp.zeros((), jnp.int32)},
         )
 
-    def _require_precision(self) -> None:
-        # JAX would otherwise round every array to float32 without an error.
-        if self._dtype == np.float64 and not jax.config.read("jax_enable_x64"):
-            raise ValueError(
-                "dtype='float64': JAX x64 is off; allowed: 'float32', or "
-                "jax.config.update('jax_enable_x64', True) before the environment"
-            )
-
-    def _checked_action(self, action: Action) -> Action:
-        """Returns the action, strongly typed, or raises what is wrong with it."""
-        expected = f"allowed: an array of shape {(self.action_size,)}, {self._dtype}"
-        if not isinstance(action, (jax.Array, np.ndarray)):
-            raise TypeError(f"action: type {type(action).__name__} given; {expected}")
-        values = jnp.asarray(action)
-        weak = jnp.issubdtype(values.dtype, jnp.floating) and values.weak_type
-        if values.dtype != self._dtype and not weak:
-            raise TypeError(f"action: dtype {values.dtype} given; {expected}")
-        if values.shape != (self.action_size,):
-            raise ValueError(
-                f"action: shape {values.shape} given; {expected} (for a batch, use "
-                "jax.vmap or create(..., batch_size=...))"
-            )
-        return values.astype(self._dtype)
-
-
-def select(condition: jax.Array, chosen: Tree, other: Tree) -> Tree:
-    """Chooses between two pytrees, world by world.
-
-    Args:
-        condition: Booleans; the leading axes of every leaf.
-        chosen: Where ``condition`` is true.
-        other: Elsewhere.
-    """
-
-    def leaf(a: jax.Array, b: jax.Array) -> jax.Array:
-        axes = condition.shape + (1,) * (jnp.ndim(b) - condition.ndim)
-        return jnp.where(condition.reshape(axes), a, b)
-
-    return jax.tree.map(leaf, chosen, other)
-
 
 def ordered_sum(terms: jax.Array) -> jax.Array:
     """Sums (n,) terms from the first to the last.
@@ -346,41 +282,9 @@ def ordered_sum(terms: jax.Array) -> jax.Array:
     return total
 
 
-def check(state: State) -> None:
-    """Raises where a world is at fault; for eager code, after a jitted rollout.
-
-    Args:
-        state: State of one world or of any batch.
-
-    Raises:
-        FaultError: Names the worlds, and their steps where ``info`` has them.
-        TypeError: ``state`` is traced.
-    """
-    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(state)):
-        raise TypeError(
-            "state: traced values given; allowed: the concrete state that a jitted "
-            "function has returned (inside jit, read info['fault'])"
-        )
-    info: Mapping[str, Any] = state.info
-    faulty = np.asarray(info["fault"]) != 0
-    for leaf in jax.tree.leaves((state.pipeline_state, state.obs, state.reward)):
-        finite = np.isfinite(np.asarray(leaf)).reshape((*faulty.shape, -1))
-        faulty = faulty | ~finite.all(axis=-1)
-    worlds = [tuple(int(i) for i in world) for world in np.argwhere(faulty)]
-    if not worlds:
-        return
-    steps = np.asarray(info["steps"]) if "steps" in info else None
-    named = []
-    for world in worlds[:8]:
-        index = world[0] if len(world) == 1 else world
-        at = "" if steps is None else f" at step {int(steps[world])}"
-        named.append(f"world {index}{at}" if world else f"the world{at}")
-    more = f" and {len(worlds) - 8} more" if len(worlds) > 8 else ""
-    raise FaultError(
-        f"not finite: {', '.join(named)}{more}; frozen there with reward 0 and done 1 "
-        "(a non-finite action or state, or a step that diverged)"
-    )
-
-
-def _all_finite(values: jax.Array) -> jax.Array:
-    return jnp.all(jnp.isfinite(values))
+def safe_norm(vector: jax.Array) -> jax.Array:
+    """Returns the length () of (n,), with gradient 0 instead of nan at 0."""
+    square = ordered_sum(jnp.square(vector))
+    positive = square > 0
+    root = jnp.sqrt(jnp.where(positive, square, jnp.ones_like(square)))
+    return jnp.where(positive, root, jnp.zeros_like(root))

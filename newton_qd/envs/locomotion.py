@@ -21,6 +21,8 @@ class Locomotion(PhysicsEnv):
     another ``_outcome`` has other rewards.
     """
 
+    forward_reward_name = "reward_forward"
+
     def __init__(
         self,
         robot: Robot,

@@ -2,6 +2,7 @@
 
 from newton_qd.wrappers.auto_reset import AutoResetWrapper
 from newton_qd.wrappers.base import Wrapper
+from newton_qd.wrappers.clip_reward import ClipRewardWrapper
 from newton_qd.wrappers.completed_eval import (
     CompletedEvalMetrics,
     CompletedEvalWrapper,
@@ -10,11 +11,16 @@ from newton_qd.wrappers.episode import EpisodeWrapper
 from newton_qd.wrappers.evaluation import EvalMetrics, EvalWrapper
 from newton_qd.wrappers.feet_contact import FeetContactWrapper
 from newton_qd.wrappers.fixed_initial_state import FixedInitialStateWrapper
+from newton_qd.wrappers.no_forward_reward import NoForwardRewardWrapper
+from newton_qd.wrappers.offset_reward import OffsetRewardWrapper
+from newton_qd.wrappers.qd import QDWrapper
 from newton_qd.wrappers.state_descriptor_reset import StateDescriptorResetWrapper
 from newton_qd.wrappers.vector import VectorWrapper
+from newton_qd.wrappers.xy_position import XYPositionWrapper
 
 __all__ = [
     "AutoResetWrapper",
+    "ClipRewardWrapper",
     "CompletedEvalMetrics",
     "CompletedEvalWrapper",
     "EpisodeWrapper",
@@ -22,7 +28,11 @@ __all__ = [
     "EvalWrapper",
     "FeetContactWrapper",
     "FixedInitialStateWrapper",
+    "NoForwardRewardWrapper",
+    "OffsetRewardWrapper",
+    "QDWrapper",
     "StateDescriptorResetWrapper",
     "VectorWrapper",
     "Wrapper",
+    "XYPositionWrapper",
 ]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from newton_qd.envs.base import State, select
-from newton_qd.types import Action, Params, RNGKey
+from newton_qd.envs.state import State, select
+from newton_qd.types import READINGS, Action, Params, RNGKey
 from newton_qd.wrappers.base import Wrapper
 
 
@@ -26,8 +26,9 @@ class AutoResetWrapper(Wrapper):
             "first_pipeline_state": state.pipeline_state,
             "first_obs": state.obs,
         }
-        if "state_descriptor" in state.info:
-            first["first_state_descriptor"] = state.info["state_descriptor"]
+        for key in READINGS:
+            if key in state.info:
+                first[f"first_{key}"] = state.info[key]
         # copies: no buffer is in a state twice, so that a state can be donated
         first = jax.tree.map(jnp.copy, first)
         return state.replace(info={**state.info, **first})
@@ -41,8 +42,9 @@ class AutoResetWrapper(Wrapper):
         state = state.replace(done=jnp.zeros_like(state.done), info=info)
         state = self.env.step(state, action, params)
         current = {"pipeline_state": state.pipeline_state, "obs": state.obs}
-        if "state_descriptor" in state.info:
-            current["state_descriptor"] = state.info["state_descriptor"]
+        for key in READINGS:
+            if f"first_{key}" in state.info:
+                current[key] = state.info[key]
         first = {key: state.info[f"first_{key}"] for key in current}
         returned = select(state.done > 0, first, current)
         changes = {"pipeline_state": returned.pop("pipeline_state")}

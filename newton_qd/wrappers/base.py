@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from newton_qd.envs.base import Env, State
+from newton_qd.envs.base import Env
+from newton_qd.envs.state import State
 from newton_qd.types import Action, Params, RNGKey
 
 
@@ -57,6 +60,12 @@ class Wrapper(Env):
     def unwrapped(self) -> Env:
         """The environment inside all wrappers."""
         return self.env.unwrapped
+
+    def with_base(self, change: Callable[[Env], Env]) -> Env:
+        """Returns the same wrappers around another environment."""
+        changed = copy.copy(self)
+        changed.env = self.env.with_base(change)
+        return changed
 
     def __getattr__(self, name: str) -> Any:
         """Looks in the environment inside: ``batch_size``, descriptors, ``system``."""

@@ -7,7 +7,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from newton_qd.envs.base import State
+from newton_qd.envs.state import State
 from newton_qd.types import Action, Metrics, Params, RNGKey
 from newton_qd.wrappers.base import Wrapper
 from newton_qd.wrappers.evaluation import require_steps, with_reward_metric

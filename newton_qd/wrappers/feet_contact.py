@@ -5,8 +5,9 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from newton_qd.envs.base import Env, PhysicsEnv, QDEnv, State
+from newton_qd.envs.base import Env, PhysicsEnv, QDEnv
 from newton_qd.envs.feet import feet_contact, smooth_feet_contact
+from newton_qd.envs.state import State, per_world
 from newton_qd.types import Action, Descriptor, Params, RNGKey
 from newton_qd.wrappers.base import Wrapper
 
@@ -40,7 +41,6 @@ class FeetContactWrapper(Wrapper, QDEnv):
                 f"smooth_width={smooth_width!r}: allowed: None, or above 0"
             )
         super().__init__(env)
-        self._system = robot.system
         self._smooth_width = smooth_width
 
     def reset(self, rng: RNGKey) -> State:
@@ -56,16 +56,23 @@ class FeetContactWrapper(Wrapper, QDEnv):
         return state.replace(info={**state.info, "state_descriptor": descriptor})
 
     def _read(self, state: State) -> Descriptor:
-        if self._smooth_width is None:
-            return feet_contact(self._system, state.pipeline_state)
-        return smooth_feet_contact(
-            self._system, state.pipeline_state, self._smooth_width
+        system, width = self._robot.system, self._smooth_width
+        if width is None:
+            return per_world(lambda physics: feet_contact(system, physics), state)
+        return per_world(
+            lambda physics: smooth_feet_contact(system, physics, width), state
         )
+
+    @property
+    def _robot(self) -> PhysicsEnv:
+        base = self.unwrapped
+        assert isinstance(base, PhysicsEnv)
+        return base
 
     @property
     def state_descriptor_length(self) -> int:
         """Number of feet."""
-        return len(self._system.feet)
+        return len(self._robot.system.feet)
 
     @property
     def state_descriptor_name(self) -> str:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 
-from newton_qd.envs.base import State, select
+from newton_qd.envs.state import State, select
 from newton_qd.types import Action, Params, RNGKey
-from newton_qd.wrappers.base import Wrapper
+from newton_qd.wrappers.qd import QDWrapper
 
 
-class StateDescriptorResetWrapper(Wrapper):
+class StateDescriptorResetWrapper(QDWrapper):
     """Returns the state descriptor of a finished world to its first value.
 
     ``AutoResetWrapper`` does so already; this is for worlds that another wrapper

@@ -1,0 +1,62 @@
+"""What a step refuses: the same words in every environment."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from newton_qd.types import Action, Params
+
+
+def require_precision(dtype: np.dtype) -> None:
+    """Raises where JAX would round a float64 environment to float32 without an error.
+
+    Raises:
+        ValueError: ``dtype`` is float64 and JAX x64 is off.
+    """
+    if dtype == np.float64 and not jax.config.read("jax_enable_x64"):
+        raise ValueError(
+            "dtype='float64': JAX x64 is off; allowed: 'float32', or "
+            "jax.config.update('jax_enable_x64', True) before the environment"
+        )
+
+
+def refuse_params(params: Params) -> None:
+    """Raises where an environment without per-world parameters is given some.
+
+    Raises:
+        ValueError: ``params`` is not ``None``.
+    """
+    if params is not None:
+        raise ValueError(
+            f"params={params!r}: per-world parameters are not available yet; "
+            "allowed: None"
+        )
+
+
+def checked_action(action: Action, size: int, dtype: np.dtype) -> Action:
+    """Returns the action, strongly typed, or raises what is wrong with it.
+
+    Args:
+        action: What a step was given.
+        size: Length that is allowed.
+        dtype: Type that is allowed; weakly typed numbers are converted to it.
+
+    Raises:
+        TypeError: It is no array, or of another type.
+        ValueError: It has another shape.
+    """
+    expected = f"allowed: an array of shape {(size,)}, {dtype}"
+    if not isinstance(action, (jax.Array, np.ndarray)):
+        raise TypeError(f"action: type {type(action).__name__} given; {expected}")
+    values = jnp.asarray(action)
+    weak = jnp.issubdtype(values.dtype, jnp.floating) and values.weak_type
+    if values.dtype != dtype and not weak:
+        raise TypeError(f"action: dtype {values.dtype} given; {expected}")
+    if values.shape != (size,):
+        raise ValueError(
+            f"action: shape {values.shape} given; {expected} (for a batch, use "
+            "jax.vmap or create(..., batch_size=...))"
+        )
+    return values.astype(dtype)

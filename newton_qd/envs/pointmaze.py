@@ -1,0 +1,294 @@
+"""PointMaze: a point on a plane that has to find its way round two walls."""
+
+from __future__ import annotations
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from newton_qd.envs.base import QDEnv, safe_norm
+from newton_qd.envs.inputs import checked_action, refuse_params, require_precision
+from newton_qd.envs.state import State
+from newton_qd.types import Action, Params, RNGKey
+
+_WALL_THICKNESS = 0.01
+_HIGHEST_START = -0.7  # y of a reset is below this
+_START_FRACTION = 10.0  # x of a reset is within the box over this
+
+
+class PointMaze(QDEnv):
+    """A point in a box with two walls, rewarded for being near the goal.
+
+    It has no physics: the observation, x and y of the point, is the whole state, and
+    ``pipeline_state`` is empty. The lower wall leaves a gap at the left, the upper one
+    at the right; a point that would cross a wall stops at its face and slides. Whether
+    it crosses is decided where its path meets the lower face of the wall. Lengths
+    have no unit. Reward: minus the distance to the goal. Done in the goal zone.
+    """
+
+    def __init__(
+        self,
+        *,
+        scale_action_space: float = 10.0,
+        x_min: float = -1.0,
+        x_max: float = 1.0,
+        y_min: float = -1.0,
+        y_max: float = 1.0,
+        zone_width: float = 0.1,
+        zone_width_offset_from_x_min: float = 0.5,
+        zone_height_offset_from_y_max: float = -0.2,
+        wall_width_ratio: float = 0.75,
+        upper_wall_height_offset: float = 0.2,
+        lower_wall_height_offset: float = -0.5,
+        dtype: str = "float32",
+    ) -> None:
+        """Sets up the maze.
+
+        Args:
+            scale_action_space: An action moves the point by itself over this.
+            x_min: Left border of the box.
+            x_max: Right border.
+            y_min: Lower border, below -0.7: a reset puts the point between them.
+            y_max: Upper border.
+            zone_width: Width and height of the goal zone.
+            zone_width_offset_from_x_min: x of the goal, from the left border.
+            zone_height_offset_from_y_max: y of the goal, from the upper border.
+            wall_width_ratio: Width of each wall over that of the box.
+            upper_wall_height_offset: y of the lower face of the upper wall.
+            lower_wall_height_offset: y of the lower face of the lower wall.
+            dtype: ``"float32"``, or ``"float64"`` with JAX x64 on.
+        """
+        _require_numbers(
+            zone_width_offset_from_x_min=zone_width_offset_from_x_min,
+            zone_height_offset_from_y_max=zone_height_offset_from_y_max,
+            wall_width_ratio=wall_width_ratio,
+        )
+        _require_numbers(
+            positive=True, scale_action_space=scale_action_space, zone_width=zone_width
+        )
+        walls = lower_wall_height_offset, upper_wall_height_offset
+        _require_box((x_min, x_max), (y_min, y_max), walls)
+        self._dtype = np.dtype(dtype)
+        if self._dtype not in (np.float32, np.float64):
+            raise ValueError(f"dtype={dtype!r}: allowed: 'float32', 'float64'")
+        require_precision(self._dtype)
+        self._scale = scale_action_space
+        self._low = (x_min, y_min)
+        self._high = (x_max, y_max)
+        self._goal = (
+            x_min + zone_width_offset_from_x_min,
+            y_max + zone_height_offset_from_y_max,
+        )
+        self._half_zone = zone_width / 2
+        self._lower, self._upper = walls
+        width = (x_max - x_min) * wall_width_ratio
+        self._lower_begins = x_max - width
+        self._upper_ends = x_min + width
+
+    def reset(self, rng: RNGKey) -> State:
+        """Begins an episode at a random place at the bottom of the box."""
+        require_precision(self._dtype)
+        _, x_key, y_key = jax.random.split(rng, 3)
+        (left, bottom), (right, _) = self._low, self._high
+        x = jax.random.uniform(x_key, (), self._dtype, left, right) / _START_FRACTION
+        y = jax.random.uniform(y_key, (), self._dtype, bottom, _HIGHEST_START)
+        return self._first_state(jnp.stack([x, y]))
+
+    def fixed_state(self) -> State:
+        """Returns the state of a reset without noise: the middle of the places."""
+        require_precision(self._dtype)
+        return self._first_state(self._start())
+
+    def step(self, state: State, action: Action, params: Params = None) -> State:
+        """Moves the point, or freezes it where something is not finite."""
+        require_precision(self._dtype)
+        refuse_params(params)
+        action = checked_action(action, self.action_size, self._dtype)
+        old = state.obs
+        finite = jnp.all(jnp.isfinite(old))
+        sound = finite & jnp.all(jnp.isfinite(action)) & (state.info["fault"] == 0)
+        # Double where: the move of a point at fault is reckoned with sound numbers,
+        # so that its gradient is 0 and not 0 * nan.
+        frozen = jax.lax.stop_gradient(jnp.where(finite, old, self._start()))
+        moved = self._moved(
+            jnp.where(sound, old, frozen), jnp.where(sound, action, jnp.zeros_like(old))
+        )
+        position = jnp.where(sound, moved, frozen)
+        one, zero = jnp.ones((), self._dtype), jnp.zeros((), self._dtype)
+        reward = -safe_norm(position - self._array(self._goal))
+        return state.replace(
+            obs=position,
+            reward=jnp.where(sound, reward, zero),
+            done=jnp.where(self._in_zone(position) | ~sound, one, zero),
+            info={
+                **state.info,
+                "fault": (~sound).astype(jnp.int32),
+                "state_descriptor": jnp.copy(position),
+            },
+        )
+
+    def _moved(self, old: jax.Array, action: jax.Array) -> jax.Array:
+        """Returns where (2,) an action takes the point (2,)."""
+        low, high = self._array(self._low), self._array(self._high)
+        new = old + jnp.clip(action, low, high) / self._scale
+        new = new.at[1].set(self._stopped_by_lower(old, new))
+        new = new.at[1].set(self._stopped_by_upper(old, new))
+        return jnp.clip(new, low, high)
+
+    def _stopped_by_lower(self, old: jax.Array, new: jax.Array) -> jax.Array:
+        """Returns y () of a point that meets the lower wall."""
+        top = self._lower + _WALL_THICKNESS
+        y_old, y = old[1], new[1]
+        up = (y_old <= self._lower) & (self._lower < y)
+        down = (y < top) & (top <= y_old) & (y_old < self._upper)
+        blocked = _crossing(old, new, self._lower, up | down) >= self._lower_begins
+        y = jnp.where(up & blocked, self._array(self._lower), y)
+        return jnp.where(down & blocked, self._array(top), y)
+
+    def _stopped_by_upper(self, old: jax.Array, new: jax.Array) -> jax.Array:
+        """Returns y () of a point that meets the upper wall."""
+        top = self._upper + _WALL_THICKNESS
+        y_old, y = old[1], new[1]
+        up = (y > self._upper) & (self._upper >= y_old) & (y_old > self._lower)
+        down = (y_old >= top) & (top > y)
+        blocked = _crossing(old, new, self._upper, up | down) <= self._upper_ends
+        y = jnp.where(down & blocked, self._array(top), y)
+        return jnp.where(up & blocked, self._array(self._upper), y)
+
+    def _in_zone(self, position: jax.Array) -> jax.Array:
+        inside = jnp.ones((), jnp.bool_)
+        for centre, value in zip(self._goal, position, strict=True):
+            low, high = centre - self._half_zone, centre + self._half_zone
+            inside = inside & (low <= value) & (value <= high)
+        return inside
+
+    def _start(self) -> jax.Array:
+        (left, bottom), (right, _) = self._low, self._high
+        x = (left + right) / 2 / _START_FRACTION
+        return self._array((x, (bottom + _HIGHEST_START) / 2))
+
+    def _first_state(self, position: jax.Array) -> State:
+        return State(
+            pipeline_state=(),
+            obs=position,
+            reward=jnp.zeros((), self._dtype),
+            done=jnp.zeros((), self._dtype),
+            metrics={},
+            info={
+                "fault": jnp.zeros((), jnp.int32),
+                "state_descriptor": jnp.copy(position),
+            },
+        )
+
+    def _array(self, values: float | tuple[float, float]) -> jax.Array:
+        return jnp.asarray(values, self._dtype)
+
+    @property
+    def descriptors_min_values(self) -> list[float]:
+        """Left and lower border."""
+        return list(self._low)
+
+    @property
+    def descriptors_max_values(self) -> list[float]:
+        """Right and upper border."""
+        return list(self._high)
+
+    @property
+    def descriptors_names(self) -> list[str]:
+        """Names of the descriptor's components."""
+        return ["x_pos", "y_pos"]
+
+    @property
+    def state_descriptor_length(self) -> int:
+        """Length of a state descriptor."""
+        return 2
+
+    @property
+    def state_descriptor_name(self) -> str:
+        """What a state descriptor measures."""
+        return "xy_position"
+
+    @property
+    def state_descriptor_limits(self) -> tuple[jax.Array, jax.Array]:
+        """Lower and upper borders of the box, (2,) each."""
+        return self._array(self._low), self._array(self._high)
+
+    @property
+    def observation_layout(self) -> tuple[tuple[str, int], ...]:
+        """Name and size of each block of the observation, in order."""
+        return (("position x y", 2),)
+
+    @property
+    def goal(self) -> tuple[float, float]:
+        """Middle of the goal zone, x and y."""
+        return self._goal
+
+    @property
+    def observation_size(self) -> int:
+        """Length of an observation."""
+        return 2
+
+    @property
+    def action_size(self) -> int:
+        """Length of an action."""
+        return 2
+
+    @property
+    def dtype(self) -> np.dtype:
+        """Type of every floating-point array of a state, and of the actions."""
+        return self._dtype
+
+    @property
+    def dt(self) -> float:
+        """Duration of a step: the maze has no time but its steps."""
+        return 1.0
+
+    @property
+    def name(self) -> str:
+        """Name of the task."""
+        return "pointmaze"
+
+
+def _crossing(
+    old: jax.Array, new: jax.Array, height: float, crosses: jax.Array
+) -> jax.Array:
+    """Returns x () at which the path from ``old`` to ``new`` (2,) meets a height.
+
+    Where it does not cross, what is returned is finite and means nothing.
+    """
+    x_old, y_old = old
+    x, y = new
+    # a path that keeps its y would divide 0 by 0
+    rise = jnp.where(crosses, y - y_old, jnp.ones_like(y))
+    return (height - y_old) / rise * (x - x_old) + x_old
+
+
+def _require_numbers(positive: bool = False, **settings: float) -> None:
+    """Raises for a setting that is not finite, or not above 0."""
+    for name, value in settings.items():
+        if not math.isfinite(value) or (positive and value <= 0):
+            allowed = "finite, above 0" if positive else "finite numbers"
+            raise ValueError(f"{name}={value!r}: allowed: {allowed}")
+
+
+def _require_box(
+    x: tuple[float, float], y: tuple[float, float], walls: tuple[float, float]
+) -> None:
+    """Raises for borders or walls that leave no way from the start to the top."""
+    if not -math.inf < x[0] < x[1] < math.inf:
+        raise ValueError(
+            f"x_min={x[0]!r}, x_max={x[1]!r}: allowed: finite, x_min below x_max"
+        )
+    if not -math.inf < y[0] < _HIGHEST_START < y[1] < math.inf:
+        raise ValueError(
+            f"y_min={y[0]!r}, y_max={y[1]!r}: allowed: finite, y_min below "
+            f"{_HIGHEST_START}, y_max above it"
+        )
+    if not y[0] < walls[0] < walls[1] < y[1]:
+        raise ValueError(
+            f"lower_wall_height_offset={walls[0]!r}, upper_wall_height_offset="
+            f"{walls[1]!r}: allowed: between {y[0]!r} and {y[1]!r}, the lower below "
+            "the upper"
+        )

@@ -1,0 +1,112 @@
+"""What ``reset`` and ``step`` return, and what is done with it world by world."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+
+from newton_qd.errors import FaultError
+from newton_qd.types import Info, Metrics, Observation
+
+Tree = TypeVar("Tree")
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
+class State:
+    """What ``reset`` and ``step`` return; a pytree that never changes its shape.
+
+    Every leaf of a batched state has the batch axis in front.
+
+    Attributes:
+        pipeline_state: What the simulation needs to go on: a ``PhysicsState``.
+        obs: (no,) observation.
+        reward: () reward of the step that led here; 0 after a reset.
+        done: () 1 where the episode has ended, else 0.
+        metrics: Parts of the reward and other () readings, 0 after a reset.
+        info: What wrappers remember; ``newton_qd.types.INFO_KEYS`` lists the keys.
+    """
+
+    pipeline_state: Any
+    obs: Observation
+    reward: jax.Array
+    done: jax.Array
+    metrics: Metrics
+    info: Info
+
+    def replace(self, **changes: Any) -> State:
+        """Returns a copy with some fields replaced."""
+        return dataclasses.replace(self, **changes)
+
+
+def select(condition: jax.Array, chosen: Tree, other: Tree) -> Tree:
+    """Chooses between two pytrees, world by world.
+
+    Args:
+        condition: Booleans; the leading axes of every leaf.
+        chosen: Where ``condition`` is true.
+        other: Elsewhere.
+    """
+
+    def leaf(a: jax.Array, b: jax.Array) -> jax.Array:
+        axes = condition.shape + (1,) * (jnp.ndim(b) - condition.ndim)
+        return jnp.where(condition.reshape(axes), a, b)
+
+    return jax.tree.map(leaf, chosen, other)
+
+
+def per_world(read: Callable[[Any], Tree], state: State) -> Tree:
+    """Reads the simulation of every world of a state.
+
+    Args:
+        read: Function of the ``pipeline_state`` of one world.
+        state: State of one world or of any batch.
+
+    Returns:
+        What ``read`` returns, with the batch axes in front.
+    """
+    for _ in range(jnp.ndim(state.done)):
+        read = jax.vmap(read)
+    return read(state.pipeline_state)
+
+
+def check(state: State) -> None:
+    """Raises where a world is at fault; for eager code, after a jitted rollout.
+
+    Args:
+        state: State of one world or of any batch.
+
+    Raises:
+        FaultError: Names the worlds, and their steps where ``info`` has them.
+        TypeError: ``state`` is traced.
+    """
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(state)):
+        raise TypeError(
+            "state: traced values given; allowed: the concrete state that a jitted "
+            "function has returned (inside jit, read info['fault'])"
+        )
+    info: Mapping[str, Any] = state.info
+    faulty = np.asarray(info["fault"]) != 0
+    for leaf in jax.tree.leaves((state.pipeline_state, state.obs, state.reward)):
+        finite = np.isfinite(np.asarray(leaf)).reshape((*faulty.shape, -1))
+        faulty = faulty | ~finite.all(axis=-1)
+    worlds = [tuple(int(i) for i in world) for world in np.argwhere(faulty)]
+    if not worlds:
+        return
+    steps = np.asarray(info["steps"]) if "steps" in info else None
+    named = []
+    for world in worlds[:8]:
+        index = world[0] if len(world) == 1 else world
+        at = "" if steps is None else f" at step {int(steps[world])}"
+        named.append(f"world {index}{at}" if world else f"the world{at}")
+    more = f" and {len(worlds) - 8} more" if len(worlds) > 8 else ""
+    raise FaultError(
+        f"not finite: {', '.join(named)}{more}; frozen there with reward 0 and done 1 "
+        "(a non-finite action or state, or a step that diverged)"
+    )

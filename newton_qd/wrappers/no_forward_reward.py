@@ -1,0 +1,44 @@
+"""Rewards without the part for running forward."""
+
+from __future__ import annotations
+
+from newton_qd.envs.base import Env, PhysicsEnv
+from newton_qd.envs.state import State
+from newton_qd.types import Action, Params
+from newton_qd.wrappers.base import Wrapper
+
+
+class NoForwardRewardWrapper(Wrapper):
+    """Takes the forward part out of the reward of a step; the metrics keep it."""
+
+    def __init__(self, env: Env, env_name: str) -> None:
+        """Wraps a simulated robot whose reward has a forward part.
+
+        Args:
+            env: The environment; its class gives ``forward_reward_name``. Where it
+                repeats actions, this wrapper goes inside the ``EpisodeWrapper``.
+            env_name: Its name, for the error.
+        """
+        base = env.unwrapped
+        name = base.forward_reward_name if isinstance(base, PhysicsEnv) else None
+        if name is None:
+            raise NotImplementedError(
+                f"This wrapper does not support {env_name} yet. Given: "
+                f"{type(base).__name__}; allowed: simulated robots whose class names "
+                "the metric of its forward reward as forward_reward_name"
+            )
+        repeat = getattr(env, "action_repeat", 1)
+        if repeat != 1:
+            raise ValueError(
+                f"env: repeats actions {repeat} times, and its metrics are of the last "
+                "repetition alone; allowed: an environment that does not, around which "
+                "EpisodeWrapper may go"
+            )
+        super().__init__(env)
+        self._forward_reward = name
+
+    def step(self, state: State, action: Action, params: Params = None) -> State:
+        """Advances by one step."""
+        state = self.env.step(state, action, params)
+        forward = state.metrics[self._forward_reward]
+        return state.replace(reward=state.reward - forward)

@@ -1,0 +1,37 @@
+"""Rewards with a constant added."""
+
+from __future__ import annotations
+
+import math
+
+from newton_qd.envs.base import Env
+from newton_qd.envs.state import State
+from newton_qd.types import Action, Params, RNGKey
+from newton_qd.wrappers.base import Wrapper
+
+
+class OffsetRewardWrapper(Wrapper):
+    """Adds a constant to the reward of resets and steps."""
+
+    def __init__(self, env: Env, offset: float = 0.0) -> None:
+        """Wraps an environment.
+
+        Args:
+            env: The environment; an action that it repeats gets the offset once.
+            offset: What is added, as ``newton_qd.reward_offset[name]``.
+        """
+        if not math.isfinite(offset):
+            raise ValueError(f"offset={offset!r}: allowed: finite numbers")
+        super().__init__(env)
+        self._offset = float(offset)
+
+    def reset(self, rng: RNGKey) -> State:
+        """Begins an episode."""
+        return self._shifted(self.env.reset(rng))
+
+    def step(self, state: State, action: Action, params: Params = None) -> State:
+        """Advances by one step."""
+        return self._shifted(self.env.step(state, action, params))
+
+    def _shifted(self, state: State) -> State:
+        return state.replace(reward=state.reward + self._offset)

@@ -1,0 +1,103 @@
+"""Position of the torso as the state descriptor."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from newton_qd.envs.base import Env, PhysicsEnv, QDEnv
+from newton_qd.envs.position import torso_xy
+from newton_qd.envs.state import State, per_world
+from newton_qd.types import Action, Params, RNGKey
+from newton_qd.wrappers.base import Wrapper
+
+Limits = Sequence[float] | np.ndarray | jax.Array
+
+
+class XYPositionWrapper(Wrapper, QDEnv):
+    """Writes where the torso is into ``info["state_descriptor"]``.
+
+    The state descriptor is kept within the limits; ``info["xy_position"]`` is the
+    position itself. With repeated actions the last repetition counts.
+    """
+
+    def __init__(
+        self,
+        env: Env,
+        env_name: str,
+        minval: Limits | None = None,
+        maxval: Limits | None = None,
+    ) -> None:
+        """Wraps a simulated robot.
+
+        Args:
+            env: The environment.
+            env_name: Its name, for the error.
+            minval: Lowest x and y of a state descriptor [m]; ``None``: no limit.
+            maxval: Highest x and y, above ``minval`` [m]; ``None``: no limit.
+        """
+        if not isinstance(env.unwrapped, PhysicsEnv):
+            raise NotImplementedError(
+                f"This wrapper does not support {env_name} yet. Given: "
+                f"{type(env.unwrapped).__name__}; allowed: simulated robots"
+            )
+        super().__init__(env)
+        self._low = _limit("minval", minval, -np.inf)
+        self._high = _limit("maxval", maxval, np.inf)
+        if not np.all(self._low < self._high):
+            raise ValueError(
+                f"minval={minval!r}, maxval={maxval!r}: allowed: minval below maxval "
+                "in x and in y"
+            )
+
+    def reset(self, rng: RNGKey) -> State:
+        """Begins an episode."""
+        return self._described(self.env.reset(rng))
+
+    def step(self, state: State, action: Action, params: Params = None) -> State:
+        """Advances by one step."""
+        return self._described(self.env.step(state, action, params))
+
+    def _described(self, state: State) -> State:
+        base = self.unwrapped
+        assert isinstance(base, PhysicsEnv)
+        system = base.system
+        position = per_world(lambda physics: torso_xy(system, physics), state)
+        low, high = self.state_descriptor_limits
+        described = {
+            "state_descriptor": jnp.clip(position, low, high),
+            "xy_position": position,
+        }
+        return state.replace(info={**state.info, **described})
+
+    @property
+    def state_descriptor_length(self) -> int:
+        """Length of a state descriptor."""
+        return 2
+
+    @property
+    def state_descriptor_name(self) -> str:
+        """What a state descriptor measures."""
+        return "xy_position"
+
+    @property
+    def state_descriptor_limits(self) -> tuple[jax.Array, jax.Array]:
+        """Lower and upper limits of x and y, (2,) each [m]."""
+        return jnp.asarray(self._low, self.dtype), jnp.asarray(self._high, self.dtype)
+
+
+def _limit(name: str, given: Limits | None, unlimited: float) -> np.ndarray:
+    """Returns a limit as (2,) numbers, or raises what is wrong with it."""
+    if given is None:
+        return np.full(2, unlimited)
+    allowed = "allowed: None, or two finite numbers"
+    try:
+        limit = np.asarray(given, np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name}={given!r}: {allowed}") from error
+    if limit.shape != (2,) or not np.all(np.isfinite(limit)):
+        raise ValueError(f"{name}={given!r}: {allowed}")
+    return limit

@@ -1,0 +1,131 @@
+"""AURORA's descriptors, with a model that is written here and with one of Flax."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from newton_qd.extractors import (
+    AuroraExtraInfo,
+    AuroraExtraInfoNormalization,
+    get_aurora_encoding,
+    get_feet_contact_proportion,
+    get_final_xy_position,
+)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Transitions:
+    state_desc: jax.Array
+
+
+class Linear:
+    """Encodes (n, t, no) as a projection of the mean over time."""
+
+    def encode(self, observations: jax.Array) -> jax.Array:
+        raise AssertionError("called through apply")
+
+    def apply(self, variables: Any, *args: Any, method: Any) -> jax.Array:
+        assert method == self.encode
+        return (args[0].mean(axis=1) @ variables["params"])[:, None, :]
+
+
+OBSERVATIONS = jax.random.normal(jax.random.key(0), (5, 7, 3), np.float32)
+WEIGHTS = jax.random.normal(jax.random.key(1), (3, 2), np.float32)
+
+
+def extra_info() -> AuroraExtraInfoNormalization:
+    mean = jnp.array([1.0, 2.0, 3.0], np.float32)
+    return AuroraExtraInfoNormalization.create(WEIGHTS, mean, 2.0 * mean)
+
+
+def expected() -> np.ndarray:
+    mean = np.array([1.0, 2.0, 3.0])
+    normalized = (np.asarray(OBSERVATIONS) - mean) / (2 * mean)
+    return normalized.mean(axis=1) @ np.asarray(WEIGHTS)
+
+
+def test_encoding_of_normalized_observations() -> None:
+    model = Linear()
+    found = get_aurora_encoding(OBSERVATIONS, extra_info(), model)
+    np.testing.assert_allclose(found, expected(), rtol=1e-5, atol=1e-6)
+    jitted = jax.jit(get_aurora_encoding, static_argnames="model")
+    again = jitted(OBSERVATIONS, extra_info(), model=model)
+    np.testing.assert_allclose(again, found, rtol=1e-6)
+
+
+def test_encoding_by_a_module_of_flax() -> None:
+    nn = pytest.importorskip("flax.linen")
+
+    class Encoder(nn.Module):
+        @nn.compact
+        def encode(self, x: jax.Array) -> jax.Array:
+            return nn.Dense(2, use_bias=False)(x.mean(axis=1))
+
+    info = extra_info().replace(model_params={"Dense_0": {"kernel": WEIGHTS}})
+    found = get_aurora_encoding(OBSERVATIONS, info, Encoder())
+    np.testing.assert_allclose(found, expected(), rtol=1e-5, atol=1e-6)
+
+
+def test_a_component_that_never_changes() -> None:
+    # the original divides 0 by 0
+    constant = OBSERVATIONS.at[..., 1].set(2.0)
+    info = extra_info().replace(std_observations=jnp.array([1.0, 0.0, 1.0], np.float32))
+    found = get_aurora_encoding(constant, info, Linear())
+    assert np.all(np.isfinite(found))
+    without = get_aurora_encoding(
+        constant, info.replace(model_params=WEIGHTS.at[1].set(100.0)), Linear()
+    )
+    assert np.array_equal(found, without)
+
+
+def test_extra_info_is_a_pytree() -> None:
+    plain = AuroraExtraInfo(model_params={"w": WEIGHTS})
+    doubled = jax.tree.map(lambda x: 2 * x, plain)
+    assert isinstance(doubled, AuroraExtraInfo)
+    assert np.array_equal(doubled.model_params["w"], 2 * WEIGHTS)
+    info = extra_info()
+    assert isinstance(info, AuroraExtraInfo)
+    assert len(jax.tree.leaves(info)) == 3
+    again = jax.jit(lambda x: x)(info)
+    assert isinstance(again, AuroraExtraInfoNormalization)
+    other = info.replace(mean_observations=jnp.zeros(3))
+    assert other.mean_observations.tolist() == [0.0] * 3
+    assert info.mean_observations.tolist() == [1.0, 2.0, 3.0]
+    with pytest.raises(TypeError, match="colour"):
+        info.replace(colour=1)
+
+
+def test_structures_of_qdax_are_taken() -> None:
+    types = pytest.importorskip("qdax.custom_types")
+    ours = extra_info()
+    theirs = types.AuroraExtraInfoNormalization.create(
+        ours.model_params, ours.mean_observations, ours.std_observations
+    )
+    found = get_aurora_encoding(OBSERVATIONS, theirs, Linear())
+    np.testing.assert_allclose(found, expected(), rtol=1e-5, atol=1e-6)
+
+
+def test_extractors_under_jit() -> None:
+    data = Transitions(jnp.arange(30, dtype=np.float32).reshape(3, 5, 2))
+    mask = jnp.array([[0] * 5, [0, 0, 1, 1, 1], [0, 1, 1, 1, 1]], np.float32)
+    for extract in (get_final_xy_position, get_feet_contact_proportion):
+        assert np.array_equal(jax.jit(extract)(data, mask), extract(data, mask))
+        swapped = jax.vmap(extract)(jax.tree.map(lambda x: x[None], data), mask[None])
+        assert np.array_equal(swapped[0], extract(data, mask))
+
+
+def test_final_position_has_a_gradient() -> None:
+    mask = jnp.array([[0, 0, 1]], np.float32)
+
+    def first(descriptors: jax.Array) -> jax.Array:
+        return get_final_xy_position(Transitions(descriptors), mask)[0, 0]
+
+    found = jax.grad(first)(jnp.zeros((1, 3, 2), np.float32))
+    assert found[0].tolist() == [[0, 0], [1, 0], [0, 0]]

@@ -1,0 +1,278 @@
+"""Wrappers that make tasks: positions, rewards, and use by hand."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import newton_qd
+from newton_qd import physics
+from newton_qd.envs.ant import Ant
+from newton_qd.envs.base import Env, PhysicsEnv, QDEnv
+from newton_qd.envs.pointmaze import PointMaze
+from newton_qd.envs.position import torso_xy
+from newton_qd.envs.state import State
+from newton_qd.wrappers import (
+    AutoResetWrapper,
+    ClipRewardWrapper,
+    EpisodeWrapper,
+    FeetContactWrapper,
+    NoForwardRewardWrapper,
+    OffsetRewardWrapper,
+    QDWrapper,
+    VectorWrapper,
+    XYPositionWrapper,
+)
+
+KEY = jax.random.key(0)
+
+
+def moved_to(state: State, x: float, y: float) -> State:
+    physics_state = state.pipeline_state
+    q = physics_state.q.at[..., :2].set(jnp.array([x, y], np.float32))
+    moved = dataclasses.replace(physics_state, q=q)
+    return state.replace(pipeline_state=moved)
+
+
+def test_position_is_clipped_and_the_reading_is_not() -> None:
+    env = XYPositionWrapper(Ant(), "ant", [-1.0, -2.0], [3.0, 4.0])
+    step = jax.jit(env.step)
+    for x, y in ((0.5, 0.25), (50.0, -60.0)):
+        state = step(moved_to(env.reset(KEY), x, y), jnp.zeros(8, np.float32))
+        found = np.asarray(state.pipeline_state.q[:2])
+        np.testing.assert_allclose(found, [x, y], atol=0.05)
+        assert np.array_equal(state.info["xy_position"], found)
+        expected = np.clip(found, [-1, -2], [3, 4])
+        assert np.array_equal(state.info["state_descriptor"], expected)
+
+
+def test_position_properties() -> None:
+    env = XYPositionWrapper(Ant(), "ant", minval=(-1, -2), maxval=jnp.array([3.0, 4]))
+    assert isinstance(env, QDEnv)
+    assert env.state_descriptor_name == "xy_position"
+    assert env.state_descriptor_length == env.descriptor_length == 2
+    assert env.behavior_descriptor_length == 2
+    for limits in (env.descriptor_limits, env.behavior_descriptor_limits):
+        assert np.array_equal(limits, [[-1, -2], [3, 4]])
+    low, high = XYPositionWrapper(Ant(), "ant").state_descriptor_limits
+    assert low.tolist() == [-np.inf] * 2 and high.tolist() == [np.inf] * 2
+
+
+@pytest.mark.parametrize(
+    ("limits", "message"),
+    [
+        ({"minval": [0.0]}, r"minval=\[0.0\]: allowed: None, or two finite"),
+        ({"maxval": [[1.0, 2.0]]}, r"maxval=.*two finite numbers"),
+        ({"minval": 3.0}, r"minval=3.0: "),
+        ({"minval": "ab"}, r"minval='ab': "),
+        ({"maxval": [1.0, np.nan]}, r"maxval=\[1.0, nan\]: "),
+        ({"maxval": [1.0, np.inf]}, r"maxval=\[1.0, inf\]: "),
+        ({"minval": [0, 1], "maxval": [1, 1]}, r"minval below maxval"),
+    ],
+)
+def test_wrong_limits(limits: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        XYPositionWrapper(Ant(), "ant", **limits)
+    with pytest.raises(ValueError, match=message):
+        newton_qd.create("antnotrap", qdax_wrappers_kwargs=[limits])
+
+
+@pytest.mark.parametrize(
+    "wrapper", [XYPositionWrapper, NoForwardRewardWrapper, FeetContactWrapper]
+)
+def test_robots_only(wrapper: Callable[[Env, str], Env]) -> None:
+    with pytest.raises(
+        NotImplementedError, match=r"^This wrapper does not support pointmaze yet\."
+    ):
+        wrapper(PointMaze(), "pointmaze")
+
+
+def test_position_of_a_torso_that_is_not_the_root() -> None:
+    system, state = Ant().system, Ant().fixed_state().pipeline_state
+    foot = dataclasses.replace(system, torso=2)
+    kinematics = physics.forward_kinematics(system, state.q, state.v)
+    assert np.array_equal(torso_xy(foot, state), kinematics.position[2, :2])
+    assert np.array_equal(torso_xy(system, state), kinematics.position[0, :2])
+
+
+def test_forward_reward_is_taken_away() -> None:
+    plain, env = Ant(), NoForwardRewardWrapper(Ant(), "ant")
+    state = jax.jit(plain.reset)(KEY)
+    assert float(env.reset(KEY).reward) == 0.0
+    action = jnp.full(8, 0.5, np.float32)
+    expected, found = (
+        jax.jit(plain.step)(state, action),
+        jax.jit(env.step)(state, action),
+    )
+    forward = expected.metrics["reward_forward"]
+    assert abs(float(forward)) > 1e-3
+    np.testing.assert_allclose(found.reward, expected.reward - forward, rtol=1e-6)
+    assert found.metrics["reward_forward"] == forward
+
+
+class Runner(Ant):
+    """An ant whose forward metric has another name, as halfcheetah's has."""
+
+    forward_reward_name = "reward_run"
+
+    def _outcome(self, before: Any, after: Any, action: Any) -> Any:
+        reward, done, metrics = super()._outcome(before, after, action)
+        return reward, done, {"reward_run": metrics["reward_forward"]}
+
+
+def test_forward_metric_is_named_by_the_class() -> None:
+    # the original knows one name for halfcheetah and its environment another
+    env = NoForwardRewardWrapper(Runner(), "runner")
+    state = jax.jit(env.step)(env.reset(KEY), jnp.zeros(8, np.float32))
+    assert set(state.metrics) == {"reward_run"}
+    for name in newton_qd.registered_envs():
+        base = newton_qd.create(name).unwrapped
+        if isinstance(base, PhysicsEnv) and base.forward_reward_name is not None:
+            metrics = jax.eval_shape(base.reset, KEY).metrics
+            assert base.forward_reward_name in metrics
+
+
+def test_forward_reward_and_repeated_actions() -> None:
+    with pytest.raises(ValueError, match=r"repeats actions 2 times.*EpisodeWrapper"):
+        NoForwardRewardWrapper(newton_qd.create("ant", action_repeat=2), "ant")
+    env = newton_qd.create("ant_omni", action_repeat=2)
+    single = newton_qd.create("ant_omni")
+    state, action = jax.jit(env.reset)(KEY), jnp.full(8, 0.5, np.float32)
+    once = jax.jit(single.step)(state, action)
+    twice = jax.jit(single.step)(once, action)
+    both = jax.jit(env.step)(state, action)
+    np.testing.assert_allclose(both.reward, once.reward + twice.reward, rtol=1e-6)
+
+
+def rewards(env: Env) -> tuple[float, float]:
+    """Of the reset, and of a step that costs 0.8 in the maze."""
+    state = env.reset(KEY)
+    state = env.step(state, jnp.zeros(2, np.float32))
+    return float(env.reset(KEY).reward), float(state.reward)
+
+
+def test_clip_reward() -> None:
+    plain = rewards(PointMaze())[1]
+    assert plain < -1.0
+    assert rewards(ClipRewardWrapper(PointMaze())) == (0.0, plain)
+    assert rewards(ClipRewardWrapper(PointMaze(), clip_min=-0.5)) == (0.0, -0.5)
+    assert rewards(ClipRewardWrapper(PointMaze(), clip_max=-0.5)) == (-0.5, plain)
+    assert rewards(ClipRewardWrapper(PointMaze(), -0.5, -0.25)) == (-0.25, -0.5)
+    with pytest.raises(ValueError, match=r"clip_min=1.0, clip_max=0.0"):
+        ClipRewardWrapper(PointMaze(), 1.0, 0.0)
+    with pytest.raises(ValueError, match=r"clip_max=nan: allowed: None, or a number"):
+        ClipRewardWrapper(PointMaze(), clip_max=np.nan)
+
+
+def test_offset_reward() -> None:
+    plain = rewards(PointMaze())[1]
+    assert rewards(OffsetRewardWrapper(PointMaze())) == (0.0, plain)
+    found = rewards(OffsetRewardWrapper(PointMaze(), offset=2.3431))
+    np.testing.assert_allclose(found, (2.3431, plain + 2.3431), rtol=1e-6)
+    for wrong in (np.nan, np.inf):
+        with pytest.raises(ValueError, match=r"offset=.*finite"):
+            OffsetRewardWrapper(PointMaze(), wrong)
+
+
+def test_rewards_keep_their_type_under_x64(x64: None) -> None:
+    env = OffsetRewardWrapper(PointMaze(), np.float64(1.0))
+    env = ClipRewardWrapper(env, np.float64(0.0), np.float64(2.0))
+    state = jax.eval_shape(env.reset, KEY)
+    state = jax.eval_shape(env.step, state, jax.ShapeDtypeStruct((2,), np.float32))
+    assert state.reward.dtype == np.float32 and not state.reward.weak_type
+
+
+def test_offset_then_clip_around_a_created_environment() -> None:
+    # as the original uses them
+    env = newton_qd.create("ant_omni", episode_length=3)
+    env = OffsetRewardWrapper(env, offset=newton_qd.reward_offset["ant_omni"])
+    env = ClipRewardWrapper(env, clip_min=0.0)
+    state = jax.jit(env.reset)(KEY)
+    assert float(state.reward) == 3.0
+    state = jax.jit(env.step)(state, 10.0 * jnp.ones(8, np.float32))
+    assert float(state.reward) == 0.0
+    assert env.state_descriptor_length == 2  # pyright: ignore
+
+
+def test_qd_wrapper_forwards_the_descriptor() -> None:
+    inside = AutoResetWrapper(PointMaze())
+    env = QDWrapper(inside)
+    assert isinstance(env, QDEnv) and env.unwrapped is inside.unwrapped
+    assert env.state_descriptor_name == "xy_position"
+    assert env.state_descriptor_length == env.descriptor_length == 2
+    assert env.behavior_descriptor_length == 2
+    for limits in (
+        env.state_descriptor_limits,
+        env.descriptor_limits,
+        env.behavior_descriptor_limits,
+    ):
+        assert np.array_equal(limits, [[-1, -1], [1, 1]])
+    assert env.reset(KEY).obs.tolist() == inside.reset(KEY).obs.tolist()
+    assert not hasattr(QDWrapper(Ant()), "descriptor_length")
+
+
+@functools.cache
+def by_hand(wrapper: Callable[[Env, str], Env]) -> Any:
+    return wrapper(newton_qd.create("ant", episode_length=3), "ant")
+
+
+@pytest.mark.parametrize("key", [jax.random.PRNGKey(0), KEY], ids=["uint32", "typed"])
+@pytest.mark.parametrize("wrapper", [FeetContactWrapper, XYPositionWrapper])
+def test_examples_of_the_original(
+    wrapper: Callable[[Env, str], Env], key: jax.Array
+) -> None:
+    # by hand, not jitted, around an environment with Episode and AutoReset
+    qd_env = by_hand(wrapper)
+    state = first = qd_env.reset(rng=key)
+    for _ in range(4):
+        action = jnp.zeros((qd_env.action_size,))
+        state = qd_env.step(state, action)
+        assert state.info["state_descriptor"].shape == (qd_env.descriptor_length,)
+        if state.done:
+            assert same_readings(state, first)
+    assert float(state.info["steps"]) == 1.0
+    if wrapper is XYPositionWrapper:
+        assert state.info["xy_position"].shape == (2,)
+
+
+def same_readings(state: State, other: State) -> bool:
+    return all(
+        np.array_equal(state.info[key], other.info[key])
+        for key in ("state_descriptor", "xy_position")
+        if key in other.info
+    )
+
+
+@pytest.mark.parametrize(
+    "wrapper", [FeetContactWrapper, XYPositionWrapper, NoForwardRewardWrapper]
+)
+def test_around_a_batch_as_inside_it(wrapper: Callable[[Env, str], Env]) -> None:
+    inside = AutoResetWrapper(
+        VectorWrapper(EpisodeWrapper(wrapper(Ant(), "ant"), 9, 1), 3)
+    )
+    around = wrapper(newton_qd.create("ant", episode_length=9, batch_size=3), "ant")
+    found = []
+    for env in (inside, around):
+        state = jax.jit(env.reset)(KEY)
+        for _ in range(6):
+            state = jax.jit(env.step)(state, jnp.full((3, 8), 0.3, np.float32))
+        found.append(state)
+    assert np.array_equal(found[0].reward, found[1].reward)
+    assert same_readings(found[1], found[0])
+
+
+def test_position_follows_the_auto_reset() -> None:
+    env = newton_qd.create("ant_omni", episode_length=2)
+    state = first = jax.jit(env.reset)(KEY)
+    for _ in range(2):
+        state = jax.jit(env.step)(state, jnp.ones(8, np.float32))
+    assert float(state.done) == 1.0
+    assert same_readings(state, first)
+    assert np.array_equal(state.info["xy_position"], state.pipeline_state.q[:2])
