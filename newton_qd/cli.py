@@ -18,7 +18,7 @@ from newton_qd.qd.config import (
     environment_facts,
     read_config,
 )
-from newton_qd.qd.interrupt import INTERRUPTED
+from newton_qd.qd.interrupt import INTERRUPTED, graceful_stop
 
 if TYPE_CHECKING:
     from newton_qd.qd.evolve import EvolveResult
@@ -203,12 +203,15 @@ def _evolve(
             "checkpoint_seconds must be at least 0, got "
             f"{arguments.checkpoint_seconds!r}"
         )
-    # Imports JAX and the physics: an argument error above does not wait for it.
-    from newton_qd.physics.precision import quiet
-    from newton_qd.qd.evolve import evolve
-    from newton_qd.qd.search import SearchError
-    from newton_qd.qd.task import make_task
-
+    # Imports JAX and the physics: an argument error above does not wait for it. An
+    # exception in the middle of an extension module's import could end in a crash.
+    with graceful_stop(b"\nstopping\n") as stop:
+        from newton_qd.physics.precision import quiet
+        from newton_qd.qd.evolve import evolve
+        from newton_qd.qd.search import SearchError
+        from newton_qd.qd.task import make_task
+    if stop.requested:
+        raise KeyboardInterrupt
     quiet()
     try:
         result = evolve(

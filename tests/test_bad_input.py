@@ -33,7 +33,7 @@ def spoil(state: State, actions: jax.Array, kind: str) -> tuple[State, jax.Array
     if kind == "state":
         q = coordinates(state).at[1, -1].set(jnp.nan)
         return with_coordinates(state, q), actions
-    value = {"nan": jnp.nan, "inf": jnp.inf, "huge": 1e38}[kind]
+    value = {"nan": jnp.nan, "inf": jnp.inf, "huge": 3e38}[kind]
     return state, actions.at[1, 2, 0].set(value)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import hashlib
 import os
@@ -329,8 +330,50 @@ def test_bad_number_of_threads_stops_a_step(
     # a callback's error arrives as JAX's own, which names it
     with pytest.raises((ValueError, RuntimeError), match="THREADS='many'"):
         outputs(system, states)
+    # where a step is traced, before anything is compiled
+    with pytest.raises(ValueError, match="THREADS='many'"):
+        jax.eval_shape(functools.partial(physics.step, system), *one_state(system))
     monkeypatch.delenv("NEWTON_QD_THREADS")
     assert np.isfinite(outputs(system, states)[0]).all()
+
+
+def one_state(system: System) -> tuple[physics.PhysicsState, jax.Array]:
+    """The default pose at rest, and a zero control."""
+    q, v = jnp.asarray(system.rest_q, system.dtype), jnp.zeros(system.nv, system.dtype)
+    state = physics.initial_state(system, q, v)
+    return state, jnp.zeros(system.nu, system.dtype)
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"q": np.zeros(14, np.float32)}, ValueError, r"q: shape \(14,\).*\(15,\)"),
+        ({"v": np.zeros(15, np.float32)}, ValueError, r"v: shape \(15,\).*\(14,\)"),
+        ({"q": np.zeros((2, 15), np.float32)}, ValueError, r"q: shape \(2, 15\)"),
+        ({"v": np.zeros(14, np.int32)}, TypeError, "v: dtype int32.*float32"),
+        ({"q": np.zeros(15, np.float16)}, TypeError, "q: dtype float16.*float32"),
+    ],
+)
+def test_a_state_of_another_robot_is_named(
+    changes: dict[str, np.ndarray], error: type[Exception], message: str
+) -> None:
+    system, _ = single_states(1)
+    state, control = one_state(system)
+    arrays = {name: jnp.asarray(value) for name, value in changes.items()}
+    wrong = dataclasses.replace(state, **arrays)
+    with pytest.raises(error, match=message):
+        physics.step(system, wrong, control)
+
+
+@pytest.mark.parametrize("speed", [900.0, 1100.0])
+def test_a_diverging_world_is_at_fault(speed: float) -> None:
+    system, _ = single_states(1)
+    state, control = one_state(system)
+    flying = dataclasses.replace(state, v=state.v.at[0].set(speed))
+    after, fault = jax.jit(functools.partial(physics.step, system))(flying, control)
+    assert int(fault) == (speed > 1000)
+    if fault:
+        np.testing.assert_array_equal(after.q, flying.q)
 
 
 @pytest.mark.parametrize("text", ["0", "3", "64", "x", ""])

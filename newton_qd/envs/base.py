@@ -197,7 +197,7 @@ class PhysicsEnv(Env):
         after, fault = physics.step(self.system, start, jnp.where(sound, action, nan))
         fault = jnp.maximum(state.info["fault"], fault)
         faulty = fault != 0
-        action = jnp.where(sound, action, jnp.zeros_like(action))
+        action = jnp.where(faulty, jnp.zeros_like(action), action)
         reward, done, metrics = self._outcome(start, after, action)
         reward, metrics = select(
             faulty, jax.tree.map(jnp.zeros_like, (reward, metrics)), (reward, metrics)

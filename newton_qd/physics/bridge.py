@@ -18,7 +18,7 @@ from jax.core import Tracer
 from warp._src.jax.ffi import FfiCallable
 
 from newton_qd.physics import interrupts
-from newton_qd.physics.launch import Launcher
+from newton_qd.physics.launch import Launcher, thread_count
 from newton_qd.physics.precision import SCALARS
 from newton_qd.physics.system import System
 
@@ -91,6 +91,26 @@ def _kernel_call(system: System, name: str, size: int) -> Any:
     return jax.jit(call, static_argnames="output_dims", inline=True)
 
 
+def _row(system: System, **parts: tuple[jax.Array, int]) -> jax.Array:
+    """Concatenates the inputs of one world; a wrong size would shift all others.
+
+    Args:
+        system: The system.
+        **parts: Array and length of each input.
+
+    Raises:
+        TypeError: An array has another type than the system.
+        ValueError: An array has another shape.
+    """
+    for name, (array, size) in parts.items():
+        expected = f"allowed: shape {(size,)}, {system.dtype}"
+        if array.shape != (size,):
+            raise ValueError(f"{name}: shape {array.shape} given; {expected}")
+        if array.dtype != system.dtype:
+            raise TypeError(f"{name}: dtype {array.dtype} given; {expected}")
+    return jnp.concatenate([array for array, _ in parts.values()])
+
+
 def _differentiable(system: System, name: str, size: int, output_size: int) -> Any:
     """Reverse-mode function of one row; the adjoint is compiled when first traced."""
 
@@ -130,7 +150,8 @@ def control_step(system: System) -> Any:
     ends = np.cumsum([nq, nv, 6 * nb, nb])
 
     def run(q: jax.Array, v: jax.Array, control: jax.Array) -> tuple[jax.Array, ...]:
-        y = step(jnp.concatenate([q, v, control]))
+        thread_count()  # a bad setting is an error here, not inside a compiled call
+        y = step(_row(system, q=(q, nq), v=(v, nv), control=(control, system.nu)))
         q, v, impulse, normal_impulse, fault = jnp.split(y, ends)
         return q, v, impulse.reshape(nb, 6), normal_impulse, fault[0]
 

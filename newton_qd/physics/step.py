@@ -41,9 +41,14 @@ def step(
 
     Returns:
         The next state, and the fault () int32: 0, or 1 where anything was not
-        finite; then ``q`` and ``v`` are the given ones (the default pose at rest if
-        those are not finite), the impulses are zero and every gradient through the
-        step is exactly zero.
+        finite or a velocity exceeded 1,000 [m/s or rad/s]; then ``q`` and ``v`` are
+        the given ones (the default pose at rest if those are not finite), the
+        impulses are zero and every gradient through the step is exactly zero.
+
+    Raises:
+        TypeError: The state or the control has another type than the system.
+        ValueError: The state or the control has another shape, or an environment
+            variable is wrong.
     """
     q, v, impulse, normal_impulse, fault = bridge.control_step(system)(
         state.q, state.v, control

@@ -29,12 +29,15 @@ class StopFlag:
 
 
 @contextlib.contextmanager
-def graceful_stop() -> Iterator[StopFlag]:
+def graceful_stop(notice: bytes = _NOTICE) -> Iterator[StopFlag]:
     """Turns SIGINT and SIGTERM into a flag while the block runs.
 
     A second signal ends the process at once with exit code 130. Outside the main
     thread Python allows no handlers: then the flag stays unset. A signal that the
     process was told to ignore stays ignored.
+
+    Args:
+        notice: What the first signal prints at once.
     """
     flag = StopFlag()
     if threading.current_thread() is not threading.main_thread():
@@ -47,7 +50,7 @@ def graceful_stop() -> Iterator[StopFlag]:
 
     previous = {number: signal.getsignal(number) for number in _SIGNALS}
     active = [n for n in _SIGNALS if previous[n] is not signal.SIG_IGN]
-    with _answer_at_once(active):
+    with _answer_at_once(active, notice):
         for number in active:
             signal.signal(number, handle)
         try:
@@ -58,7 +61,7 @@ def graceful_stop() -> Iterator[StopFlag]:
 
 
 @contextlib.contextmanager
-def _answer_at_once(numbers: list[signal.Signals]) -> Iterator[None]:
+def _answer_at_once(numbers: list[signal.Signals], notice: bytes) -> Iterator[None]:
     """Lets a thread answer to signals.
 
     Python runs handlers between two of its own instructions only, which can be a
@@ -66,6 +69,7 @@ def _answer_at_once(numbers: list[signal.Signals]) -> Iterator[None]:
 
     Args:
         numbers: Signals to answer to.
+        notice: The answer to the first.
     """
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
@@ -79,7 +83,7 @@ def _answer_at_once(numbers: list[signal.Signals]) -> Iterator[None]:
             if received[0] in numbers:
                 # Not through sys.stderr: its buffer may be in use.
                 with contextlib.suppress(OSError):
-                    os.write(2, _NOTICE)
+                    os.write(2, notice)
         os.close(reader)
 
     before = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)

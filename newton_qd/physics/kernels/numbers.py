@@ -44,12 +44,12 @@ def clamp(a: real, b: real, c: real) -> real:
 
 @wp.func_native(
     *native(
-        "rest == rest ? zero : one",
-        before="Real zero = Real(0), one = Real(1), rest = A - A;",
+        "A < bound ? (A > -bound ? zero : one) : one",
+        before="Real zero = Real(0), one = Real(1), bound = Real(s);",
     )
 )
-def broken(a: real) -> real:
-    """1 where a number is not finite, else 0; without adjoint."""
+def beyond(a: real, s: scalar) -> real:
+    """0 where a number lies between ``-s`` and ``s``, else 1; without adjoint."""
     ...
 
 

@@ -9,10 +9,12 @@ import warp as wp
 from . import real, scalar, sync, vec3, width
 from .algebra import add, component, mul, vector
 from .memory import constant, gather, load, scatter, store
-from .numbers import broken, choose
+from .numbers import beyond, choose
 from .structs import Model, Row, Scratch, row_at
 
 WIDTH = wp.constant(width)
+# Ten radians in a substep of 10 ms: nothing that moves so fast is simulated any more.
+MAX_SPEED = wp.constant(scalar(1000.0))
 
 
 @wp.struct
@@ -107,7 +109,7 @@ def adj_load_world(
 
 @wp.func
 def detect_fault(m: Model, sc: Scratch, slot: int, lane: int):
-    """Record whether anything that the step returns is not finite."""
+    """Record whether a number is not finite, or a speed out of bounds."""
     if lane == 0:
         # zero times a finite number is zero, anything else is not a number
         zero = scalar(0.0)
@@ -126,7 +128,10 @@ def detect_fault(m: Model, sc: Scratch, slot: int, lane: int):
                     total = total + zero * component(impulse, j)
                     total = total + zero * component(angular, j)
                 total = total + zero * load(sc.normal_impulse, report + c)
-        store(sc.fault, slot, broken(total))
+        fault = beyond(total, scalar(1.0))
+        for k in range(m.nv):
+            fault = fault + beyond(load(sc.v, end.v + k), MAX_SPEED)
+        store(sc.fault, slot, beyond(fault, scalar(0.5)))
     sync(lane)
 
 
@@ -150,7 +155,7 @@ def store_state(
     total = real()
     for k in range(m.nq + m.nv):
         total = total + scalar(0.0) * gather(x, start + k, inputs, pack.count)
-    lost = broken(total)
+    lost = beyond(total, scalar(1.0))
     for k in range(lane, m.nq, lanes):
         stay = choose(
             lost, constant(m.rest_q, k), gather(x, start + k, inputs, pack.count)
