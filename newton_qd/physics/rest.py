@@ -12,7 +12,7 @@ from newton_qd.physics.system import JointKind, System
 from newton_qd.physics.xml_reader import RobotDescriptionError
 
 
-def _height_coordinate(system: System) -> tuple[int, float] | None:
+def height_coordinate(system: System) -> tuple[int, float] | None:
     """Returns the coordinate that raises the torso, and its sign; None if none."""
     frames = reference.body_frames(system, system.rest_q)
     body = system.torso
@@ -47,7 +47,7 @@ def rest_coordinates(system: System) -> np.ndarray:
                 f"rests at {angle:g}; allowed: {lower:g} to {upper:g}"
             )
     posed = dataclasses.replace(system, rest_q=q.copy())
-    height = _height_coordinate(posed)
+    height = height_coordinate(posed)
     if height is None:
         if robot.rest_height is not None:
             raise RobotDescriptionError(
