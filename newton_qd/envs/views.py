@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from newton_qd import physics
-from newton_qd.physics.rest import height_coordinate
+from newton_qd.physics.rest import raising_coordinate
 from newton_qd.physics.system import PhysicsState, System
 
 _LIGHTEST = 1e-5  # [kg]
@@ -145,8 +145,9 @@ class SystemView:
             rows[link] = row
             if link in names:
                 rows[names[link]] = row
-        ground = len(shown_bodies(system))
-        rows.update(dict.fromkeys(_GROUND, ground))
+        first = len(shown_bodies(system))
+        for row, (aliases, _) in enumerate(_still_bodies(system), first):
+            rows.update(dict.fromkeys(aliases, row))
         return Bodies(types.MappingProxyType(rows))
 
     @property
@@ -201,7 +202,7 @@ class SystemView:
         joint_q, joint_v = self._joint_indices()
         if joint_angle is not None:
             q = q.at[joint_q].set(_checked("joint_angle", joint_angle, joint_q, dtype))
-            height = height_coordinate(system)
+            height = raising_coordinate(system)
             if system.robot.rest_height is None and height is not None:
                 coordinate, sign = height
                 q = q.at[coordinate].add(-sign * physics.lowest_contact(system, q))
@@ -219,11 +220,11 @@ class SystemView:
         dtype = impulse.dtype
         mass = np.asarray(system.mass[bodies], dtype)[:, None]
         inverse = np.asarray(np.linalg.inv(system.inertia[bodies]), dtype)
-        rot = qp.rot[..., :-1, :]
+        rot = qp.rot[..., : len(bodies), :]
         local = _rotate(rot * np.array([1, -1, -1, -1], dtype), impulse[..., 3:])
         turned = jnp.sum(inverse * local[..., None, :], axis=-1)
         changes = impulse[..., :3] / mass, _rotate(rot, turned)
-        return Info(Changes(*(_with_ground(change) for change in changes)))
+        return Info(Changes(*(_with_still(system, change) for change in changes)))
 
     def _joint_indices(self) -> tuple[np.ndarray, np.ndarray]:
         axes = [axis for chain in _joint_chains(self._system) for axis in chain]
@@ -232,7 +233,7 @@ class SystemView:
 
 
 def shown_bodies(system: System) -> np.ndarray:
-    """Returns the bodies (nr - 1,) that have a row; the ground's row is the last."""
+    """Returns the moving bodies that have a row; those that never move come after."""
     return np.flatnonzero(system.mass >= _LIGHTEST).astype(np.int32)
 
 
@@ -243,13 +244,13 @@ def qp_view(system: System, state: PhysicsState) -> QP:
         found = physics.forward_kinematics(system, q, v)
         bodies = shown_bodies(system)
         rotation = found.rotation[bodies]
-        upright = jnp.asarray([[1.0, 0.0, 0.0, 0.0]], q.dtype)
+        frames = np.array([frame for _, frame in _still_bodies(system)], q.dtype)
         rot = jnp.concatenate([rotation[:, 3:], rotation[:, :3]], axis=1)
         return (
-            _with_ground(found.com[bodies]),
-            jnp.concatenate([rot, upright]),
-            _with_ground(found.linear_velocity[bodies]),
-            _with_ground(found.angular_velocity[bodies]),
+            jnp.concatenate([found.com[bodies], frames[:, :3]]),
+            jnp.concatenate([rot, frames[:, [6, 3, 4, 5]]]),
+            _with_still(system, found.linear_velocity[bodies]),
+            _with_still(system, found.angular_velocity[bodies]),
         )
 
     for _ in range(state.q.ndim - 1):
@@ -287,6 +288,13 @@ def _rotate(rot: jax.Array, vector: jax.Array) -> jax.Array:
     return vector + rot[..., :1] * turned + jnp.cross(rot[..., 1:], turned)
 
 
-def _with_ground(rows: jax.Array) -> jax.Array:
-    """Returns the rows (..., nr, 3) with one of zeros behind."""
-    return jnp.concatenate([rows, jnp.zeros_like(rows[..., :1, :])], axis=-2)
+def _still_bodies(system: System) -> list[tuple[tuple[str, ...], np.ndarray]]:
+    """Returns names and frame (7,) in the world of each body that never moves."""
+    del system  # every scene is the bare ground
+    return [(_GROUND, np.array([0, 0, 0, 0, 0, 0, 1.0]))]
+
+
+def _with_still(system: System, rows: jax.Array) -> jax.Array:
+    """Returns rows (..., nb, 3) with zeros behind, for the bodies that never move."""
+    shape = (*rows.shape[:-2], len(_still_bodies(system)), 3)
+    return jnp.concatenate([rows, jnp.zeros(shape, rows.dtype)], axis=-2)

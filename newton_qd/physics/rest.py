@@ -12,8 +12,15 @@ from newton_qd.physics.system import JointKind, System
 from newton_qd.physics.xml_reader import RobotDescriptionError
 
 
-def height_coordinate(system: System) -> tuple[int, float] | None:
-    """Returns the coordinate that raises the torso, and its sign; None if none."""
+def raising_coordinate(system: System) -> tuple[int, float] | None:
+    """Finds what lifts a robot without turning it.
+
+    Args:
+        system: The robot, in the pose ``rest_q``.
+
+    Returns:
+        The coordinate that raises the torso, and its sign; ``None`` if none does.
+    """
     frames = reference.body_frames(system, system.rest_q)
     body = system.torso
     while body >= 0:
@@ -47,7 +54,7 @@ def rest_coordinates(system: System) -> np.ndarray:
                 f"rests at {angle:g}; allowed: {lower:g} to {upper:g}"
             )
     posed = dataclasses.replace(system, rest_q=q.copy())
-    height = height_coordinate(posed)
+    height = raising_coordinate(posed)
     if height is None:
         if robot.rest_height is not None:
             raise RobotDescriptionError(
