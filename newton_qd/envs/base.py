@@ -12,6 +12,7 @@ import numpy as np
 from newton_qd import physics
 from newton_qd.envs.inputs import checked_action, refuse_params, require_precision
 from newton_qd.envs.state import State, select
+from newton_qd.envs.views import SystemView
 from newton_qd.physics.system import PhysicsState, System
 from newton_qd.robots import Robot
 from newton_qd.types import Action, Metrics, Observation, Params, RNGKey
@@ -241,6 +242,11 @@ class PhysicsEnv(Env):
         """Name of the robot."""
         return self.robot.name
 
+    @property
+    def sys(self) -> SystemView:
+        """What code for brax v1 reads of the robot."""
+        return SystemView(self.system)
+
     def _rest(self) -> PhysicsState:
         """Returns the default pose, at rest."""
         q = jnp.asarray(self.system.rest_q, self._dtype)
@@ -267,6 +273,7 @@ class PhysicsEnv(Env):
             done=jnp.zeros((), self._dtype),
             metrics={name: jnp.zeros((), self._dtype) for name in self._metrics},
             info={"fault": jnp.zeros((), jnp.int32)},
+            system=self.system,
         )
 
 

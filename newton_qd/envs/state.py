@@ -11,7 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from newton_qd.envs.views import QP, qp_view
 from newton_qd.errors import FaultError
+from newton_qd.physics.system import System
 from newton_qd.types import Info, Metrics, Observation
 
 Tree = TypeVar("Tree")
@@ -31,6 +33,7 @@ class State:
         done: () 1 where the episode has ended, else 0.
         metrics: Parts of the reward and other () readings, 0 after a reset.
         info: What wrappers remember; ``newton_qd.types.INFO_KEYS`` lists the keys.
+        system: The robot, for ``qp``; no leaf but part of the tree's structure.
     """
 
     pipeline_state: Any
@@ -39,6 +42,20 @@ class State:
     done: jax.Array
     metrics: Metrics
     info: Info
+    system: System | None = dataclasses.field(
+        default=None, repr=False, metadata={"static": True}
+    )
+
+    @property
+    def qp(self) -> QP:
+        """Bodies as brax v1 shows them, computed when asked for; read-only.
+
+        Raises:
+            AttributeError: The environment has no bodies.
+        """
+        if self.system is None:
+            raise AttributeError("qp: this state is of an environment without bodies")
+        return qp_view(self.system, self.pipeline_state)
 
     def replace(self, **changes: Any) -> State:
         """Returns a copy with some fields replaced."""

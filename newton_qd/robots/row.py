@@ -76,6 +76,8 @@ class Robot:
         substeps: Physics steps in a control step [-].
         gravity: Downward acceleration [m/s^2].
         material: Softness of contacts and limits.
+        original_names: ``(link, body)``: what a link's body is called in the original
+            suite, where that is another name; for ``env.sys``.
     """
 
     name: str
@@ -90,3 +92,4 @@ class Robot:
     rest_height: float | None = None
     gravity: float = 9.81
     material: Material = Material()
+    original_names: tuple[tuple[str, str], ...] = ()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
@@ -80,6 +82,11 @@ class EpisodeWrapper(Wrapper):
     def dt(self) -> float:
         """Duration of a step: that of all repetitions [s]."""
         return self.env.dt * self.action_repeat
+
+    @property
+    def sys(self) -> Any:
+        """What code for brax v1 reads of the robot; its step is that of this one."""
+        return self.env.sys.repeated(self.action_repeat)  # pyright: ignore
 
 
 def _moving(state: State) -> jax.Array:

@@ -1,0 +1,300 @@
+"""Views for code that was written for brax v1: ``state.qp`` and ``env.sys``.
+
+They are computed from the physics state when they are asked for. One row is one body:
+the links of the robot in the order of its URDF file, then the ground. Links below
+1e-5 kg have no row: they stand between the axes of one joint of the original.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+from collections.abc import Mapping
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from newton_qd import physics
+from newton_qd.physics.rest import raising_coordinate
+from newton_qd.physics.system import PhysicsState, System
+
+_LIGHTEST = 1e-5  # [kg]
+_GROUND = ("Ground", "floor")  # names of the last row in the original
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
+class QP:
+    """Where the bodies are and how they move, world axes; read-only.
+
+    Attributes:
+        pos: (nr, 3) centre of mass of each body [m].
+        rot: (nr, 4) quaternion wxyz.
+        vel: (nr, 3) velocity of the centre of mass [m/s].
+        ang: (nr, 3) angular velocity [rad/s].
+        physics: State that the rest was computed from.
+    """
+
+    pos: jax.Array
+    rot: jax.Array
+    vel: jax.Array
+    ang: jax.Array
+    physics: PhysicsState
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
+class Changes:
+    """Velocity changes of the bodies over a control step, world axes.
+
+    Attributes:
+        vel: (nr, 3) of the centre of mass [m/s].
+        ang: (nr, 3) of the angular velocity [rad/s].
+    """
+
+    vel: jax.Array
+    ang: jax.Array
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
+class Info:
+    """What the last control step reported.
+
+    Attributes:
+        contact: Velocity changes by contact, zero after a reset.
+    """
+
+    contact: Changes
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Bodies:
+    """The rows of a view.
+
+    Attributes:
+        index: Row of each body, by link and by its name in the original.
+    """
+
+    index: Mapping[str, int]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Joints:
+    """All joints with the same number of axes.
+
+    Attributes:
+        q: (nj, axes) coordinate of each axis.
+        v: (nj, axes) degree of freedom of each axis.
+    """
+
+    q: np.ndarray
+    v: np.ndarray
+
+    def angle_vel(self, qp: QP) -> tuple[tuple[jax.Array, ...], tuple[jax.Array, ...]]:
+        """Returns angles and their rates, one array (nj,) each per axis [rad, rad/s].
+
+        The rates are those of the angles; the original has the opposite sign.
+        """
+        axes = range(self.q.shape[1])
+        return (
+            tuple(qp.physics.q[..., self.q[:, axis]] for axis in axes),
+            tuple(qp.physics.v[..., self.v[:, axis]] for axis in axes),
+        )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Config:
+    """Settings of the simulation.
+
+    Attributes:
+        dt: Duration of a step, repeated actions included [s].
+        substeps: Physics steps in it [-].
+    """
+
+    dt: float
+    substeps: int
+
+
+class SystemView:
+    """What old code reads of a robot; read-only."""
+
+    def __init__(self, system: System, action_repeat: int = 1) -> None:
+        """Makes the view.
+
+        Args:
+            system: The robot.
+            action_repeat: Control steps for each action.
+        """
+        self._system = system
+        self._repeat = action_repeat
+
+    def repeated(self, action_repeat: int) -> SystemView:
+        """Returns the view of an environment that repeats its actions."""
+        return SystemView(self._system, self._repeat * action_repeat)
+
+    @property
+    def body(self) -> Bodies:
+        """The rows of a view."""
+        system = self._system
+        names = dict(system.robot.original_names)
+        rows: dict[str, int] = {}
+        for row, body in enumerate(shown_bodies(system)):
+            link = system.body_names[body]
+            rows[link] = row
+            if link in names:
+                rows[names[link]] = row
+        first = len(shown_bodies(system))
+        for row, (aliases, _) in enumerate(_still_bodies(system), first):
+            rows.update(dict.fromkeys(aliases, row))
+        return Bodies(types.MappingProxyType(rows))
+
+    @property
+    def joints(self) -> tuple[Joints, ...]:
+        """The joints between bodies, grouped by their number of axes."""
+        groups: dict[int, list[list[int]]] = {}
+        for chain in _joint_chains(self._system):
+            groups.setdefault(len(chain), []).append(chain)
+        system = self._system
+        return tuple(
+            Joints(
+                system.q_start[np.array(groups[axes])].astype(np.int32),
+                system.v_start[np.array(groups[axes])].astype(np.int32),
+            )
+            for axes in sorted(groups)
+        )
+
+    @property
+    def num_joint_dof(self) -> int:
+        """Number of axes of all joints."""
+        return sum(len(chain) for chain in _joint_chains(self._system))
+
+    @property
+    def config(self) -> Config:
+        """Settings of the simulation."""
+        robot = self._system.robot
+        return Config(robot.dt * self._repeat, robot.substeps * self._repeat)
+
+    def default_angle(self) -> jax.Array:
+        """Returns the joint angles (num_joint_dof,) of the default pose [rad].
+
+        They are in the order of the URDF file, joint by joint.
+        """
+        system = self._system
+        q, _ = self._joint_indices()
+        return jnp.asarray(system.rest_q[q], jnp.dtype(system.dtype))
+
+    def default_qp(
+        self,
+        joint_angle: jax.Array | None = None,
+        joint_velocity: jax.Array | None = None,
+    ) -> QP:
+        """Returns the default pose, standing on the ground.
+
+        Args:
+            joint_angle: (num_joint_dof,) as ``default_angle`` [rad]; ``None``: that.
+            joint_velocity: (num_joint_dof,) [rad/s]; ``None``: 0.
+        """
+        system = self._system
+        dtype = jnp.dtype(system.dtype)
+        q, v = jnp.asarray(system.rest_q, dtype), jnp.zeros((system.nv,), dtype)
+        joint_q, joint_v = self._joint_indices()
+        if joint_angle is not None:
+            q = q.at[joint_q].set(_checked("joint_angle", joint_angle, joint_q, dtype))
+            height = raising_coordinate(system)
+            if system.robot.rest_height is None and height is not None:
+                coordinate, sign = height
+                q = q.at[coordinate].add(-sign * physics.lowest_contact(system, q))
+        if joint_velocity is not None:
+            v = v.at[joint_v].set(
+                _checked("joint_velocity", joint_velocity, joint_v, dtype)
+            )
+        return qp_view(system, physics.initial_state(system, q, v))
+
+    def info(self, qp: QP) -> Info:
+        """Returns what the step that led to a view reported."""
+        system = self._system
+        bodies = shown_bodies(system)
+        impulse = qp.physics.impulse[..., bodies, :]
+        dtype = impulse.dtype
+        mass = np.asarray(system.mass[bodies], dtype)[:, None]
+        inverse = np.asarray(np.linalg.inv(system.inertia[bodies]), dtype)
+        rot = qp.rot[..., : len(bodies), :]
+        local = _rotate(rot * np.array([1, -1, -1, -1], dtype), impulse[..., 3:])
+        turned = jnp.sum(inverse * local[..., None, :], axis=-1)
+        changes = impulse[..., :3] / mass, _rotate(rot, turned)
+        return Info(Changes(*(_with_still(system, change) for change in changes)))
+
+    def _joint_indices(self) -> tuple[np.ndarray, np.ndarray]:
+        axes = [axis for chain in _joint_chains(self._system) for axis in chain]
+        q, v = self._system.q_start[axes], self._system.v_start[axes]
+        return q.astype(np.int32), v.astype(np.int32)
+
+
+def shown_bodies(system: System) -> np.ndarray:
+    """Returns the moving bodies that have a row; those that never move come after."""
+    return np.flatnonzero(system.mass >= _LIGHTEST).astype(np.int32)
+
+
+def qp_view(system: System, state: PhysicsState) -> QP:
+    """Returns where the bodies of a state are; every batch axis stays in front."""
+
+    def read(q: jax.Array, v: jax.Array) -> tuple[jax.Array, ...]:
+        found = physics.forward_kinematics(system, q, v)
+        bodies = shown_bodies(system)
+        rotation = found.rotation[bodies]
+        frames = np.array([frame for _, frame in _still_bodies(system)], q.dtype)
+        rot = jnp.concatenate([rotation[:, 3:], rotation[:, :3]], axis=1)
+        return (
+            jnp.concatenate([found.com[bodies], frames[:, :3]]),
+            jnp.concatenate([rot, frames[:, [6, 3, 4, 5]]]),
+            _with_still(system, found.linear_velocity[bodies]),
+            _with_still(system, found.angular_velocity[bodies]),
+        )
+
+    for _ in range(state.q.ndim - 1):
+        read = jax.vmap(read)
+    return QP(*read(state.q, state.v), physics=state)
+
+
+def _joint_chains(system: System) -> list[list[int]]:
+    """Returns, for each joint between shown bodies, its axes from the parent on."""
+    shown = set(shown_bodies(system).tolist())
+    chains = []
+    for body in sorted(shown):
+        chain, parent = [body], int(system.parent[body])
+        while parent >= 0 and parent not in shown:
+            chain.insert(0, parent)
+            parent = int(system.parent[parent])
+        if parent >= 0:
+            chains.append(chain)
+    return chains
+
+
+def _checked(
+    name: str, values: jax.Array, indices: np.ndarray, dtype: jnp.dtype
+) -> jax.Array:
+    if jnp.shape(values) != indices.shape:
+        raise ValueError(
+            f"{name}: shape {jnp.shape(values)} given; allowed: {indices.shape}"
+        )
+    return jnp.asarray(values, dtype)
+
+
+def _rotate(rot: jax.Array, vector: jax.Array) -> jax.Array:
+    """Rotates (..., 3) by quaternions wxyz (..., 4)."""
+    turned = 2.0 * jnp.cross(rot[..., 1:], vector)
+    return vector + rot[..., :1] * turned + jnp.cross(rot[..., 1:], turned)
+
+
+def _still_bodies(system: System) -> list[tuple[tuple[str, ...], np.ndarray]]:
+    """Returns names and frame (7,) in the world of each body that never moves."""
+    del system  # every scene is the bare ground
+    return [(_GROUND, np.array([0, 0, 0, 0, 0, 0, 1.0]))]
+
+
+def _with_still(system: System, rows: jax.Array) -> jax.Array:
+    """Returns rows (..., nb, 3) with zeros behind, for the bodies that never move."""
+    shape = (*rows.shape[:-2], len(_still_bodies(system)), 3)
+    return jnp.concatenate([rows, jnp.zeros(shape, rows.dtype)], axis=-2)

@@ -1,0 +1,179 @@
+"""``state.qp`` and ``env.sys``, against plain NumPy and against the observation."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import newton_qd
+from newton_qd.envs.ant import Ant
+from newton_qd.envs.pointmaze import PointMaze
+from newton_qd.envs.state import State
+from newton_qd.envs.views import QP, Info
+from newton_qd.physics import reference
+from newton_qd.wrappers import FixedInitialStateWrapper
+
+ANT = Ant()
+KEY = jax.random.key(0)
+
+
+@pytest.fixture(scope="module")
+def batch() -> State:
+    """Three ants after some steps."""
+    state = jax.jit(jax.vmap(ANT.reset))(jax.random.split(KEY, 3))
+    step = jax.jit(jax.vmap(ANT.step))
+    for index in range(6):
+        key = jax.random.key(index)
+        action = jax.random.uniform(key, (3, 8), np.float32, -1.0, 1.0)
+        state = step(state, action)
+    return state
+
+
+def row(tree: Any, index: int) -> Any:
+    return jax.tree.map(lambda x: x[index], tree)
+
+
+def test_bodies_are_where_the_kinematics_puts_them(batch: State) -> None:
+    system, qp = ANT.system, batch.qp
+    assert qp.pos.shape == qp.vel.shape == qp.ang.shape == (3, 10, 3)
+    assert qp.rot.shape == (3, 10, 4)
+    for world in range(3):
+        q = np.asarray(batch.pipeline_state.q[world], np.float64)
+        v = np.asarray(batch.pipeline_state.v[world], np.float64)
+        frames = reference.body_frames(system, q)
+        linear, angular = reference.jacobians(system, q)
+        centre = [
+            reference.compose(frame, np.append(com, [0, 0, 0, 1]))[:3]
+            for frame, com in zip(frames, system.com, strict=True)
+        ]
+        np.testing.assert_allclose(qp.pos[world, :9], centre, atol=1e-5)
+        np.testing.assert_allclose(qp.vel[world, :9], linear @ v, atol=1e-4)
+        np.testing.assert_allclose(qp.ang[world, :9], angular @ v, atol=1e-4)
+        wxyz = frames[:, [6, 3, 4, 5]]
+        same = np.abs(np.sum(wxyz * np.asarray(qp.rot[world, :9]), axis=1))
+        np.testing.assert_allclose(same, 1.0, atol=1e-5)
+
+
+def test_the_ground_is_the_last_row(batch: State) -> None:
+    qp = batch.qp
+    for part in (qp.pos, qp.vel, qp.ang):
+        assert np.all(part[:, 9] == 0)
+    assert np.all(qp.rot[:, 9] == np.array([1, 0, 0, 0]))
+
+
+def test_a_batch_is_its_worlds(batch: State) -> None:
+    alone = jax.jit(lambda state: state.qp)(row(batch, 1))
+    nested = jax.tree.map(lambda x: x.reshape(1, 3, *x.shape[1:]), batch).qp
+    for part in ("pos", "rot", "vel", "ang"):
+        whole = getattr(batch.qp, part)
+        np.testing.assert_allclose(getattr(alone, part), whole[1], atol=1e-6)
+        assert np.array_equal(getattr(nested, part)[0], whole)
+
+
+def test_rows_by_both_names() -> None:
+    index = ANT.sys.body.index
+    assert index["$ Torso"] == index["torso"] == 0
+    feet = [index[name] for name in ("$ Body 4", "$ Body 7", "$ Body 10", "$ Body 13")]
+    assert feet == [index[foot] for foot in newton_qd.FEET_NAMES["ant"]] == [2, 4, 6, 8]
+    assert [index[f"Aux {leg}"] for leg in (1, 2, 3, 4)] == [1, 3, 5, 7]
+    assert index["Ground"] == index["floor"] == 9
+    with pytest.raises(TypeError):
+        index["mine"] = 3  # pyright: ignore[reportIndexIssue]
+
+
+def test_joints_are_those_of_the_observation(batch: State) -> None:
+    (joints,) = ANT.sys.joints
+    (angles,), (rates,) = joints.angle_vel(batch.qp)
+    assert np.array_equal(angles, batch.obs[:, 5:13])
+    assert np.array_equal(rates, batch.obs[:, 19:27])
+    assert ANT.sys.num_joint_dof == 8
+
+
+def test_joints_of_the_fixed_initial_state() -> None:
+    # the test of QDax: exactly the default angles, exactly at rest
+    env: Any = newton_qd.create("ant_uni", fixed_init_state=True)
+    state = env.reset(jax.random.PRNGKey(10))
+    angle_vel = [joint.angle_vel(state.qp) for joint in env.sys.joints]
+    angles = jnp.concatenate([a for angle, _ in angle_vel for a in angle])
+    rates = jnp.concatenate([v for _, vel in angle_vel for v in vel])
+    assert np.array_equal(angles, env.sys.default_angle())
+    assert np.array_equal(rates, jnp.zeros(env.sys.num_joint_dof))
+
+
+def test_default_pose() -> None:
+    sys = ANT.sys
+    default, fixed = sys.default_qp(), ANT.fixed_state().qp
+    for part in ("pos", "rot", "vel", "ang"):
+        assert np.array_equal(getattr(default, part), getattr(fixed, part))
+    same = sys.default_qp(joint_angle=sys.default_angle())
+    np.testing.assert_allclose(same.pos, default.pos, atol=1e-6)
+    # a reset is the default pose with other joints
+    reset = ANT.reset(KEY)
+    physics_state = reset.pipeline_state
+    found = sys.default_qp(physics_state.q[7:], physics_state.v[6:])
+    for part in ("pos", "rot", "vel", "ang"):
+        expected = getattr(reset.qp, part)
+        np.testing.assert_allclose(getattr(found, part), expected, atol=1e-6)
+    with pytest.raises(ValueError, match=r"joint_angle: shape \(3,\) .*\(8,\)"):
+        sys.default_qp(jnp.zeros(3))
+
+
+def test_contact_is_that_of_the_observation(batch: State) -> None:
+    contact = ANT.sys.info(batch.qp).contact
+    assert np.any(contact.vel != 0)
+    for values, first in ((contact.vel, 27), (contact.ang, 57)):
+        seen = np.clip(np.asarray(values), -1, 1).reshape(3, 30)
+        np.testing.assert_allclose(seen, batch.obs[:, first : first + 30], atol=1e-4)
+    still = ANT.sys.info(ANT.fixed_state().qp).contact
+    assert np.all(still.vel == 0) and np.all(still.ang == 0)
+
+
+@pytest.mark.parametrize("repeat", [1, 3])
+def test_config(repeat: int) -> None:
+    env: Any = newton_qd.create("ant_uni", action_repeat=repeat)
+    assert env.sys.config.dt == env.dt == 0.05 * repeat
+    assert env.sys.config.substeps == 5 * repeat
+
+
+def test_a_state_without_bodies() -> None:
+    state = PointMaze().reset(KEY)
+    assert not hasattr(state, "qp")
+    with pytest.raises(AttributeError, match="without bodies"):
+        state.qp  # noqa: B018
+    assert not hasattr(newton_qd.create("pointmaze"), "sys")
+
+
+def test_states_of_one_robot_have_one_structure(batch: State) -> None:
+    other = newton_qd.create("ant", episode_length=None, auto_reset=False)
+    same = jax.tree.structure(other.reset(KEY)) == jax.tree.structure(batch)
+    assert same
+    assert copy.copy(batch).system is ANT.system
+    assert "system" not in repr(batch)
+
+
+def test_observation_function_of_the_fixed_initial_state() -> None:
+    seen = []
+
+    def observe(qp: QP, info: Info, action: jax.Array) -> jax.Array:
+        seen.append((qp.pos.shape, info.contact.vel.shape, action.tolist()))
+        return jnp.full(87, qp.pos[0, 2])
+
+    height = float(ANT.fixed_state().obs[0])
+    env = FixedInitialStateWrapper(newton_qd.create("ant"), "ant", observe)
+    state = env.reset(KEY)
+    np.testing.assert_allclose(state.obs, [height] * 87, rtol=1e-6)
+    assert np.array_equal(state.obs, state.info["first_obs"])
+    assert seen == [((10, 3), (10, 3), [0.0] * 8)]
+    after = jax.jit(env.step)(state, jnp.zeros(8, np.float32))
+    assert after.obs.shape == (87,) and np.ptp(after.obs) > 0
+
+    short = FixedInitialStateWrapper(ANT, "ant", lambda qp, info, action: qp.pos[0])
+    with pytest.raises(ValueError, match=r"get_obs_fn: .*\(3,\); allowed: \(87,\)"):
+        short.reset(KEY)
+    with pytest.raises(NotImplementedError, match=r"^This wrapper does not support"):
+        FixedInitialStateWrapper(PointMaze(), "pointmaze", observe)
