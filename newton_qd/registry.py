@@ -9,6 +9,9 @@ from typing import Any, Generic, TypeVar
 
 from newton_qd.envs.ant import Ant
 from newton_qd.envs.base import Env
+from newton_qd.envs.halfcheetah import HalfCheetah
+from newton_qd.envs.hopper import Hopper
+from newton_qd.envs.walker2d import Walker2d
 from newton_qd.errors import UnknownEnvironment
 from newton_qd.extractors import get_feet_contact_proportion
 from newton_qd.wrappers import (
@@ -65,6 +68,30 @@ _ROWS: dict[str, EnvironmentRow] = {
         wrappers=(WrapperRow(FeetContactWrapper),),
         descriptor_extractor=get_feet_contact_proportion,
         reward_offset=3.24,
+    ),
+    "halfcheetah": EnvironmentRow(HalfCheetah, "halfcheetah"),
+    "halfcheetah_uni": EnvironmentRow(
+        HalfCheetah,
+        "halfcheetah",
+        wrappers=(WrapperRow(FeetContactWrapper),),
+        descriptor_extractor=get_feet_contact_proportion,
+        reward_offset=9.231,
+    ),
+    "hopper": EnvironmentRow(Hopper, "hopper"),
+    "hopper_uni": EnvironmentRow(
+        Hopper,
+        "hopper",
+        wrappers=(WrapperRow(FeetContactWrapper),),
+        descriptor_extractor=get_feet_contact_proportion,
+        reward_offset=0.9,
+    ),
+    "walker2d": EnvironmentRow(Walker2d, "walker2d"),
+    "walker2d_uni": EnvironmentRow(
+        Walker2d,
+        "walker2d",
+        wrappers=(WrapperRow(FeetContactWrapper),),
+        descriptor_extractor=get_feet_contact_proportion,
+        reward_offset=1.413,
     ),
 }
 

@@ -49,8 +49,37 @@ def rows(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     yield
 
 
+ROBOTS = ("ant", "halfcheetah", "hopper", "walker2d")
+# The original's offsets.
+OFFSETS = {
+    "ant_uni": 3.24,
+    "halfcheetah_uni": 9.231,
+    "hopper_uni": 0.9,
+    "walker2d_uni": 1.413,
+}
+# Observation, action, descriptor.
+SIZES = {
+    "ant": (87, 8, 4),
+    "halfcheetah": (18, 6, 2),
+    "hopper": (11, 3, 1),
+    "walker2d": (17, 6, 2),
+}
+
+
 def test_names() -> None:
-    assert newton_qd.registered_envs() == ("ant", "ant_uni")
+    names = [name for robot in ROBOTS for name in (robot, f"{robot}_uni")]
+    assert newton_qd.registered_envs() == tuple(names)
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_sizes_are_those_of_the_original(robot: str) -> None:
+    plain, uni = newton_qd.create(robot), newton_qd.create(f"{robot}_uni")
+    observation, action, feet = SIZES[robot]
+    for env in (plain, uni):
+        assert (env.observation_size, env.action_size) == (observation, action)
+        assert env.name == robot
+    assert uni.descriptor_length == feet  # pyright: ignore
+    assert uni.state_descriptor_name == "feet_contact"  # pyright: ignore
 
 
 def test_wrappers_are_stacked_in_order() -> None:
@@ -132,10 +161,10 @@ def test_float64_needs_x64() -> None:
 
 def test_tables_are_columns_of_the_rows() -> None:
     extractors = newton_qd.behavior_descriptor_extractor
-    assert dict(extractors) == {"ant_uni": get_feet_contact_proportion}
+    assert dict(extractors) == dict.fromkeys(OFFSETS, get_feet_contact_proportion)
     assert newton_qd.descriptor_extractor is extractors
-    assert dict(newton_qd.reward_offset) == {"ant_uni": 3.24}
-    assert len(newton_qd.reward_offset) == 1 and "ant" not in newton_qd.reward_offset
+    assert dict(newton_qd.reward_offset) == OFFSETS
+    assert len(newton_qd.reward_offset) == 4 and "ant" not in newton_qd.reward_offset
     assert "ant_uni" in repr(newton_qd.reward_offset)
     with pytest.raises(KeyError, match="'ant' has no reward_offset; known: ant_uni"):
         newton_qd.reward_offset["ant"]
