@@ -1,130 +1,27 @@
-"""The environments by name: one row each, and what builds them."""
+"""Environments by name: what builds them, and tables of what their rows say."""
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import inspect
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Generic, TypeVar
 
-from newton_qd.envs.ant import Ant
 from newton_qd.envs.base import Env
-from newton_qd.envs.pointmaze import PointMaze
 from newton_qd.errors import UnknownEnvironment
-from newton_qd.extractors import get_feet_contact_proportion, get_final_xy_position
 from newton_qd.robots import ROBOTS, Robot
+from newton_qd.tasks import ROWS as _ROWS
+from newton_qd.tasks import EnvironmentRow, Extractor, WrapperRow
 from newton_qd.wrappers import (
     AutoResetWrapper,
     CompletedEvalWrapper,
     EpisodeWrapper,
     EvalWrapper,
-    FeetContactWrapper,
     FixedInitialStateWrapper,
-    NoForwardRewardWrapper,
     VectorWrapper,
-    XYPositionWrapper,
 )
 
-Extractor = Callable[[Any, Any], Any]
 Value = TypeVar("Value")
-
-
-@dataclasses.dataclass(frozen=True)
-class WrapperRow:
-    """A wrapper of an environment, called as ``wrapper(env, name, **options)``.
-
-    Attributes:
-        wrapper: Class or function.
-        options: Keyword arguments, replaced by ``qdax_wrappers_kwargs``.
-    """
-
-    wrapper: Callable[..., Env]
-    options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-
-
-@dataclasses.dataclass(frozen=True)
-class EnvironmentRow:
-    """Everything about an environment that has a name.
-
-    Attributes:
-        base: Makes the environment from the keyword arguments of ``create``.
-        base_name: Name that wrappers receive.
-        wrappers: From the inside to the outside.
-        descriptor_extractor: Reads the descriptor of an episode, for QD tasks.
-        reward_offset: Added to each step's reward to keep QD scores positive.
-        robot: Row of the robot inside; ``None``: that of ``ROBOTS`` called
-            ``base_name``, if there is one.
-    """
-
-    base: Callable[..., Env]
-    base_name: str
-    wrappers: tuple[WrapperRow, ...] = ()
-    descriptor_extractor: Extractor | None = None
-    reward_offset: float | None = None
-    robot: Robot | None = None
-
-    @property
-    def feet(self) -> tuple[str, ...] | None:
-        """Links of the robot's feet; ``None`` where it has none."""
-        robot = self._robot
-        return robot.feet if robot is not None and robot.feet else None
-
-    @property
-    def torso(self) -> str | None:
-        """Link of the robot's torso; ``None`` where there is no robot."""
-        return None if self._robot is None else self._robot.torso
-
-    @property
-    def forward_reward(self) -> str | None:
-        """Metric that is the forward part of the reward; ``None``: there is none."""
-        return getattr(self.base, "forward_reward_name", None)
-
-    @property
-    def _robot(self) -> Robot | None:
-        return self.robot or ROBOTS.get(self.base_name)
-
-
-def _xy_position(
-    minval: tuple[float, float], maxval: tuple[float, float]
-) -> WrapperRow:
-    """Returns the wrapper for a position within limits [m] as the descriptor."""
-    return WrapperRow(XYPositionWrapper, {"minval": minval, "maxval": maxval})
-
-
-_ROWS: dict[str, EnvironmentRow] = {
-    "ant": EnvironmentRow(Ant, "ant"),
-    "ant_uni": EnvironmentRow(
-        Ant,
-        "ant",
-        wrappers=(WrapperRow(FeetContactWrapper),),
-        descriptor_extractor=get_feet_contact_proportion,
-        reward_offset=3.24,
-    ),
-    "ant_omni": EnvironmentRow(
-        Ant,
-        "ant",
-        wrappers=(
-            _xy_position((-30.0, -30.0), (30.0, 30.0)),
-            WrapperRow(NoForwardRewardWrapper),
-        ),
-        descriptor_extractor=get_final_xy_position,
-        reward_offset=3.0,
-    ),
-    "antnotrap": EnvironmentRow(
-        Ant,
-        "ant",
-        wrappers=(_xy_position((0.0, -8.0), (70.0, 8.0)),),
-        descriptor_extractor=get_final_xy_position,
-        reward_offset=3.38,
-    ),
-    "pointmaze": EnvironmentRow(
-        PointMaze,
-        "pointmaze",
-        descriptor_extractor=get_final_xy_position,
-        reward_offset=2.3431,
-    ),
-}
 
 
 class _Column(Mapping[str, Value], Generic[Value]):

@@ -21,6 +21,7 @@ _COMPILER = (
     'balanceinertia="false" boundmass="0" boundinertia="0"/></mujoco>'
 )
 _ROOT_JOINT = "newton_qd_root"
+_SPECK = 1e-12  # of a link without mass, which MuJoCo refuses to move [kg, kg m^2]
 
 
 class MujocoReference:
@@ -35,6 +36,10 @@ class MujocoReference:
         if system.joint_kind[0] == JointKind.FREE:
             # MuJoCo welds the root link of a URDF file to the world.
             spec.body(system.body_names[0]).add_freejoint(name=_ROOT_JOINT)
+        for name in np.array(system.body_names)[system.mass == 0]:
+            body = spec.body(name)
+            body.mass, body.inertia = _SPECK, [_SPECK] * 3
+            body.explicitinertial = True
         spec.option.gravity = [0.0, 0.0, -system.robot.gravity]
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)

@@ -16,6 +16,7 @@ from urdf_text import row, write
 from newton_qd import physics
 from newton_qd.physics import reference
 from newton_qd.physics.model import build_system
+from newton_qd.physics.rest import raising_coordinate
 from newton_qd.physics.system import JointKind, PhysicsState, System
 from newton_qd.robots import Contact, Material, Robot
 
@@ -30,24 +31,32 @@ def variant(robot: Robot, dtype: str, **changes: Any) -> System:
 def random_states(system: System, rng: np.random.Generator, worlds: int) -> Arrays:
     """Coordinates (n, nq), velocities (n, nv), actions (n, nu) of a legged robot.
 
-    The first half sinks, its lowest foot 10 to 20 mm deep in the ground; the second
-    half is up to 0.5 m above it.
+    Its root is free or in a plane. The first half sinks, its lowest foot 10 to 20 mm
+    deep in the ground; the second half is up to 0.5 m above it.
     """
     q = np.tile(system.rest_q, (worlds, 1))
     for body in np.flatnonzero(system.joint_kind != JointKind.FREE):
         dof, at = system.v_start[body], system.q_start[body]
         lower, upper = system.limit_lower[dof], system.limit_upper[dof]
-        q[:, at] = rng.uniform(lower - 0.1, upper + 0.1, worlds)
+        if np.isfinite(lower):
+            q[:, at] = rng.uniform(lower - 0.1, upper + 0.1, worlds)
     tilt = 0.15 * rng.normal(size=(worlds, 4)) + np.array([0.0, 0.0, 0.0, 1.0])
-    q[:, 3:7] = tilt / np.linalg.norm(tilt, axis=1, keepdims=True)
-    q[:, :2] = 5.0 * rng.normal(size=(worlds, 2))
+    if system.joint_kind[0] == JointKind.FREE:
+        q[:, 3:7] = tilt / np.linalg.norm(tilt, axis=1, keepdims=True)
+        q[:, :2] = 5.0 * rng.normal(size=(worlds, 2))
+    else:
+        q[:, 2] = 2.0 * tilt[:, 1]
+        q[:, 0] = 5.0 * rng.normal(size=worlds)
+    raising = raising_coordinate(system)
+    assert raising is not None
+    up = raising[0]
     half = worlds // 2
     height = rng.uniform(-0.02, -0.01, worlds)
     height[half:] = rng.uniform(0.0, 0.5, worlds - half)
     for world in range(worlds):
-        q[world, 2] += height[world] - reference.lowest_contact(system, q[world])
+        q[world, up] += height[world] - reference.lowest_contact(system, q[world])
     v = rng.normal(size=(worlds, system.nv))
-    v[:half, 2] = -np.abs(v[:half, 2])
+    v[:half, up] = -np.abs(v[:half, up])
     return q, v, rng.uniform(-1.0, 1.0, (worlds, system.nu))
 
 

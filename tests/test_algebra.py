@@ -173,6 +173,22 @@ def test_one_variable_twice(applied: dict[str, Any], name: str) -> None:
     np.testing.assert_allclose(shared[0].grad.numpy(), expected, rtol=1e-12)
 
 
+@pytest.mark.parametrize("width", [1e-110, 5e-324, 0.0])
+def test_penetration_keeps_its_digits(applied: dict[str, Any], width: float) -> None:
+    """At the edge of a contact's zone the width of its clipping underflows."""
+    name = next(name for name in functions() if name.startswith("penetration"))
+    function, ratio = functions()[name], np.array([-1.5, -0.4, 0.6, 1.5])
+    wide = evaluate(applied[name], function, {"gap": ratio, "width": np.ones(4)})
+    values = {"gap": width * ratio, "width": np.full(4, width)}
+    held = arrays(function, values)
+    held[-1].grad.fill_(1.0)
+    unused = [None for _ in held]
+    wp.launch(applied[name], 1, held, adj_inputs=unused, adjoint=True, device="cpu")
+    assert all(np.isfinite(array.grad.numpy()).all() for array in held)
+    found = evaluate(applied[name], function, values)
+    np.testing.assert_allclose(found, width * wide, rtol=1e-14, atol=1e-323)
+
+
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 0.3, 1.999, 2.001, 9.0])
 def test_exponential_map(applied: dict[str, Any], angle: float) -> None:
     name = next(name for name in functions() if name.startswith("turn_by"))

@@ -3,7 +3,8 @@
 Mass matrix, bias force and unconstrained acceleration at random states, without
 contact: to 1e-5 in float32 and 1e-9 in float64, relative to the robot's own scale
 (an entry of the mass matrix to its two diagonal entries, a force or acceleration to
-the largest of its vector).
+the largest of its vector). In float32 the halfcheetah has 1e-4: a foot has 200 times as
+much inertia about the torso, where the kernels add it up, as about its own joint.
 """
 
 from __future__ import annotations
@@ -22,10 +23,11 @@ from newton_qd.assets import find_urdf
 from newton_qd.physics import reference
 from newton_qd.physics.model import build_system
 from newton_qd.physics.system import JointKind, System
-from newton_qd.robots import ANT, Robot
+from newton_qd.robots import ROBOTS, Robot
 
 STATES = 20
 TOLERANCE = {"float32": 1e-5, "float64": 1e-9}
+ROUNDED = {("halfcheetah", "float32"): 1e-4}
 
 # Nothing here is aligned, centred or diagonal; "spacer" is a link of a gram that
 # makes a joint of two axes.
@@ -111,10 +113,10 @@ def off_centre_row(path: Path) -> Robot:
     )
 
 
-@pytest.fixture(scope="module", params=["ant", "off_centre"])
+@pytest.fixture(scope="module", params=[*ROBOTS, "off_centre"])
 def robot(request: pytest.FixtureRequest, tmp_path_factory) -> Robot:
-    if request.param == "ant":
-        return ANT
+    if request.param in ROBOTS:
+        return ROBOTS[request.param]
     path = tmp_path_factory.mktemp("urdf") / "off_centre.urdf"
     path.write_text(OFF_CENTRE, encoding="utf-8")
     return off_centre_row(path)
@@ -143,7 +145,7 @@ def error(ours: np.ndarray, theirs: np.ndarray) -> float:
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_equations_of_motion(robot: Robot, dtype: str) -> None:
-    tolerance = TOLERANCE[dtype]
+    tolerance = ROUNDED.get((robot.name, dtype), TOLERANCE[dtype])
     with jax.enable_x64(True) if dtype == "float64" else contextlib.nullcontext():
         system = build_system(robot, dtype)
         mass_matrix = _jitted(physics.mass_matrix, system)

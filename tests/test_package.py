@@ -35,6 +35,7 @@ LAYERS = (
     "envs",
     "wrappers",
     "extractors",
+    "tasks",
     "registry",
     "__init__",
 )

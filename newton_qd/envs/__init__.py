@@ -2,7 +2,23 @@
 
 from newton_qd.envs.ant import Ant
 from newton_qd.envs.base import Env, PhysicsEnv, QDEnv
+from newton_qd.envs.halfcheetah import HalfCheetah
+from newton_qd.envs.hopper import Hopper
+from newton_qd.envs.locomotion import Locomotion
 from newton_qd.envs.pointmaze import PointMaze
 from newton_qd.envs.state import State, check
+from newton_qd.envs.walker2d import Walker2d
 
-__all__ = ["Ant", "Env", "PhysicsEnv", "PointMaze", "QDEnv", "State", "check"]
+__all__ = [
+    "Ant",
+    "Env",
+    "HalfCheetah",
+    "Hopper",
+    "Locomotion",
+    "PhysicsEnv",
+    "PointMaze",
+    "QDEnv",
+    "State",
+    "Walker2d",
+    "check",
+]

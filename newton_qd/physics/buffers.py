@@ -10,8 +10,8 @@ import warp as wp
 
 from newton_qd.physics import reference
 from newton_qd.physics.precision import kernels, pack_width
-from newton_qd.physics.system import JointKind, ObstacleKind, System
-from newton_qd.physics.tree import Tree, build_tree
+from newton_qd.physics.system import ObstacleKind, System
+from newton_qd.physics.tree import Tree, build_tree, origin_axes
 
 # Solves of a substep: the predictor and two correctors.
 _SOLVES = 3
@@ -52,12 +52,12 @@ def build_model(system: System, device: Any) -> Any:
 
     model.nb, model.nq, model.nv = system.nb, system.nq, system.nv
     model.nu, model.nc = system.nu, len(system.contact_body)
-    model.free_root = int(system.joint_kind[0] == JointKind.FREE)
     model.substeps, model.passes = robot.substeps, _SOLVES
     model.h = robot.dt / robot.substeps
     model.gravity = robot.gravity
     model.total_mass = system.total_mass
     put("rest_q", system.rest_q)
+    put("origin_axis", origin_axes(system))
     _put_bodies(put, system, tree)
     model.body_levels = len(tree.body_level[0]) - 1
     _put_dofs(put, system)

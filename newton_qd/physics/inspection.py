@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 
 from newton_qd.physics import bridge
-from newton_qd.physics.system import JointKind, System
+from newton_qd.physics.system import System
+from newton_qd.physics.tree import origin_axes
 
 
 @jax.tree_util.register_dataclass
@@ -66,9 +67,10 @@ def forward_kinematics(system: System, q: jax.Array, v: jax.Array) -> Kinematics
     local = jnp.asarray(system.com, q.dtype)
     com = at + _rotate(rotation, local)
     angular = twist[:, :3]
-    # the kernels work about O, the position of a free root
-    free = system.joint_kind[0] == JointKind.FREE
-    origin = q[:3] if free else jnp.zeros((3,), q.dtype)
+    # the kernels work about O
+    axes = origin_axes(system).astype(system.dtype)[: system.nq]
+    moves = (q[i] * axis for i, axis in enumerate(axes))
+    origin = sum(moves, jnp.zeros((3,), q.dtype))
     return Kinematics(
         position=at + origin,
         rotation=rotation,

@@ -1,4 +1,4 @@
-"""Tables of a kinematic tree that the kernels walk: levels, children, contacts."""
+"""Tables of a kinematic tree that the kernels walk, and the origin they work about."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from newton_qd.physics.system import System
+from newton_qd.physics import reference
+from newton_qd.physics.system import JointKind, System
 
 
 def _ragged(rows: Sequence[Sequence[int]]) -> tuple[np.ndarray, np.ndarray]:
@@ -59,3 +60,25 @@ def build_tree(system: System) -> Tree:
         child=_ragged(children),
         contact=np.asarray([0, *np.cumsum(contact_counts)], np.int32),
     )
+
+
+def origin_axes(system: System) -> np.ndarray:
+    """Returns how the origin O of spatial vectors moves with the first coordinates.
+
+    O is the position of a free root, or the point that the slides at the root have
+    carried away from the origin of the world.
+
+    Returns:
+        (3, 3) row i is the step of O for each metre of coordinate i, world axes [-].
+    """
+    if system.joint_kind[0] == JointKind.FREE:
+        return np.eye(3)
+    axes = np.zeros((3, 3))
+    frames = reference.body_frames(system, np.zeros(system.nq))
+    for body in range(min(3, system.nb)):
+        slides = system.joint_kind[body] == JointKind.PRISMATIC
+        if not slides or system.parent[body] != body - 1:
+            break
+        side = reference.compose(frames[body], system.child_frame[body])
+        axes[body] = reference.rotation_matrix(side[3:]) @ system.joint_axis[body]
+    return axes

@@ -1,9 +1,12 @@
 """Poses, motion subspaces, twists and bias accelerations, root to leaves.
 
-Spatial vectors are (angular, linear) in world axes about the origin O, the position
-of a free root (Featherstone 2008, ch. 2 and 5). Gravity enters as an upward
-acceleration of the world.
+Spatial vectors are (angular, linear) in world axes about the origin O (Featherstone
+2008, ch. 2 and 5), which is where a free root or the slides under a root have moved:
+near the robot wherever it goes, because inertias about a far point have no digits left.
+Gravity enters as an upward acceleration of the world.
 """
+
+import warp as wp
 
 from . import real, scalar, stage, vec3
 from .algebra import (
@@ -27,9 +30,12 @@ from .structs import Model, Row, Scratch
 @stage
 def world_frame(m: Model, sc: Scratch, row: Row):
     """Pose of the world frame seen from O."""
-    p = vec3()
-    if m.free_root == 1:
-        p = neg(vector(load(sc.q, row.q), load(sc.q, row.q + 1), load(sc.q, row.q + 2)))
+    # a robot with fewer coordinates reads its last one again, times zero
+    last = row.q + m.nq - 1
+    first = load(sc.q, row.q) * constant(m.origin_axis, 0)
+    second = load(sc.q, wp.min(row.q + 1, last)) * constant(m.origin_axis, 1)
+    third = load(sc.q, wp.min(row.q + 2, last)) * constant(m.origin_axis, 2)
+    p = neg(first + second + third)
     zero = vec3()
     store(
         sc.pose,

@@ -9,9 +9,10 @@ import warp as wp
 from . import quat, real, vec3
 from .native import native
 
+# in units of the width: its cube may be too small for a number
 _ZONES = """
 Real zero = Real(0), one = Real(1);
-Real u = WIDTH - GAP, s = WIDTH + GAP, cube = WIDTH * WIDTH * WIDTH;
+Real t = GAP / WIDTH, u = one - t, s = one + t;
 auto zones = [&](Real deep, Real near) {
     return GAP <= -WIDTH ? deep : (GAP < WIDTH ? near : zero);
 };
@@ -20,10 +21,10 @@ auto zones = [&](Real deep, Real near) {
 
 @wp.func_native(
     *native(
-        "zones(-GAP, u * u * u * (WIDTH + WIDTH + s) / (Real(16) * cube))",
+        "zones(-GAP, Real(0.0625) * WIDTH * u * u * u * (Real(2) + s))",
         """
-Real slope = u * u * (WIDTH + s) / (Real(4) * cube);
-Real widening = Real(3) * u * u * s * s / (Real(16) * cube * WIDTH);
+Real slope = Real(0.25) * u * u * (one + s);
+Real widening = Real(0.1875) * u * u * s * s;
 adj_GAP -= zones(one, slope) * adj_RET;
 adj_WIDTH += zones(zero, widening) * adj_RET;
 """,
@@ -37,10 +38,10 @@ def penetration(gap: real, width: real) -> real:
 
 @wp.func_native(
     *native(
-        "zones(one, u * u * (WIDTH + s) / (Real(4) * cube))",
+        "zones(one, Real(0.25) * u * u * (one + s))",
         """
-Real slope = Real(3) * u * s / (Real(4) * cube);
-Real widening = Real(3) * u * s * GAP / (Real(4) * cube * WIDTH);
+Real slope = Real(0.75) * u * s / WIDTH;
+Real widening = t * slope;
 adj_GAP -= zones(zero, slope) * adj_RET;
 adj_WIDTH += zones(zero, widening) * adj_RET;
 """,

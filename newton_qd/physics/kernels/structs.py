@@ -21,13 +21,13 @@ class Model:
     nv: int
     nu: int
     nc: int
-    free_root: int  # 1: the origin O follows the position of the first joint
     substeps: int
     total_mass: scalar  # [kg]
     passes: int  # solves of a substep: predictor and correctors
     h: scalar  # [s]
     gravity: scalar  # [m/s^2]
     rest_q: wp.array[scalar]  # (nq,)
+    origin_axis: wp.array[_vec3]  # (3,) what a coordinate adds to the origin O
     # bodies, (nb + 1)
     body_parent: wp.array[int]
     joint_kind: wp.array[int]

@@ -1,0 +1,111 @@
+"""What the robots in a plane share: observation blocks, and running upright.
+
+Their root has the coordinates x, z and pitch, and its velocities are their rates.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from newton_qd.envs.base import ordered_sum
+from newton_qd.physics.system import PhysicsState
+from newton_qd.types import Action, Metrics
+
+X, Z, PITCH = 0, 1, 2
+_ROOT = 3  # coordinates of the root, and velocities
+
+
+def blocks(
+    state: PhysicsState, orientation: dict[str, jax.Array], *, omit_x: bool
+) -> dict[str, jax.Array]:
+    """Returns the blocks of the observation of a robot in a plane.
+
+    Args:
+        state: The state.
+        orientation: How the torso is turned, as the robot's task sees it.
+        omit_x: Whether the position along x is left out.
+    """
+    q, v = state.q, state.v
+    first = {} if omit_x else {"torso position x [m]": q[X : X + 1]}
+    return {
+        **first,
+        "torso height [m]": q[Z : Z + 1],
+        **orientation,
+        "joint angles [rad]": q[_ROOT:],
+        "torso velocity x z [m/s]": v[:PITCH],
+        "torso angular velocity y [rad/s]": v[PITCH:_ROOT],
+        "joint velocities [rad/s]": v[_ROOT:],
+    }
+
+
+def forward_velocity(before: PhysicsState, after: PhysicsState, dt: float) -> jax.Array:
+    """Returns the mean velocity of the torso along x over a step () [m/s]."""
+    return (after.q[X] - before.q[X]) / dt
+
+
+def euler_pitch(angle: jax.Array) -> jax.Array:
+    """Returns the Euler angle about y of a turn by ``angle``, -pi/2 to pi/2 [rad].
+
+    That is arcsin(sin(angle)), the reading of the original, by reflections: its
+    gradient is 1 or -1 everywhere.
+    """
+    turn = np.asarray(2 * np.pi, angle.dtype)
+    half = np.asarray(np.pi, angle.dtype)
+    wrapped = angle - turn * jnp.round(angle / turn)
+    folded = jnp.where(wrapped > 0, half - wrapped, -half - wrapped)
+    return jnp.where(jnp.abs(wrapped) > half / 2, folded, wrapped)
+
+
+@dataclasses.dataclass(frozen=True)
+class UprightRun:
+    """Run along x without falling: reward and end of hopper and walker2d.
+
+    Attributes:
+        forward_reward_weight: Weight of the velocity along x [s/m].
+        ctrl_cost_weight: Cost of the sum of squared actions [-].
+        healthy_reward: Bonus of a step [-].
+        terminate_when_unhealthy: Whether an unhealthy torso ends the episode; if
+            not, it loses the bonus instead.
+        healthy_z_range: Lowest and highest healthy height of the torso [m].
+        healthy_angle_range: Lowest and highest healthy Euler pitch [rad].
+    """
+
+    forward_reward_weight: float
+    ctrl_cost_weight: float
+    healthy_reward: float
+    terminate_when_unhealthy: bool
+    healthy_z_range: tuple[float, float]
+    healthy_angle_range: tuple[float, float]
+
+    def outcome(
+        self, before: PhysicsState, after: PhysicsState, action: Action, dt: float
+    ) -> tuple[jax.Array, jax.Array, Metrics]:
+        """Returns reward, done and metrics of a step of ``dt`` [s]."""
+        velocity = forward_velocity(before, after, dt)
+        healthy = self._healthy(after)
+        if self.terminate_when_unhealthy:
+            bonus, done = jnp.full_like(healthy, self.healthy_reward), 1 - healthy
+        else:
+            bonus, done = self.healthy_reward * healthy, jnp.zeros_like(healthy)
+        forward = self.forward_reward_weight * velocity
+        control = self.ctrl_cost_weight * ordered_sum(jnp.square(action))
+        metrics = {
+            "reward_forward": forward,
+            "reward_ctrl": -control,
+            "reward_healthy": bonus,
+            "x_position": after.q[X],
+            "x_velocity": velocity,
+        }
+        return forward + bonus - control, done, metrics
+
+    def _healthy(self, state: PhysicsState) -> jax.Array:
+        """Returns 1 where height and pitch are in their ranges, else 0."""
+        height, pitch = state.q[Z], euler_pitch(state.q[PITCH])
+        low, high = self.healthy_z_range
+        back, front = self.healthy_angle_range
+        healthy = (height >= low) & (height <= high) & (pitch >= back)
+        return (healthy & (pitch <= front)).astype(state.q.dtype)

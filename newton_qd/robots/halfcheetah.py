@@ -1,0 +1,36 @@
+"""Halfcheetah: a trunk on a back and a front leg, in a plane."""
+
+from newton_qd.robots.row import Contact, Material, Robot
+
+_LEG_PARTS = ("bthigh", "bshin", "bfoot", "fthigh", "fshin", "ffoot")
+
+HALFCHEETAH = Robot(
+    name="halfcheetah",
+    urdf="halfcheetah.urdf",
+    torso="torso",
+    feet=("ffoot", "bfoot"),
+    actuators=(
+        ("bthigh", 120.0),
+        ("bshin", 90.0),
+        ("bfoot", 60.0),
+        ("fthigh", 120.0),
+        ("fshin", 60.0),
+        ("ffoot", 30.0),
+    ),
+    contacts=(
+        *(Contact("torso", end, name) for name in ("trunk", "head") for end in (1, -1)),
+        *(Contact(link, end) for link in _LEG_PARTS for end in (1, -1)),
+    ),
+    # the middle of each joint's range
+    rest_pose=(
+        ("bthigh", 0.265),
+        ("bfoot", 0.1925),
+        ("fthigh", -0.15),
+        ("fshin", -0.165),
+    ),
+    dt=0.05,
+    # 10 ms would let a foot, light and undamped, swing for ever about its limit
+    substeps=10,
+    # smoothing: a quarter to a third of the radius of the capsules
+    material=Material(friction=0.6, smoothing=0.015),
+)

@@ -1,0 +1,135 @@
+"""The environments as data: one row for each name.
+
+To add one, add a row; :func:`newton_qd.register` does so from outside.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from newton_qd.envs.ant import Ant
+from newton_qd.envs.base import Env
+from newton_qd.envs.halfcheetah import HalfCheetah
+from newton_qd.envs.hopper import Hopper
+from newton_qd.envs.pointmaze import PointMaze
+from newton_qd.envs.walker2d import Walker2d
+from newton_qd.extractors import get_feet_contact_proportion, get_final_xy_position
+from newton_qd.robots import ROBOTS, Robot
+from newton_qd.wrappers import (
+    FeetContactWrapper,
+    NoForwardRewardWrapper,
+    XYPositionWrapper,
+)
+
+Extractor = Callable[[Any, Any], Any]
+
+
+@dataclasses.dataclass(frozen=True)
+class WrapperRow:
+    """A wrapper of an environment, called as ``wrapper(env, name, **options)``.
+
+    Attributes:
+        wrapper: Class or function.
+        options: Keyword arguments, replaced by ``qdax_wrappers_kwargs``.
+    """
+
+    wrapper: Callable[..., Env]
+    options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+
+@dataclasses.dataclass(frozen=True)
+class EnvironmentRow:
+    """Everything about an environment that has a name.
+
+    Attributes:
+        base: Makes the environment from the keyword arguments of ``create``.
+        base_name: Name that wrappers receive.
+        wrappers: From the inside to the outside.
+        descriptor_extractor: Reads the descriptor of an episode, for QD tasks.
+        reward_offset: Added to each step's reward to keep QD scores positive.
+        robot: Row of the robot inside; ``None``: that of ``ROBOTS`` called
+            ``base_name``, if there is one.
+    """
+
+    base: Callable[..., Env]
+    base_name: str
+    wrappers: tuple[WrapperRow, ...] = ()
+    descriptor_extractor: Extractor | None = None
+    reward_offset: float | None = None
+    robot: Robot | None = None
+
+    @property
+    def feet(self) -> tuple[str, ...] | None:
+        """Links of the robot's feet; ``None`` where it has none."""
+        robot = self._robot
+        return robot.feet if robot is not None and robot.feet else None
+
+    @property
+    def torso(self) -> str | None:
+        """Link of the robot's torso; ``None`` where there is no robot."""
+        return None if self._robot is None else self._robot.torso
+
+    @property
+    def forward_reward(self) -> str | None:
+        """Metric that is the forward part of the reward; ``None``: there is none."""
+        return getattr(self.base, "forward_reward_name", None)
+
+    @property
+    def _robot(self) -> Robot | None:
+        return self.robot or ROBOTS.get(self.base_name)
+
+
+def _uni(base: Callable[..., Env], base_name: str, offset: float) -> EnvironmentRow:
+    """Returns the task of running forward, described by the feet's contacts."""
+    return EnvironmentRow(
+        base,
+        base_name,
+        wrappers=(WrapperRow(FeetContactWrapper),),
+        descriptor_extractor=get_feet_contact_proportion,
+        reward_offset=offset,
+    )
+
+
+def _position(
+    base: Callable[..., Env],
+    base_name: str,
+    offset: float,
+    limits: tuple[tuple[float, float], tuple[float, float]],
+    *wrappers: Callable[..., Env],
+) -> EnvironmentRow:
+    """Returns a task described by the last position within limits [m]."""
+    options = {"minval": limits[0], "maxval": limits[1]}
+    return EnvironmentRow(
+        base,
+        base_name,
+        wrappers=(
+            WrapperRow(XYPositionWrapper, options),
+            *(WrapperRow(wrapper) for wrapper in wrappers),
+        ),
+        descriptor_extractor=get_final_xy_position,
+        reward_offset=offset,
+    )
+
+
+_ANYWHERE = ((-30.0, -30.0), (30.0, 30.0))
+
+ROWS: dict[str, EnvironmentRow] = {
+    "ant": EnvironmentRow(Ant, "ant"),
+    "ant_uni": _uni(Ant, "ant", 3.24),
+    "ant_omni": _position(Ant, "ant", 3.0, _ANYWHERE, NoForwardRewardWrapper),
+    "antnotrap": _position(Ant, "ant", 3.38, ((0.0, -8.0), (70.0, 8.0))),
+    "halfcheetah": EnvironmentRow(HalfCheetah, "halfcheetah"),
+    "halfcheetah_uni": _uni(HalfCheetah, "halfcheetah", 9.231),
+    "hopper": EnvironmentRow(Hopper, "hopper"),
+    "hopper_uni": _uni(Hopper, "hopper", 0.9),
+    "walker2d": EnvironmentRow(Walker2d, "walker2d"),
+    "walker2d_uni": _uni(Walker2d, "walker2d", 1.413),
+    "pointmaze": EnvironmentRow(
+        PointMaze,
+        "pointmaze",
+        descriptor_extractor=get_final_xy_position,
+        reward_offset=2.3431,
+    ),
+}
