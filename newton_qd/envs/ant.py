@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from newton_qd.envs.base import PhysicsEnv, ordered_sum
+from newton_qd.envs.base import PhysicsEnv
 from newton_qd.envs.contacts import angular_changes, linear_changes
-from newton_qd.envs.vectors import length
+from newton_qd.envs.vectors import length, ordered_sum
 from newton_qd.physics.system import PhysicsState
 from newton_qd.robots import ANT
 from newton_qd.types import Action, Metrics

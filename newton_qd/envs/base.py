@@ -13,6 +13,7 @@ import numpy as np
 from jax.core import Tracer
 
 from newton_qd import physics
+from newton_qd.envs.vectors import ordered_sum as ordered_sum
 from newton_qd.errors import FaultError
 from newton_qd.physics.system import PhysicsState, System
 from newton_qd.robots import Robot
@@ -333,18 +334,6 @@ def select(condition: jax.Array, chosen: Tree, other: Tree) -> Tree:
         return jnp.where(condition.reshape(axes), a, b)
 
     return jax.tree.map(leaf, chosen, other)
-
-
-def ordered_sum(terms: jax.Array) -> jax.Array:
-    """Sums (n,) terms from the first to the last.
-
-    The order of ``jnp.sum`` depends on the batch; this one does not, so that one
-    world gives bitwise the same in any batch. For a few dozen terms.
-    """
-    total = terms[0]
-    for index in range(1, terms.shape[0]):
-        total = total + terms[index]
-    return total
 
 
 def check(state: State) -> None:
