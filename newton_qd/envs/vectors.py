@@ -34,9 +34,9 @@ def ordered_sum(terms: jax.Array) -> jax.Array:
 def length(vector: jax.Array) -> jax.Array:
     """Returns the norm of (n,), with gradient 0 instead of nan at 0."""
     square = ordered_sum(jnp.square(vector))
-    positive = square > 0
-    root = jnp.sqrt(jnp.where(positive, square, jnp.ones_like(square)))
-    return jnp.where(positive, root, jnp.zeros_like(root))
+    zero = square == 0  # not "is not above": a nan stays one
+    root = jnp.sqrt(jnp.where(zero, jnp.ones_like(square), square))
+    return jnp.where(zero, jnp.zeros_like(root), root)
 
 
 def cross(a: jax.Array, b: jax.Array) -> jax.Array:
