@@ -64,8 +64,9 @@ class Ant(PhysicsEnv):
         self._omit_xy = exclude_current_positions_from_observation
         super().__init__(ANT, reset_noise_scale=reset_noise_scale, dtype=dtype)
 
-    def _observe(self, state: PhysicsState) -> dict[str, jax.Array]:
+    def _observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
         """Returns the blocks of the observation."""
+        del action
         q, v = state.q, state.v
         blocks = {} if self._omit_xy else {"torso position x y [m]": q[:2]}
         blocks |= {

@@ -175,12 +175,15 @@ class PhysicsEnv(Env):
         rest = jax.eval_shape(self._rest)
         action = jax.ShapeDtypeStruct((system.nu,), self._dtype)
         self._layout: tuple[tuple[str, int], ...] = ()
-        jax.eval_shape(self._record_layout, rest)
+        jax.eval_shape(self._record_layout, rest, action)
         self._metrics = tuple(jax.eval_shape(self._outcome, rest, rest, action)[2])
 
     @abc.abstractmethod
-    def _observe(self, state: PhysicsState) -> dict[str, jax.Array]:
-        """Returns the named blocks (n,) of the observation, in order."""
+    def _observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
+        """Returns the named blocks (n,) of the observation, in order.
+
+        The action is the one that led to the state; zero after a reset.
+        """
 
     @abc.abstractmethod
     def _outcome(
@@ -223,14 +226,14 @@ class PhysicsEnv(Env):
         after, fault = physics.step(self.system, start, jnp.where(sound, action, nan))
         fault = jnp.maximum(state.info["fault"], fault)
         faulty = fault != 0
-        action = jnp.where(sound, action, jnp.zeros_like(action))
+        action = jnp.where(faulty, jnp.zeros_like(action), action)
         reward, done, metrics = self._outcome(start, after, action)
         reward, metrics = select(
             faulty, jax.tree.map(jnp.zeros_like, (reward, metrics)), (reward, metrics)
         )
         return state.replace(
             pipeline_state=after,
-            obs=self._observation(after),
+            obs=self._observation(after, action),
             reward=reward,
             done=jnp.where(faulty, jnp.ones_like(done), done),
             metrics={**state.metrics, **metrics},
@@ -273,22 +276,23 @@ class PhysicsEnv(Env):
         v = jnp.zeros((self.system.nv,), self._dtype)
         return physics.initial_state(self.system, q, v)
 
-    def _record_layout(self, state: PhysicsState) -> None:
+    def _record_layout(self, state: PhysicsState, action: Action) -> None:
         # not a result of eval_shape: it would sort the names
-        blocks = self._observe(state).items()
+        blocks = self._observe(state, action).items()
         self._layout = tuple((name, block.shape[0]) for name, block in blocks)
 
     def _noise(self, rng: RNGKey) -> jax.Array:
         shape, scale = self._joint_q.shape, self._noise_scale
         return jax.random.uniform(rng, shape, self._dtype, -scale, scale)
 
-    def _observation(self, state: PhysicsState) -> Observation:
-        return jnp.concatenate(list(self._observe(state).values()))
+    def _observation(self, state: PhysicsState, action: Action) -> Observation:
+        return jnp.concatenate(list(self._observe(state, action).values()))
 
     def _first_state(self, state: PhysicsState) -> State:
+        action = jnp.zeros((self.action_size,), self._dtype)
         return State(
             pipeline_state=state,
-            obs=self._observation(state),
+            obs=self._observation(state, action),
             reward=jnp.zeros((), self._dtype),
             done=jnp.zeros((), self._dtype),
             metrics={name: jnp.zeros((), self._dtype) for name in self._metrics},
