@@ -22,7 +22,7 @@ from newton_qd.assets import find_urdf
 from newton_qd.physics import reference
 from newton_qd.physics.model import build_system
 from newton_qd.physics.system import JointKind, System
-from newton_qd.robots import ANT, Robot
+from newton_qd.robots import ROBOTS, Robot
 
 STATES = 20
 TOLERANCE = {"float32": 1e-5, "float64": 1e-9}
@@ -111,10 +111,10 @@ def off_centre_row(path: Path) -> Robot:
     )
 
 
-@pytest.fixture(scope="module", params=["ant", "off_centre"])
+@pytest.fixture(scope="module", params=[*ROBOTS, "off_centre"])
 def robot(request: pytest.FixtureRequest, tmp_path_factory) -> Robot:
-    if request.param == "ant":
-        return ANT
+    if request.param in ROBOTS:
+        return ROBOTS[request.param]
     path = tmp_path_factory.mktemp("urdf") / "off_centre.urdf"
     path.write_text(OFF_CENTRE, encoding="utf-8")
     return off_centre_row(path)
