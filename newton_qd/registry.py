@@ -9,6 +9,7 @@ from typing import Any, Generic, TypeVar
 
 from newton_qd.envs.ant import Ant
 from newton_qd.envs.base import Env
+from newton_qd.envs.humanoid import Humanoid
 from newton_qd.errors import UnknownEnvironment
 from newton_qd.extractors import get_feet_contact_proportion
 from newton_qd.wrappers import (
@@ -65,6 +66,14 @@ _ROWS: dict[str, EnvironmentRow] = {
         wrappers=(WrapperRow(FeetContactWrapper),),
         descriptor_extractor=get_feet_contact_proportion,
         reward_offset=3.24,
+    ),
+    "humanoid": EnvironmentRow(Humanoid, "humanoid"),
+    "humanoid_uni": EnvironmentRow(
+        Humanoid,
+        "humanoid",
+        wrappers=(WrapperRow(FeetContactWrapper),),
+        descriptor_extractor=get_feet_contact_proportion,
+        reward_offset=0.0,
     ),
 }
 

@@ -50,7 +50,10 @@ def rows(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 def test_names() -> None:
-    assert newton_qd.registered_envs() == ("ant", "ant_uni")
+    assert newton_qd.registered_envs() == (
+        *("ant", "ant_uni"),
+        *("humanoid", "humanoid_uni"),
+    )
 
 
 def test_wrappers_are_stacked_in_order() -> None:
@@ -132,10 +135,13 @@ def test_float64_needs_x64() -> None:
 
 def test_tables_are_columns_of_the_rows() -> None:
     extractors = newton_qd.behavior_descriptor_extractor
-    assert dict(extractors) == {"ant_uni": get_feet_contact_proportion}
+    assert dict(extractors) == {
+        "ant_uni": get_feet_contact_proportion,
+        "humanoid_uni": get_feet_contact_proportion,
+    }
     assert newton_qd.descriptor_extractor is extractors
-    assert dict(newton_qd.reward_offset) == {"ant_uni": 3.24}
-    assert len(newton_qd.reward_offset) == 1 and "ant" not in newton_qd.reward_offset
+    assert dict(newton_qd.reward_offset) == {"ant_uni": 3.24, "humanoid_uni": 0.0}
+    assert len(newton_qd.reward_offset) == 2 and "ant" not in newton_qd.reward_offset
     assert "ant_uni" in repr(newton_qd.reward_offset)
     with pytest.raises(KeyError, match="'ant' has no reward_offset; known: ant_uni"):
         newton_qd.reward_offset["ant"]
