@@ -9,7 +9,7 @@ from typing import Any, Generic, TypeVar
 
 from newton_qd.envs.base import Env
 from newton_qd.errors import UnknownEnvironment
-from newton_qd.robots import ROBOTS, Robot
+from newton_qd.robots import Robot
 from newton_qd.tasks import ROWS as _ROWS
 from newton_qd.tasks import EnvironmentRow, Extractor, WrapperRow
 from newton_qd.wrappers import (

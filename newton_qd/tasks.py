@@ -13,6 +13,7 @@ from newton_qd.envs.ant import Ant
 from newton_qd.envs.base import Env
 from newton_qd.envs.halfcheetah import HalfCheetah
 from newton_qd.envs.hopper import Hopper
+from newton_qd.envs.humanoid import Humanoid
 from newton_qd.envs.pointmaze import PointMaze
 from newton_qd.envs.walker2d import Walker2d
 from newton_qd.extractors import get_feet_contact_proportion, get_final_xy_position
@@ -124,6 +125,11 @@ ROWS: dict[str, EnvironmentRow] = {
     "halfcheetah_uni": _uni(HalfCheetah, "halfcheetah", 9.231),
     "hopper": EnvironmentRow(Hopper, "hopper"),
     "hopper_uni": _uni(Hopper, "hopper", 0.9),
+    "humanoid": EnvironmentRow(Humanoid, "humanoid"),
+    "humanoid_uni": _uni(Humanoid, "humanoid", 0.0),
+    "humanoid_omni": _position(
+        Humanoid, "humanoid", 0.0, _ANYWHERE, NoForwardRewardWrapper
+    ),
     "walker2d": EnvironmentRow(Walker2d, "walker2d"),
     "walker2d_uni": _uni(Walker2d, "walker2d", 1.413),
     "pointmaze": EnvironmentRow(

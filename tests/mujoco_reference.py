@@ -2,7 +2,8 @@
 
 MuJoCo imports the URDF file by itself. Its free joint has the linear velocity of
 the root's origin in world axes, as ours, but the angular velocity in body axes, and
-quaternions are (w, x, y, z); joints are matched by name.
+quaternions are (w, x, y, z); joints are matched by name. Links without mass get the
+least that it takes.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ _COMPILER = (
     'balanceinertia="false" boundmass="0" boundinertia="0"/></mujoco>'
 )
 _ROOT_JOINT = "newton_qd_root"
-_SPECK = 1e-12  # of a link without mass, which MuJoCo refuses to move [kg, kg m^2]
+# MuJoCo refuses links without mass that move; this passes [kg and kg m^2].
+_LEAST = 1e-14
 
 
 class MujocoReference:
@@ -37,8 +39,9 @@ class MujocoReference:
             # MuJoCo welds the root link of a URDF file to the world.
             spec.body(system.body_names[0]).add_freejoint(name=_ROOT_JOINT)
         for name in np.array(system.body_names)[system.mass == 0]:
-            body = spec.body(name)
-            body.mass, body.inertia = _SPECK, [_SPECK] * 3
+            body = spec.body(str(name))
+            body.mass, body.inertia = _LEAST, np.full(3, _LEAST)
+            body.ipos, body.iquat = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
             body.explicitinertial = True
         spec.option.gravity = [0.0, 0.0, -system.robot.gravity]
         self.model = spec.compile()

@@ -138,7 +138,7 @@ def test_far_away_everything_is_as_near(name: str) -> None:
 class Lowered(PhysicsEnv):
     """Does nothing, on a rail whose axis points down."""
 
-    def _observe(self, state: PhysicsState) -> dict[str, jax.Array]:
+    def _observe(self, state: PhysicsState, action: jax.Array) -> dict[str, jax.Array]:
         return {"q": state.q}
 
     def _outcome(self, before: PhysicsState, after: PhysicsState, action: Any) -> Any:

@@ -4,6 +4,8 @@ from newton_qd.envs.ant import Ant
 from newton_qd.envs.base import Env, PhysicsEnv, QDEnv
 from newton_qd.envs.halfcheetah import HalfCheetah
 from newton_qd.envs.hopper import Hopper
+from newton_qd.envs.humanoid import Humanoid
+from newton_qd.envs.humanoid_trap import HumanoidTrap
 from newton_qd.envs.locomotion import Locomotion
 from newton_qd.envs.pointmaze import PointMaze
 from newton_qd.envs.state import State, check
@@ -14,6 +16,8 @@ __all__ = [
     "Env",
     "HalfCheetah",
     "Hopper",
+    "Humanoid",
+    "HumanoidTrap",
     "Locomotion",
     "PhysicsEnv",
     "PointMaze",

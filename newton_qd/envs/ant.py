@@ -6,8 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from newton_qd.envs.base import PhysicsEnv, ordered_sum, safe_norm
-from newton_qd.physics.system import PhysicsState, System
+from newton_qd.envs.base import PhysicsEnv
+from newton_qd.envs.contacts import angular_changes, linear_changes
+from newton_qd.envs.vectors import length, ordered_sum
+from newton_qd.physics.system import PhysicsState
 from newton_qd.robots import ANT
 from newton_qd.types import Action, Metrics
 
@@ -64,8 +66,9 @@ class Ant(PhysicsEnv):
         self._omit_xy = exclude_current_positions_from_observation
         super().__init__(ANT, reset_noise_scale=reset_noise_scale, dtype=dtype)
 
-    def _observe(self, state: PhysicsState) -> dict[str, jax.Array]:
+    def _observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
         """Returns the blocks of the observation."""
+        del action
         q, v = state.q, state.v
         blocks = {} if self._omit_xy else {"torso position x y [m]": q[:2]}
         blocks |= {
@@ -77,12 +80,19 @@ class Ant(PhysicsEnv):
             "joint velocities [rad/s]": v[_ROOT_V:],
         }
         if self._use_contact_forces:
-            linear = _linear_changes(self.system, state)
-            angular = _angular_changes(self.system, state)
-            blocks["contact velocity changes, bodies and ground [m/s]"] = _rows(linear)
-            blocks["contact angular velocity changes, bodies and ground [rad/s]"] = (
-                _rows(angular)
+            bodies = np.arange(self.system.nb, dtype=np.int32)
+            linear = linear_changes(self.system, state, bodies)
+            angular = angular_changes(
+                self.system, state, bodies, "use_contact_forces=True"
             )
+            blocks |= {
+                "contact velocity changes, bodies and ground [m/s]": _rows(
+                    _clipped(linear)
+                ),
+                "contact angular velocity changes, bodies and ground [rad/s]": _rows(
+                    _clipped(angular)
+                ),
+            }
         return blocks
 
     def _outcome(
@@ -108,7 +118,7 @@ class Ant(PhysicsEnv):
             "reward_contact": -contact,
             "x_position": position[0],
             "y_position": position[1],
-            "distance_from_origin": safe_norm(position),
+            "distance_from_origin": length(position),
             "x_velocity": velocity[0],
             "y_velocity": velocity[1],
         }
@@ -118,35 +128,12 @@ class Ant(PhysicsEnv):
         """Returns the sum of squared contact velocity changes [m^2/s^2]."""
         # The other bodies cannot touch anything: their terms are zero.
         touching = np.unique(self.system.contact_body).astype(np.int32)
-        changes = _linear_changes(self.system, state)[touching]
+        changes = _clipped(linear_changes(self.system, state, touching))
         return ordered_sum(jnp.square(changes).reshape(-1))
 
 
-def _linear_changes(system: System, state: PhysicsState) -> jax.Array:
-    """Returns contact impulse over mass, clipped, (nb, 3) [m/s]."""
-    mass = np.asarray(system.mass, system.dtype)[:, None]
-    return jnp.clip(state.impulse[:, :3] / mass, -_CONTACT_CLIP, _CONTACT_CLIP)
-
-
-def _angular_changes(system: System, state: PhysicsState) -> jax.Array:
-    """Returns angular contact impulse over inertia, clipped, (nb, 3) [rad/s]."""
-    inertia = np.asarray(_isotropic_inertia(system), system.dtype)[:, None]
-    return jnp.clip(state.impulse[:, 3:] / inertia, -_CONTACT_CLIP, _CONTACT_CLIP)
-
-
-def _isotropic_inertia(system: System) -> np.ndarray:
-    """Returns the one moment of inertia (nb,) of each body [kg m^2]."""
-    moment = system.inertia[:, 0, 0]
-    excess = np.abs(system.inertia - moment[:, None, None] * np.eye(3))
-    refused = (excess.max(axis=(1, 2)) > 1e-6 * moment) | (moment <= 0)
-    if np.any(refused):
-        body = int(np.argmax(refused))
-        raise ValueError(
-            f"use_contact_forces=True: link {system.body_names[body]!r} of "
-            f"{system.robot.urdf!r} has the inertia {system.inertia[body].tolist()}; "
-            "allowed: False, or inertias that are positive and equal about every axis"
-        )
-    return moment
+def _clipped(changes: jax.Array) -> jax.Array:
+    return jnp.clip(changes, -_CONTACT_CLIP, _CONTACT_CLIP)
 
 
 def _rows(changes: jax.Array) -> jax.Array:

@@ -154,12 +154,15 @@ class PhysicsEnv(Env):
         rest = jax.eval_shape(self._rest)
         action = jax.ShapeDtypeStruct((system.nu,), self._dtype)
         self._layout: tuple[tuple[str, int], ...] = ()
-        jax.eval_shape(self._record_layout, rest)
+        jax.eval_shape(self._record_layout, rest, action)
         self._metrics = tuple(jax.eval_shape(self._outcome, rest, rest, action)[2])
 
     @abc.abstractmethod
-    def _observe(self, state: PhysicsState) -> dict[str, jax.Array]:
-        """Returns the named blocks (n,) of the observation, in order."""
+    def _observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
+        """Returns the named blocks (n,) of the observation, in order.
+
+        The action is the one that led to the state; zero after a reset.
+        """
 
     @abc.abstractmethod
     def _outcome(
@@ -205,7 +208,7 @@ class PhysicsEnv(Env):
         )
         return state.replace(
             pipeline_state=after,
-            obs=self._observation(after),
+            obs=self._observation(after, action),
             reward=reward,
             done=jnp.where(faulty, jnp.ones_like(done), done),
             metrics={**state.metrics, **metrics},
@@ -253,45 +256,26 @@ class PhysicsEnv(Env):
         v = jnp.zeros((self.system.nv,), self._dtype)
         return physics.initial_state(self.system, q, v)
 
-    def _record_layout(self, state: PhysicsState) -> None:
+    def _record_layout(self, state: PhysicsState, action: Action) -> None:
         # not a result of eval_shape: it would sort the names
-        blocks = self._observe(state).items()
+        blocks = self._observe(state, action).items()
         self._layout = tuple((name, block.shape[0]) for name, block in blocks)
 
     def _noise(self, rng: RNGKey) -> jax.Array:
         shape, scale = self._joint_q.shape, self._noise_scale
         return jax.random.uniform(rng, shape, self._dtype, -scale, scale)
 
-    def _observation(self, state: PhysicsState) -> Observation:
-        return jnp.concatenate(list(self._observe(state).values()))
+    def _observation(self, state: PhysicsState, action: Action) -> Observation:
+        return jnp.concatenate(list(self._observe(state, action).values()))
 
     def _first_state(self, state: PhysicsState) -> State:
+        action = jnp.zeros((self.action_size,), self._dtype)
         return State(
             pipeline_state=state,
-            obs=self._observation(state),
+            obs=self._observation(state, action),
             reward=jnp.zeros((), self._dtype),
             done=jnp.zeros((), self._dtype),
             metrics={name: jnp.zeros((), self._dtype) for name in self._metrics},
             info={"fault": jnp.zeros((), jnp.int32)},
             system=self.system,
         )
-
-
-def ordered_sum(terms: jax.Array) -> jax.Array:
-    """Sums (n,) terms from the first to the last.
-
-    The order of ``jnp.sum`` depends on the batch; this one does not, so that one
-    world gives bitwise the same in any batch. For a few dozen terms.
-    """
-    total = terms[0]
-    for index in range(1, terms.shape[0]):
-        total = total + terms[index]
-    return total
-
-
-def safe_norm(vector: jax.Array) -> jax.Array:
-    """Returns the length () of (n,), with gradient 0 instead of nan at 0."""
-    square = ordered_sum(jnp.square(vector))
-    positive = square > 0
-    root = jnp.sqrt(jnp.where(positive, square, jnp.ones_like(square)))
-    return jnp.where(positive, root, jnp.zeros_like(root))

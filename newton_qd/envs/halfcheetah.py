@@ -6,7 +6,8 @@ import jax
 import jax.numpy as jnp
 
 from newton_qd.envs import planar
-from newton_qd.envs.base import PhysicsEnv, ordered_sum
+from newton_qd.envs.base import PhysicsEnv
+from newton_qd.envs.vectors import ordered_sum
 from newton_qd.physics.system import PhysicsState
 from newton_qd.robots import HALFCHEETAH
 from newton_qd.types import Action, Metrics
@@ -46,8 +47,9 @@ class HalfCheetah(PhysicsEnv):
         self._omit_x = exclude_current_positions_from_observation
         super().__init__(HALFCHEETAH, reset_noise_scale=reset_noise_scale, dtype=dtype)
 
-    def _observe(self, state: PhysicsState) -> dict[str, jax.Array]:
+    def _observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
         """Returns the blocks of the observation."""
+        del action
         half = state.q[planar.PITCH] / 2
         turned = jnp.stack([jnp.cos(half), jnp.sin(half)])
         orientation = {"torso orientation w y": turned}

@@ -5,7 +5,8 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from newton_qd.envs.base import PhysicsEnv, ordered_sum
+from newton_qd.envs.base import PhysicsEnv
+from newton_qd.envs.vectors import ordered_sum
 from newton_qd.physics.system import JointKind, PhysicsState
 from newton_qd.robots import Robot
 from newton_qd.types import Action, Metrics
@@ -66,8 +67,9 @@ class Locomotion(PhysicsEnv):
                 "allowed: a robot whose root link moves freely"
             )
 
-    def _observe(self, state: PhysicsState) -> dict[str, jax.Array]:
+    def _observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
         """Returns the blocks of the observation."""
+        del action
         q, v = state.q, state.v
         return {
             "root height [m]": q[2:3],

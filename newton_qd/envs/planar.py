@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from newton_qd.envs.base import ordered_sum
+from newton_qd.envs.vectors import ordered_sum
 from newton_qd.physics.system import PhysicsState
 from newton_qd.types import Action, Metrics
 

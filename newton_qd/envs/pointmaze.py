@@ -8,9 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from newton_qd.envs.base import QDEnv, safe_norm
+from newton_qd.envs.base import QDEnv
 from newton_qd.envs.inputs import checked_action, refuse_params, require_precision
 from newton_qd.envs.state import State
+from newton_qd.envs.vectors import length
 from newton_qd.types import Action, Params, RNGKey
 
 _WALL_THICKNESS = 0.01
@@ -117,7 +118,7 @@ class PointMaze(QDEnv):
         )
         position = jnp.where(sound, moved, frozen)
         one, zero = jnp.ones((), self._dtype), jnp.zeros((), self._dtype)
-        reward = -safe_norm(position - self._array(self._goal))
+        reward = -length(position - self._array(self._goal))
         return state.replace(
             obs=position,
             reward=jnp.where(sound, reward, zero),

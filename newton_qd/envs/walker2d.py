@@ -61,8 +61,9 @@ class Walker2d(PhysicsEnv):
         self._omit_x = exclude_current_positions_from_observation
         super().__init__(WALKER2D, reset_noise_scale=reset_noise_scale, dtype=dtype)
 
-    def _observe(self, state: PhysicsState) -> dict[str, jax.Array]:
+    def _observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
         """Returns the blocks of the observation."""
+        del action
         pitch = planar.euler_pitch(state.q[planar.PITCH])
         orientation = {"torso pitch [rad]": pitch[None]}
         return planar.blocks(state, orientation, omit_x=self._omit_x)

@@ -1,0 +1,71 @@
+"""Velocity changes by contact, as observations and costs read them."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+
+from newton_qd.physics.system import PhysicsState, System
+
+
+def linear_changes(
+    system: System, state: PhysicsState, bodies: np.ndarray
+) -> jax.Array:
+    """Contact impulse over mass, friction included.
+
+    Args:
+        system: The system.
+        state: State after the control step; zero after a reset.
+        bodies: (n,) bodies with mass.
+
+    Returns:
+        (n, 3) world axes [m/s].
+    """
+    mass = np.asarray(system.mass[bodies], system.dtype)[:, None]
+    return state.impulse[bodies, :3] / mass
+
+
+def angular_changes(
+    system: System, state: PhysicsState, bodies: np.ndarray, reader: str
+) -> jax.Array:
+    """Angular contact impulse about the centre of mass over inertia.
+
+    Args:
+        system: The system.
+        state: State after the control step; zero after a reset.
+        bodies: (n,) bodies with mass.
+        reader: What reads the changes, for the error.
+
+    Returns:
+        (n, 3) world axes [rad/s].
+
+    Raises:
+        ValueError: An inertia is not the same about every axis.
+    """
+    inertia = isotropic_inertia(system, bodies, reader)
+    return state.impulse[bodies, 3:] / np.asarray(inertia, system.dtype)[:, None]
+
+
+def isotropic_inertia(system: System, bodies: np.ndarray, reader: str) -> np.ndarray:
+    """Returns the one moment of inertia (n,) of each body [kg m^2].
+
+    Args:
+        system: The system.
+        bodies: (n,) bodies with mass.
+        reader: What reads the moments, for the error.
+
+    Raises:
+        ValueError: An inertia is not the same about every axis.
+    """
+    inertia = system.inertia[bodies]
+    moment = inertia[:, 0, 0]
+    excess = np.abs(inertia - moment[:, None, None] * np.eye(3))
+    refused = (excess.max(axis=(1, 2)) > 1e-6 * moment) | (moment <= 0)
+    if np.any(refused):
+        index = int(np.argmax(refused))
+        name = system.body_names[bodies[index]]
+        raise ValueError(
+            f"{reader}: link {name!r} of {system.robot.urdf!r} has the inertia "
+            f"{inertia[index].tolist()}; allowed: positive and equal about every axis"
+        )
+    return moment

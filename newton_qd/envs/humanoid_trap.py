@@ -1,0 +1,106 @@
+"""Humanoid as the trap task knows it: other inertias, costs and contacts."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from newton_qd.envs.contacts import angular_changes, linear_changes
+from newton_qd.envs.humanoid import Humanoid
+from newton_qd.envs.vectors import rounded
+from newton_qd.physics.system import PhysicsState
+from newton_qd.types import Action, Metrics
+
+
+class HumanoidTrap(Humanoid):
+    """The humanoid with its contacts in the observation and a cheaper control.
+
+    The robot is the humanoid. Its observation ends with contact velocity changes of
+    every body and of the scene, unclipped. The walls are not here: a scene brings
+    them, and the names of its bodies go into ``scene_bodies``.
+    """
+
+    scene_bodies: tuple[str, ...] = ("floor",)
+    """Bodies of the scene, which never move: a row of zeros each."""
+
+    def __init__(
+        self,
+        *,
+        forward_reward_weight: float = 1.25,
+        ctrl_cost_weight: float = 0.01,
+        healthy_reward: float = 5.0,
+        terminate_when_unhealthy: bool = True,
+        healthy_z_range: tuple[float, float] = (0.8, 2.1),
+        reset_noise_scale: float = 1e-2,
+        exclude_current_positions_from_observation: bool = True,
+        dtype: str = "float32",
+    ) -> None:
+        """Loads the humanoid.
+
+        Args:
+            forward_reward_weight: As for the humanoid, and so are the others.
+            ctrl_cost_weight: Cost of the sum of squared actions [-].
+            healthy_reward: Bonus of a step [-].
+            terminate_when_unhealthy: Whether an unhealthy torso ends the episode.
+            healthy_z_range: Lowest and highest healthy height of the torso [m].
+            reset_noise_scale: Half width of the noise on joint angles [rad] and
+                joint velocities [rad/s] at a reset.
+            exclude_current_positions_from_observation: Whether the observation
+                omits x and y of the torso.
+            dtype: ``"float32"``, or ``"float64"`` with JAX x64 on.
+        """
+        super().__init__(
+            forward_reward_weight=forward_reward_weight,
+            ctrl_cost_weight=ctrl_cost_weight,
+            healthy_reward=healthy_reward,
+            terminate_when_unhealthy=terminate_when_unhealthy,
+            healthy_z_range=healthy_z_range,
+            reset_noise_scale=reset_noise_scale,
+            exclude_current_positions_from_observation=(
+                exclude_current_positions_from_observation
+            ),
+            dtype=dtype,
+        )
+
+    @property
+    def name(self) -> str:
+        """Name of the robot in this task."""
+        return "humanoid_w_trap"
+
+    def _observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
+        """Returns the blocks of the observation."""
+        bodies = self._bodies
+        linear = linear_changes(self.system, state, bodies)
+        angular = angular_changes(self.system, state, bodies, "contact changes")
+        return super()._observe(state, action) | {
+            "contact velocity changes, bodies and scene [m/s]": self._rows(linear),
+            "contact angular velocity changes, bodies and scene [rad/s]": self._rows(
+                angular
+            ),
+        }
+
+    def _rows(self, changes: jax.Array) -> jax.Array:
+        """Returns the rows of the bodies (n, 3) and of the scene's bodies, flat."""
+        scene = jnp.zeros((len(self.scene_bodies), 3), changes.dtype)
+        return jnp.concatenate([changes, scene]).reshape(-1)
+
+    def _inertia_about_centre(
+        self, mass: jax.Array, arm: jax.Array, square: jax.Array
+    ) -> jax.Array:
+        """Returns inertias about the robot's centre of mass (n, 3, 3) [kg m^2]."""
+        products = mass[:, :, None] * arm[:, :, None] * arm[:, None, :]
+        return self._rotational(mass * square) - rounded(products)
+
+    def _outcome(
+        self, before: PhysicsState, after: PhysicsState, action: Action
+    ) -> tuple[jax.Array, jax.Array, Metrics]:
+        """Returns reward, done and metrics of a step."""
+        reward, done, found = super()._outcome(before, after, action)
+        metrics = {
+            "reward_linvel": found["reward_linvel"],
+            # a cost, with its sign as in the original
+            "reward_quadctrl": -found["reward_quadctrl"],
+            "reward_alive": found["reward_alive"],
+            "reward_impact": jnp.zeros_like(reward),
+        }
+        return reward, done, metrics
