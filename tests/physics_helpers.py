@@ -77,6 +77,54 @@ def batched_step(system: System) -> Callable[..., tuple[jax.Array, ...]]:
     return jax.jit(jax.vmap(one_step(system)))
 
 
+_DIFFERENCE = 1e-6  # step of the central differences
+
+
+@functools.cache
+def functional(system: System, steps: int) -> Callable[..., jax.Array]:
+    """A random linear functional of everything that some control steps return."""
+    rng = np.random.default_rng(1)
+    shapes = ((system.nq,), (system.nv,), (system.nb, 6), (system.nb,))
+    weights = [rng.normal(size=shape) for shape in shapes]
+    step = one_step(system)
+
+    def value(q: jax.Array, v: jax.Array, control: jax.Array) -> jax.Array:
+        def advance(state: Any, _: None) -> Any:
+            *state, impulse, normal, _fault = step(*state, control)
+            return tuple(state), (impulse, normal)
+
+        state, outputs = jax.lax.scan(advance, (q, v), None, length=steps)
+        results = (*state, *(x.sum(axis=0) for x in outputs))
+        terms = [(w * x).sum() for w, x in zip(weights, results, strict=True)]
+        return jnp.stack(terms).sum()
+
+    return value
+
+
+def directional_errors(
+    value: Callable[..., jax.Array],
+    inputs: tuple[np.ndarray, ...],
+    distance: float = _DIFFERENCE,
+) -> np.ndarray:
+    """Errors (inputs, worlds) in units of |gradient| |direction|."""
+    rng = np.random.default_rng(2)
+    several = jax.jit(jax.vmap(value))
+    arguments = tuple(range(len(inputs)))
+    gradients = jax.jit(jax.vmap(jax.grad(value, argnums=arguments)))(*inputs)
+    errors = []
+    for i, gradient in enumerate(gradients):
+        direction = rng.normal(size=inputs[i].shape)
+        ahead, behind = (
+            several(*inputs[:i], inputs[i] + step * direction, *inputs[i + 1 :])
+            for step in (distance, -distance)
+        )
+        difference = np.asarray(ahead - behind) / (2 * distance)
+        exact = (np.asarray(gradient) * direction).sum(axis=1)
+        size = np.linalg.norm(gradient, axis=1) * np.linalg.norm(direction, axis=1)
+        errors.append(np.abs(difference - exact) / size)
+    return np.array(errors)
+
+
 @functools.cache
 def rollout(system: System) -> Callable[..., PhysicsState]:
     """A jitted rollout of one world: states (steps, ...) under controls (steps, nu)."""
@@ -131,6 +179,20 @@ def order(steps: np.ndarray, errors: np.ndarray) -> float:
     return float(np.polyfit(np.log(steps), np.log(errors), 1)[0])
 
 
+POINTS = 4097  # of a line along which smoothness is measured
+_STRIDES = np.array([1, 2, 4, 8])
+
+
+def growth(values: np.ndarray) -> float:
+    """Order in which second differences (points, ...) along a line shrink."""
+    largest = []
+    for stride in _STRIDES:
+        ahead, here, behind = values[2 * stride :], values[stride:-stride], values
+        second = ahead - 2 * here + behind[: len(ahead)]
+        largest.append(np.abs(second).max())
+    return order(_STRIDES, np.array(largest))
+
+
 def penetration(gap: Any, width: float) -> np.ndarray:
     """The smooth max(-gap, 0) of the contact law, design in docs/physics.md."""
     u = np.clip(width - gap, 0.0, None)
@@ -173,6 +235,7 @@ def box_system(folder: Path, angle: float, **material: Any) -> System:
         contact_body=np.zeros(4, np.int32),
         contact_obstacle=np.zeros(4, np.int32),
         contact_position=np.array(corners),
+        contact_segment=np.zeros((4, 3)),
         contact_radius=np.full(4, _RADIUS),
         obstacle_frame=np.concatenate([np.zeros(3), tilt])[None],
     )

@@ -86,6 +86,7 @@ def test_sphere_rests_on_capsule(x64: None, tmp_path: Path) -> None:
         contact_body=np.zeros(1, np.int32),
         contact_obstacle=np.zeros(1, np.int32),
         contact_position=np.zeros((1, 3)),
+        contact_segment=np.zeros((1, 3)),
         contact_radius=np.array([0.1]),
         obstacle_kind=np.array([ObstacleKind.CAPSULE], np.int32),
         obstacle_frame=np.concatenate([[0.2, 0.0, 0.3], lying])[None],

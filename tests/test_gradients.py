@@ -10,7 +10,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from physics_helpers import batched_step, one_step, random_states, report
+from physics_helpers import (
+    batched_step,
+    directional_errors,
+    functional,
+    one_step,
+    random_states,
+    report,
+)
 
 import newton_qd
 from newton_qd import physics
@@ -20,56 +27,10 @@ from newton_qd.physics.system import System
 from newton_qd.robots import ANT
 
 WORLDS = 100
-DIFFERENCE = 1e-6  # step of the central differences
 
 
 def ant(dtype: str = "float64") -> System:
     return physics.load_system(ANT, dtype)
-
-
-@functools.cache
-def functional(system: System, steps: int) -> Callable[..., jax.Array]:
-    """A random linear functional of everything that some control steps return."""
-    rng = np.random.default_rng(1)
-    shapes = ((system.nq,), (system.nv,), (system.nb, 6), (system.nb,))
-    weights = [rng.normal(size=shape) for shape in shapes]
-    step = one_step(system)
-
-    def value(q: jax.Array, v: jax.Array, control: jax.Array) -> jax.Array:
-        def advance(state: Any, _: None) -> Any:
-            *state, impulse, normal, _fault = step(*state, control)
-            return tuple(state), (impulse, normal)
-
-        state, outputs = jax.lax.scan(advance, (q, v), None, length=steps)
-        results = (*state, *(x.sum(axis=0) for x in outputs))
-        terms = [(w * x).sum() for w, x in zip(weights, results, strict=True)]
-        return jnp.stack(terms).sum()
-
-    return value
-
-
-def directional_errors(
-    value: Callable[..., jax.Array],
-    inputs: tuple[np.ndarray, ...],
-    distance: float = DIFFERENCE,
-) -> np.ndarray:
-    """Errors (inputs, worlds) in units of |gradient| |direction|."""
-    rng = np.random.default_rng(2)
-    several = jax.jit(jax.vmap(value))
-    arguments = tuple(range(len(inputs)))
-    gradients = jax.jit(jax.vmap(jax.grad(value, argnums=arguments)))(*inputs)
-    errors = []
-    for i, gradient in enumerate(gradients):
-        direction = rng.normal(size=inputs[i].shape)
-        ahead, behind = (
-            several(*inputs[:i], inputs[i] + step * direction, *inputs[i + 1 :])
-            for step in (distance, -distance)
-        )
-        difference = np.asarray(ahead - behind) / (2 * distance)
-        exact = (np.asarray(gradient) * direction).sum(axis=1)
-        size = np.linalg.norm(gradient, axis=1) * np.linalg.norm(direction, axis=1)
-        errors.append(np.abs(difference - exact) / size)
-    return np.array(errors)
 
 
 @pytest.mark.parametrize(("steps", "bound"), [(1, 1e-6), (16, 1e-4)])

@@ -17,9 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from physics_helpers import (
+    POINTS,
     batched_step,
+    growth,
     one_step,
-    order,
     random_states,
     report,
     rollout,
@@ -57,19 +58,6 @@ def assert_bitwise(ours: States, theirs: States) -> None:
 
 
 # Smoothness
-
-POINTS = 4097
-STRIDES = np.array([1, 2, 4, 8])
-
-
-def growth(values: np.ndarray) -> float:
-    """Order in which second differences (points, ...) along a line shrink."""
-    largest = []
-    for stride in STRIDES:
-        ahead, here, behind = values[2 * stride :], values[stride:-stride], values
-        second = ahead - 2 * here + behind[: len(ahead)]
-        largest.append(np.abs(second).max())
-    return order(STRIDES, np.array(largest))
 
 
 def test_growth_tells_smooth_from_kinked() -> None:

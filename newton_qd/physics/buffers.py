@@ -125,6 +125,7 @@ def _put_contacts(put: Any, system: System, tree: Tree) -> None:
     put("contact_start", tree.contact)
     put("contact_body", system.contact_body + 1)
     put("contact_position", system.contact_position)
+    put("contact_segment", system.contact_segment)
     put("contact_radius", system.contact_radius)
     put("contact_obstacle", system.contact_obstacle)
     put("obstacle_kind", system.obstacle_kind)

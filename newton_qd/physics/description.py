@@ -164,7 +164,8 @@ def _read_inertial(
     return float(mass), frame[:3], rotation @ inertia @ rotation.T
 
 
-def _read_link(reader: XmlReader, element: ElementTree.Element) -> Link:
+def read_link(reader: XmlReader, element: ElementTree.Element) -> Link:
+    """Reads a link: its inertia and its colliders."""
     name = reader.text(element, "name")
     mass, com, inertia = _read_inertial(reader, element)
     for visual in element.findall("visual"):
@@ -227,7 +228,8 @@ def _read_joint(reader: XmlReader, element: ElementTree.Element) -> Joint:
     )
 
 
-def _by_name(reader: XmlReader, tag: str) -> dict[str, ElementTree.Element]:
+def by_name(reader: XmlReader, tag: str) -> dict[str, ElementTree.Element]:
+    """Returns the elements of a tag by their names, each given once."""
     found: dict[str, ElementTree.Element] = {}
     for element in reader.root.findall(tag):
         name = reader.text(element, "name")
@@ -239,11 +241,11 @@ def _by_name(reader: XmlReader, tag: str) -> dict[str, ElementTree.Element]:
     return found
 
 
-def _read_joints(reader: XmlReader, links: dict[str, Link]) -> dict[str, list[Joint]]:
+def read_joints(reader: XmlReader, links: dict[str, Link]) -> dict[str, list[Joint]]:
     """Returns the joints by parent link, having checked that they name links."""
     children: dict[str, list[Joint]] = {name: [] for name in links}
     moved: set[str] = set()
-    for element in _by_name(reader, "joint").values():
+    for element in by_name(reader, "joint").values():
         joint = _read_joint(reader, element)
         for role, link in (("parent", joint.parent), ("child", joint.child)):
             if link not in links:
@@ -257,9 +259,10 @@ def _read_joints(reader: XmlReader, links: dict[str, Link]) -> dict[str, list[Jo
     return children
 
 
-def _find_root(
+def find_root(
     reader: XmlReader, links: dict[str, Link], children: dict[str, list[Joint]]
 ) -> str:
+    """Returns the link without a parent, having checked that there is one tree."""
     moved = {joint.child for joints in children.values() for joint in joints}
     roots = [name for name in links if name not in moved]
     if len(roots) != 1:
@@ -335,12 +338,12 @@ def read_description(path: Path) -> Description:
     reader = XmlReader(path)
     if reader.root.tag != "robot":
         raise reader.error(reader.root, "allowed as the outermost element: <robot>")
-    elements = _by_name(reader, "link")
+    elements = by_name(reader, "link")
     if not elements:
         raise reader.error(reader.root, "element <link> is missing")
-    links = {name: _read_link(reader, element) for name, element in elements.items()}
-    children = _read_joints(reader, links)
-    root = links[_find_root(reader, links, children)]
+    links = {name: read_link(reader, element) for name, element in elements.items()}
+    children = read_joints(reader, links)
+    root = links[find_root(reader, links, children)]
     floating = root.name != WORLD
     bodies: dict[str, Body] = {}
 

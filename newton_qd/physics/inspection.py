@@ -117,7 +117,7 @@ def bias_forces(system: System, q: jax.Array, v: jax.Array) -> jax.Array:
 
 
 def lowest_contact(system: System, q: jax.Array) -> jax.Array:
-    """Height of the lowest point of all contact spheres [m].
+    """Height of the lowest point of all spheres that touch the ground [m].
 
     Args:
         system: The system.
@@ -128,7 +128,8 @@ def lowest_contact(system: System, q: jax.Array) -> jax.Array:
     """
     still = jnp.zeros((system.nv,), q.dtype)
     kinematics = forward_kinematics(system, q, still)
-    bodies = system.contact_body
-    local = jnp.asarray(system.contact_position, q.dtype)
+    ground = system.ground_contacts
+    bodies = system.contact_body[ground]
+    local = jnp.asarray(system.contact_position[ground], q.dtype)
     centre = kinematics.position[bodies] + _rotate(kinematics.rotation[bodies], local)
-    return jnp.min(centre[:, 2] - jnp.asarray(system.contact_radius, q.dtype))
+    return jnp.min(centre[:, 2] - jnp.asarray(system.contact_radius[ground], q.dtype))

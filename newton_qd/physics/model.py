@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import jax
@@ -25,10 +26,17 @@ from newton_qd.physics.description import (
 )
 from newton_qd.physics.rest import rest_coordinates
 from newton_qd.physics.row import check_row, index_of
-from newton_qd.physics.system import JointKind, ObstacleKind, System
+from newton_qd.physics.scene import (
+    ContactRow,
+    obstacle_tables,
+    read_scene,
+    wall_contacts,
+)
+from newton_qd.physics.system import JointKind, System
 from newton_qd.physics.verify import BuiltModel, ModelMismatchError, verify
 from newton_qd.physics.xml_reader import IDENTITY, RobotDescriptionError
 from newton_qd.robots import Contact, Robot
+from newton_qd.scenes import Scene
 
 if TYPE_CHECKING:
     import newton
@@ -243,48 +251,48 @@ def _collider(robot: Robot, contact: Contact, body: Body) -> Shape:
     return found[0]
 
 
-def _contacts(
-    robot: Robot, bodies: list[Body], obstacles: int
-) -> dict[str, np.ndarray]:
-    """Pairs every contact sphere with every obstacle, sorted by body."""
-    rows = []
+def _ground_contacts(robot: Robot, bodies: list[Body]) -> Iterator[ContactRow]:
+    """Pairs the spheres of the robot's row with the ground."""
     for contact in robot.contacts:
         body = _body_of(robot, "contacts", contact.link, bodies)
         shape = _collider(robot, contact, bodies[body])
         centre, radius = _contact_sphere(shape, contact.end)
-        rows += [(body, row, centre, radius) for row in range(obstacles)]
-    rows.sort(key=lambda row: row[0])
+        yield ContactRow(body, 0, centre, np.zeros(3), radius)
+
+
+def _contacts(
+    robot: Robot, scene: Scene | None, bodies: list[Body], obstacles: int
+) -> dict[str, np.ndarray]:
+    """Returns the contact tables, sorted by body, the ground before the walls."""
+    rows = list(_ground_contacts(robot, bodies))
+    if scene is not None:
+        colliders = {
+            name: (i, tuple(shape for shape in body.shapes if shape.link == name))
+            for i, body in enumerate(bodies)
+            for name in body.links
+        }
+        rows += wall_contacts(robot, scene, obstacles, colliders)
+    rows.sort(key=lambda row: row.body)
     return {
-        "contact_body": np.array([row[0] for row in rows], dtype=np.int32),
-        "contact_obstacle": np.array([row[1] for row in rows], dtype=np.int32),
-        "contact_position": np.array([row[2] for row in rows]).reshape(-1, 3),
-        "contact_radius": np.array([row[3] for row in rows], dtype=np.float64),
+        "contact_body": np.array([row.body for row in rows], dtype=np.int32),
+        "contact_obstacle": np.array([row.obstacle for row in rows], dtype=np.int32),
+        "contact_position": np.array([row.position for row in rows]).reshape(-1, 3),
+        "contact_segment": np.array([row.segment for row in rows]).reshape(-1, 3),
+        "contact_radius": np.array([row.radius for row in rows], dtype=np.float64),
     }
 
 
-def _obstacles() -> dict[str, np.ndarray]:
-    """Returns the tables of what the robot may touch: the ground.
-
-    The walls of a scene become further rows here: capsules and boxes, with the
-    frames and sizes that :class:`System` documents.
-    """
-    return {
-        "obstacle_kind": np.array([ObstacleKind.PLANE], dtype=np.int32),
-        "obstacle_frame": IDENTITY[None].copy(),
-        "obstacle_size": np.zeros((1, 3)),
-    }
-
-
-def build_system(robot: Robot, dtype: str) -> System:
-    """Builds the immutable description of a robot on flat ground.
+def build_system(robot: Robot, dtype: str, scene: Scene | None = None) -> System:
+    """Builds the immutable description of a robot in a scene.
 
     Args:
         robot: The robot's row.
         dtype: ``"float32"`` or ``"float64"``: precision of the kernels.
+        scene: What stands on the flat ground; ``None``: nothing.
 
     Raises:
-        AssetNotFoundError: The row's URDF file does not exist.
-        RobotDescriptionError: The file or the row is not one that physics can run.
+        AssetNotFoundError: A row's URDF file does not exist.
+        RobotDescriptionError: A file or a row is not one that physics can run.
         ModelMismatchError: Newton's model differs from the file.
         ValueError: ``dtype`` is not allowed, or needs JAX's 64-bit mode.
     """
@@ -297,12 +305,14 @@ def build_system(robot: Robot, dtype: str) -> System:
     built = _read_newton(model, description)
     verify(built, description)
     bodies = [description.bodies[name] for name in built.body_names]
-    control, obstacles = _control(robot, built), _obstacles()
+    links = () if scene is None else read_scene(scene)
+    control, obstacles = _control(robot, built), obstacle_tables(links)
     total_mass = sum(body.link.mass for body in bodies)
     weight = total_mass * (robot.gravity or _EARTH_GRAVITY)
     material = robot.material
     system = System(
         robot=robot,
+        scene=scene,
         dtype=dtype,
         body_names=built.body_names,
         joint_names=built.joint_names,
@@ -320,8 +330,10 @@ def build_system(robot: Robot, dtype: str) -> System:
         **_body_arrays(bodies),
         **_dof_arrays(robot, built, bodies, control),
         **control,
-        **_contacts(robot, bodies, len(obstacles["obstacle_kind"])),
+        **_contacts(robot, scene, bodies, len(obstacles["obstacle_kind"])),
         **obstacles,
+        scene_links=tuple(link.name for link in links),
+        scene_frames=np.array([link.frame for link in links]).reshape(-1, 7),
     )
     return dataclasses.replace(system, rest_q=rest_coordinates(system))
 
@@ -337,21 +349,24 @@ def _check_dtype(dtype: str) -> None:
 
 
 @functools.cache
-def _cached_system(robot: Robot, dtype: str) -> System:
-    return build_system(robot, dtype)
+def _cached_system(robot: Robot, dtype: str, scene: Scene | None) -> System:
+    return build_system(robot, dtype, scene)
 
 
-def load_system(robot: Robot, dtype: str = "float32") -> System:
-    """Returns the system of a robot, built once per process and precision.
+def load_system(
+    robot: Robot, dtype: str = "float32", scene: Scene | None = None
+) -> System:
+    """Returns the system of a robot, built once per process, precision and scene.
 
     Args:
         robot: The robot's row.
         dtype: ``"float32"`` or ``"float64"``, which needs JAX's 64-bit mode.
+        scene: What stands on the flat ground; ``None``: nothing.
 
     Raises:
-        AssetNotFoundError: The row's URDF file does not exist.
-        RobotDescriptionError: The file or the row is not one that physics can run.
+        AssetNotFoundError: A row's URDF file does not exist.
+        RobotDescriptionError: A file or a row is not one that physics can run.
         ValueError: ``dtype`` is not allowed, or needs JAX's 64-bit mode.
     """
     _check_dtype(dtype)
-    return _cached_system(robot, dtype)
+    return _cached_system(robot, dtype, scene)

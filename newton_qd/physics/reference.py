@@ -143,14 +143,15 @@ def penetration(gap: float, width: float) -> float:
 
 
 def lowest_contact(system: System, q: np.ndarray) -> float:
-    """Returns the height of the lowest contact sphere's bottom over z = 0 [m]."""
+    """Returns the height over z = 0 of the lowest sphere against the ground [m]."""
     frames = body_frames(system, q)
+    ground = system.ground_contacts
     heights = [
         compose(frames[body], np.append(position, [0, 0, 0, 1.0]))[2] - radius
         for body, position, radius in zip(
-            system.contact_body,
-            system.contact_position,
-            system.contact_radius,
+            system.contact_body[ground],
+            system.contact_position[ground],
+            system.contact_radius[ground],
             strict=True,
         )
     ]

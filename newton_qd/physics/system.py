@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 from newton_qd.robots import Robot
+from newton_qd.scenes import Scene
 
 
 class JointKind(enum.IntEnum):
@@ -20,7 +21,7 @@ class JointKind(enum.IntEnum):
 
 
 class ObstacleKind(enum.IntEnum):
-    """Shapes that a robot's spheres may touch; the values are read by the kernels."""
+    """Shapes that a robot may touch; the values are read by the kernels."""
 
     PLANE = 0
     CAPSULE = 1
@@ -38,6 +39,7 @@ class System:
 
     Attributes:
         robot: The row that the system was built from.
+        scene: The row of what stands on the ground; ``None``: nothing.
         dtype: ``"float32"`` or ``"float64"``: precision of the kernels.
         body_names: (nb,) URDF link names.
         joint_names: (nb,) URDF joint names; the root's is the empty string when
@@ -63,8 +65,10 @@ class System:
         limit_stiffness: (nv,) [N m/rad or N/m]; 0 where there is no limit.
         control_dof: (nu,) degree of freedom that each action drives.
         gear: (nu,) generalized force of a unit action [N m or N].
-        contact_body: (nc,) body of each contact sphere, ascending.
+        contact_body: (nc,) body of each contact sphere or capsule, ascending.
         contact_position: (nc, 3) centre in the body frame [m].
+        contact_segment: (nc, 3) from the centre to an end of a capsule's axis in
+            the body frame [m]; zero for a sphere, and read for walls only.
         contact_radius: (nc,) [m].
         contact_obstacle: (nc,) row of the obstacle tables.
         obstacle_kind: (no,) see :class:`ObstacleKind`.
@@ -72,6 +76,8 @@ class System:
             axis are the local z axis.
         obstacle_size: (no, 3) capsule: radius, half length, 0; box: half
             extents [m]; plane: zeros.
+        scene_links: (ns,) names of the scene's links.
+        scene_frames: (ns, 7) their frames in the world.
         contact_stiffness: [N/m].
         feet: (nf,) body index of each foot.
         torso: Body index of the torso.
@@ -79,6 +85,7 @@ class System:
     """
 
     robot: Robot
+    scene: Scene | None
     dtype: str
     body_names: tuple[str, ...]
     joint_names: tuple[str, ...]
@@ -103,11 +110,14 @@ class System:
     gear: np.ndarray
     contact_body: np.ndarray
     contact_position: np.ndarray
+    contact_segment: np.ndarray
     contact_radius: np.ndarray
     contact_obstacle: np.ndarray
     obstacle_kind: np.ndarray
     obstacle_frame: np.ndarray
     obstacle_size: np.ndarray
+    scene_links: tuple[str, ...]
+    scene_frames: np.ndarray
     contact_stiffness: float
     feet: np.ndarray
     torso: int
@@ -118,6 +128,14 @@ class System:
             value = getattr(self, field.name)
             if isinstance(value, np.ndarray):
                 value.setflags(write=False)
+        for field in ("position", "segment", "radius", "obstacle"):
+            # the kernels read these tables without looking at their length
+            rows = len(getattr(self, f"contact_{field}"))
+            if rows != len(self.contact_body):
+                raise ValueError(
+                    f"contact_{field}: {rows} rows given; allowed: "
+                    f"{len(self.contact_body)}, as many as contact_body has"
+                )
 
     @property
     def nb(self) -> int:
@@ -138,6 +156,11 @@ class System:
     def nu(self) -> int:
         """Number of actions."""
         return len(self.gear)
+
+    @property
+    def ground_contacts(self) -> np.ndarray:
+        """Rows of the contact tables that touch the ground, obstacle 0."""
+        return np.flatnonzero(self.contact_obstacle == 0)
 
     @property
     def total_mass(self) -> float:

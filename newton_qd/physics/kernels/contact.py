@@ -1,4 +1,4 @@
-"""Contacts of one robot sphere with one obstacle, linearised for the three solves.
+"""Contacts of a robot with static obstacles, linearised for the three solves.
 
 The predictor solve takes the normal force as linear in the new velocity. Its normal
 impulse may turn negative when a body lifts off, and its friction weight belongs to
@@ -17,20 +17,18 @@ from .algebra import (
     cross,
     div,
     dot,
-    length,
     mul,
     neg,
-    normalize,
     rotate,
     rotate_back,
     rotation,
     sub,
     transform_point,
     translation,
-    vector,
 )
 from .memory import constant, load, store
-from .numbers import clamp, sqrt, uniform
+from .nearest import nearest_share, obstacle_distance, obstacle_normal
+from .numbers import sqrt, uniform
 from .smooth import gate, penetration
 from .structs import Model, Row, Scratch
 
@@ -39,28 +37,6 @@ DISSIPATION_WIDTH = wp.constant(scalar(0.25))
 CLIP_WIDTH = wp.constant(scalar(0.5))
 # Steps of Newton's method for a friction weight: from its bound, 3 % off at most.
 WEIGHT_STEPS = wp.constant(2)
-
-
-@wp.func
-def obstacle_normal(m: Model, o: int, at: vec3):
-    """Outward unit normal at the obstacle point nearest to ``at`` (obstacle frame)."""
-    n = vector(real(), real(), uniform(scalar(1.0)))
-    if load(m.obstacle_kind, o) == 1:
-        half = component(constant(m.obstacle_size, o), 1)
-        nearest = vector(real(), real(), clamp(component(at, 2), neg(half), half))
-        n = normalize(at - nearest)
-    return n
-
-
-@wp.func
-def obstacle_distance(m: Model, o: int, at: vec3):
-    """Signed distance of ``at`` (obstacle frame) from the obstacle's surface [m]."""
-    d = component(at, 2)
-    if load(m.obstacle_kind, o) == 1:
-        half = component(constant(m.obstacle_size, o), 1)
-        nearest = vector(real(), real(), clamp(component(at, 2), neg(half), half))
-        d = length(at - nearest) - component(constant(m.obstacle_size, o), 0)
-    return d
 
 
 @stage
@@ -74,11 +50,16 @@ def contact_predictor(m: Model, sc: Scratch, row: Row, c: int):
     frame = constant(m.obstacle_frame, o)
     turn = rotation(frame)
     world = translation(load(sc.pose, row.body))
-    from_obstacle = center - world - translation(frame)
-    at = rotate_back(turn, from_obstacle)
-    normal = rotate(turn, obstacle_normal(m, o, at))
+    at = rotate_back(turn, center - world - translation(frame))
+    if load(m.obstacle_kind, o) == 1:
+        half = rotate(rotation(x), constant(m.contact_segment, c))
+        along = rotate_back(turn, half)
+        share = nearest_share(m, c, o, at, along)
+        center = center + share * half
+        at = at + share * along
     radius = constant(m.contact_radius, c)
     gap = obstacle_distance(m, o, at) - radius
+    normal = rotate(turn, obstacle_normal(m, o, at))
     r = center - radius * normal
     vc = load(sc.twist_v, row.body + i) + cross(load(sc.twist_w, row.body + i), r)
     vn = dot(normal, vc)

@@ -61,6 +61,7 @@ class Model:
     contact_start: wp.array[int]  # (nb + 2)
     contact_body: wp.array[int]
     contact_position: wp.array[_vec3]
+    contact_segment: wp.array[_vec3]
     contact_radius: wp.array[scalar]
     contact_obstacle: wp.array[int]
     obstacle_kind: wp.array[int]

@@ -1,0 +1,178 @@
+"""Reads the static obstacles of a scene, and finds what collides with them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+
+import numpy as np
+
+from newton_qd.assets import find_urdf
+from newton_qd.physics import reference
+from newton_qd.physics.description import (
+    WORLD,
+    Link,
+    Shape,
+    by_name,
+    find_root,
+    read_joints,
+    read_link,
+)
+from newton_qd.physics.system import ObstacleKind
+from newton_qd.physics.xml_reader import IDENTITY, RobotDescriptionError, XmlReader
+from newton_qd.robots import Robot
+from newton_qd.scenes import Scene
+
+_KINDS = {
+    "sphere": ObstacleKind.CAPSULE,
+    "capsule": ObstacleKind.CAPSULE,
+    "box": ObstacleKind.BOX,
+}
+# Colliders of a robot that may touch an obstacle.
+_TOUCHING = ("sphere", "capsule")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SceneLink:
+    """A link that never moves: its ``frame`` (7,) and its colliders in the world."""
+
+    name: str
+    frame: np.ndarray
+    shapes: tuple[Shape, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class ContactRow:
+    """One contact: a sphere or capsule of a body, and an obstacle.
+
+    Attributes:
+        body: Body of the robot.
+        obstacle: Row of the obstacle tables.
+        position: (3,) centre in the body frame [m].
+        segment: (3,) from the centre to an end of a capsule's axis, body frame [m].
+        radius: [m].
+    """
+
+    body: int
+    obstacle: int
+    position: np.ndarray
+    segment: np.ndarray
+    radius: float
+
+
+def read_scene(scene: Scene) -> tuple[SceneLink, ...]:
+    """Reads the links of a scene, in the order of its file.
+
+    A root link called ``world`` stands for the world and is left out.
+
+    Raises:
+        AssetNotFoundError: The URDF file does not exist.
+        RobotDescriptionError: The file is malformed, something in it moves or has
+            mass, or a collider is of a kind that contacts do not have.
+    """
+    if not isinstance(scene, Scene):
+        raise TypeError(
+            f"scene={scene!r}: allowed: None, or a Scene such as newton_qd.scenes.TRAP"
+        )
+    reader = XmlReader(find_urdf(scene.urdf))
+    if reader.root.tag != "robot":
+        raise reader.error(reader.root, "allowed as the outermost element: <robot>")
+    elements = by_name(reader, "link")
+    if not elements:
+        raise reader.error(reader.root, "element <link> is missing")
+    links = {name: read_link(reader, element) for name, element in elements.items()}
+    for name, link in links.items():
+        if (name == WORLD and link.shapes) or link.mass > 0:
+            what = "a mass" if link.mass > 0 else "a collider"
+            raise reader.error(elements[name], f"has {what}; allowed in a scene: none")
+        for shape in link.shapes:
+            if shape.kind not in _KINDS:
+                raise reader.error(
+                    elements[name],
+                    f"has a {shape.kind} as collider; allowed: {', '.join(_KINDS)}",
+                )
+    frames = _link_frames(reader, links)
+    return tuple(
+        SceneLink(name, frames[name], _placed(links[name], frames[name]))
+        for name in links
+        if name != WORLD
+    )
+
+
+def _link_frames(reader: XmlReader, links: dict[str, Link]) -> dict[str, np.ndarray]:
+    """Returns the frame (7,) of every link in the world."""
+    children = read_joints(reader, links)
+    root = find_root(reader, links, children)
+    frames = {root: IDENTITY}
+    pending = [root]
+    for parent in pending:
+        for joint in children[parent]:
+            if joint.kind != "fixed":
+                raise RobotDescriptionError(
+                    f"{reader.path}: joint {joint.name!r} is {joint.kind}; allowed in "
+                    "a scene: fixed"
+                )
+            frames[joint.child] = reference.compose(frames[parent], joint.frame)
+            pending.append(joint.child)
+    return frames
+
+
+def _placed(link: Link, frame: np.ndarray) -> tuple[Shape, ...]:
+    return tuple(
+        dataclasses.replace(shape, frame=reference.compose(frame, shape.frame))
+        for shape in link.shapes
+    )
+
+
+def obstacle_tables(links: tuple[SceneLink, ...]) -> dict[str, np.ndarray]:
+    """Returns the tables of what a robot may touch: the ground, then the walls."""
+    shapes = [shape for link in links for shape in link.shapes]
+    kinds = [ObstacleKind.PLANE, *(_KINDS[shape.kind] for shape in shapes)]
+    return {
+        "obstacle_kind": np.array(kinds, dtype=np.int32),
+        "obstacle_frame": np.array([IDENTITY, *(shape.frame for shape in shapes)]),
+        "obstacle_size": np.array([np.zeros(3), *(shape.size for shape in shapes)]),
+    }
+
+
+def wall_contacts(
+    robot: Robot,
+    scene: Scene,
+    obstacles: int,
+    colliders: dict[str, tuple[int, tuple[Shape, ...]]],
+) -> Iterator[ContactRow]:
+    """Pairs the colliders of the robot's touching links with every wall.
+
+    Args:
+        robot: The robot's row.
+        scene: The scene's row.
+        obstacles: Rows of the obstacle tables; row 0 is the ground.
+        colliders: Body and colliders, in the body, of every link of the robot.
+
+    Raises:
+        RobotDescriptionError: A link is not the robot's, or has no collider that
+            may touch.
+    """
+    names = scene.links
+    if names is None:
+        names = tuple(dict.fromkeys(contact.link for contact in robot.contacts))
+    for name in names:
+        if name not in colliders:
+            raise RobotDescriptionError(
+                f"scene {scene.name!r}, links: {name!r} is not in {robot.urdf}; "
+                f"allowed: {', '.join(colliders)}"
+            )
+        body, shapes = colliders[name]
+        if not shapes or any(shape.kind not in _TOUCHING for shape in shapes):
+            found = ", ".join(shape.kind for shape in shapes) or "none"
+            raise RobotDescriptionError(
+                f"scene {scene.name!r}, links: colliders of {name!r} are {found}; "
+                f"allowed: at least one, each of {', '.join(_TOUCHING)}"
+            )
+        for shape in shapes:
+            axis = reference.rotation_matrix(shape.frame[3:])[:, 2]
+            half = shape.size[1] * axis
+            for obstacle in range(1, obstacles):
+                yield ContactRow(
+                    body, obstacle, shape.frame[:3], half, float(shape.size[0])
+                )

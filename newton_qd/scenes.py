@@ -1,0 +1,29 @@
+"""Scenes as data: what stands on the ground beside the robot, one row each."""
+
+from __future__ import annotations
+
+import dataclasses
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """Static obstacles, and which links of a robot collide with them.
+
+    Attributes:
+        name: Name of the scene.
+        urdf: File name inside ``urdf/``, or a path: links that are fixed to the
+            world, with capsules, spheres or boxes as colliders.
+        links: Links of the robot, all of whose colliders touch the obstacles;
+            ``None``: the links that touch the ground.
+    """
+
+    name: str
+    urdf: str
+    links: tuple[str, ...] | None = None
+
+
+TRAP = Scene("trap", "trap.urdf")
+HUMANOID_TRAP = Scene("humanoid_trap", "humanoid_trap.urdf")
+MAZE = Scene("maze", "maze.urdf")
+
+SCENES = {scene.name: scene for scene in (TRAP, HUMANOID_TRAP, MAZE)}
