@@ -107,8 +107,8 @@ def reshaped(tree: Any, old_axes: int, new: tuple[int, ...]) -> Any:
 
 
 def observation_layout(env: Env) -> tuple[tuple[str, int], ...]:
-    base: Any = env.unwrapped
-    return base.observation_layout
+    layout: Any = getattr(env, "observation_layout")  # noqa: B009 - no Env has it
+    return layout
 
 
 def coordinates(state: State) -> jax.Array:

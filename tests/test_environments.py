@@ -245,9 +245,9 @@ def test_every_observation_element_moves(name: str) -> None:
 
 
 def contact_never_moves(env: PhysicsEnv, block: str) -> np.ndarray:
-    """Entries (bodies and ground, 3) that no contact can change."""
+    """Entries (bodies, ground and walls, 3) that no contact can change."""
     system = env.system
-    never = np.ones((system.nb + 1, 3), bool)
+    never = np.ones((system.nb + 1 + len(system.scene_links), 3), bool)
     for body, centre in zip(system.contact_body, system.contact_position, strict=True):
         never[body] = False
         # a sphere around the centre of mass is touched straight below it: no yaw
@@ -273,10 +273,10 @@ def test_fixed_initial_state_has_no_noise(name: str) -> None:
     assert same(state, reset(env)(jax.random.key(1)))
     assert same(row(state, 0), row(state, 1))
     assert same(state.obs, state.info["first_obs"])
-    robot: Any = env.unwrapped
-    alone = jax.jit(robot.fixed_state)()
+    inside: Any = make(name, "bare")
+    alone = jax.jit(inside.fixed_state)()
     assert same(row(state.obs, 0), alone.obs)
-    if not isinstance(robot, PhysicsEnv):
+    if not isinstance(env.unwrapped, PhysicsEnv):
         return
     assert np.all(state.pipeline_state.v == 0)
     noisy = newton_qd.create(name, reset_noise_scale=0.0)

@@ -44,7 +44,7 @@ class Ant(PhysicsEnv):
         Args:
             ctrl_cost_weight: Cost of the sum of squared actions [-].
             use_contact_forces: Whether the observation ends with the contact
-                velocity changes of every body and of the ground (always 0).
+                velocity changes of every body, and of ground and walls (always 0).
             contact_cost_weight: Cost of the sum of squared contact velocity changes,
                 clipped as in the observation [-].
             healthy_reward: Bonus of a step [-].
@@ -81,16 +81,16 @@ class Ant(PhysicsEnv):
         }
         if self._use_contact_forces:
             bodies = np.arange(self.system.nb, dtype=np.int32)
-            linear = linear_changes(self.system, state, bodies)
-            angular = angular_changes(
-                self.system, state, bodies, "use_contact_forces=True"
+            linear = _clipped(linear_changes(self.system, state, bodies))
+            angular = _clipped(
+                angular_changes(self.system, state, bodies, "use_contact_forces=True")
             )
+            still = ("ground", *self.system.scene_links)
+            names = ", ".join(("bodies", *still[:-1])) + f" and {still[-1]}"
             blocks |= {
-                "contact velocity changes, bodies and ground [m/s]": _rows(
-                    _clipped(linear)
-                ),
-                "contact angular velocity changes, bodies and ground [rad/s]": _rows(
-                    _clipped(angular)
+                f"contact velocity changes, {names} [m/s]": _rows(linear, len(still)),
+                f"contact angular velocity changes, {names} [rad/s]": _rows(
+                    angular, len(still)
                 ),
             }
         return blocks
@@ -136,8 +136,8 @@ def _clipped(changes: jax.Array) -> jax.Array:
     return jnp.clip(changes, -_CONTACT_CLIP, _CONTACT_CLIP)
 
 
-def _rows(changes: jax.Array) -> jax.Array:
-    """Returns the rows of the bodies (nb, 3) and of the ground, flat (3 nb + 3,)."""
-    # The ground never moves; its row is kept for the layout that policies know.
-    ground = jnp.zeros((1, 3), changes.dtype)
-    return jnp.concatenate([changes, ground]).reshape(-1)
+def _rows(changes: jax.Array, still: int) -> jax.Array:
+    """Returns the rows of bodies (nb, 3) and of what never moves, one after another."""
+    # Those of ground and walls are zero, kept for the layout that policies know.
+    zeros = jnp.zeros((still, 3), changes.dtype)
+    return jnp.concatenate([changes, zeros]).reshape(-1)

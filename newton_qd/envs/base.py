@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import copy
 from collections.abc import Callable
 
 import jax
@@ -15,6 +16,7 @@ from newton_qd.envs.state import State, select
 from newton_qd.envs.views import SystemView
 from newton_qd.physics.system import PhysicsState, System
 from newton_qd.robots import Robot
+from newton_qd.scenes import Scene
 from newton_qd.types import Action, Metrics, Observation, Params, RNGKey
 
 
@@ -82,6 +84,21 @@ class Env(abc.ABC):
         """
         return change(self)
 
+    def with_scene(self, scene: Scene | None) -> Env:
+        """Returns the same wrappers around the same robot in another scene.
+
+        Args:
+            scene: What stands on the ground; ``None``: nothing. This environment and
+                its wrappers stay as they are.
+
+        Raises:
+            NotImplementedError: The environment inside is not a simulated robot.
+        """
+        raise NotImplementedError(
+            f"scene={scene!r}: {self.name} is not a simulated robot; allowed: "
+            "environments whose unwrapped is a PhysicsEnv"
+        )
+
 
 class QDEnv(Env):
     """An environment that writes ``info["state_descriptor"]``.
@@ -132,7 +149,12 @@ class PhysicsEnv(Env):
     """Metric that is the forward part of the reward; ``None``: there is none."""
 
     def __init__(
-        self, robot: Robot, *, reset_noise_scale: float, dtype: str = "float32"
+        self,
+        robot: Robot,
+        *,
+        reset_noise_scale: float,
+        dtype: str = "float32",
+        scene: Scene | None = None,
     ) -> None:
         """Loads the robot.
 
@@ -141,12 +163,16 @@ class PhysicsEnv(Env):
             reset_noise_scale: Half width of the uniform noise on joint angles [rad]
                 and joint velocities [rad/s] at a reset.
             dtype: ``"float32"``, or ``"float64"`` with JAX x64 on.
+            scene: What stands on the ground; ``None``: nothing.
         """
-        self.system: System = physics.load_system(robot, dtype)
         self.robot = robot
         self._dtype = np.dtype(dtype)
         self._noise_scale = reset_noise_scale
-        system = self.system
+        self._load(scene)
+
+    def _load(self, scene: Scene | None) -> None:
+        system = physics.load_system(self.robot, self._dtype.name, scene)
+        self.system: System = system
         joints = np.flatnonzero(np.isin(system.v_start, system.control_dof))
         self._joint_q = system.q_start[joints].astype(np.int32)
         self._joint_v = system.v_start[joints].astype(np.int32)
@@ -156,6 +182,16 @@ class PhysicsEnv(Env):
         self._layout: tuple[tuple[str, int], ...] = ()
         jax.eval_shape(self._record_layout, rest, action)
         self._metrics = tuple(jax.eval_shape(self._outcome, rest, rest, action)[2])
+
+    def with_scene(self, scene: Scene | None) -> PhysicsEnv:
+        """Returns the same environment in another scene; this one stays as it is.
+
+        Args:
+            scene: What stands on the ground; ``None``: nothing.
+        """
+        moved = copy.copy(self)
+        moved._load(scene)
+        return moved
 
     @abc.abstractmethod
     def _observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:

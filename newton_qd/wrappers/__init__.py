@@ -11,10 +11,12 @@ from newton_qd.wrappers.episode import EpisodeWrapper
 from newton_qd.wrappers.evaluation import EvalMetrics, EvalWrapper
 from newton_qd.wrappers.feet_contact import FeetContactWrapper
 from newton_qd.wrappers.fixed_initial_state import FixedInitialStateWrapper
+from newton_qd.wrappers.maze import MazeWrapper
 from newton_qd.wrappers.no_forward_reward import NoForwardRewardWrapper
 from newton_qd.wrappers.offset_reward import OffsetRewardWrapper
 from newton_qd.wrappers.qd import QDWrapper
 from newton_qd.wrappers.state_descriptor_reset import StateDescriptorResetWrapper
+from newton_qd.wrappers.trap import TrapWrapper
 from newton_qd.wrappers.vector import VectorWrapper
 from newton_qd.wrappers.xy_position import XYPositionWrapper
 
@@ -28,10 +30,12 @@ __all__ = [
     "EvalWrapper",
     "FeetContactWrapper",
     "FixedInitialStateWrapper",
+    "MazeWrapper",
     "NoForwardRewardWrapper",
     "OffsetRewardWrapper",
     "QDWrapper",
     "StateDescriptorResetWrapper",
+    "TrapWrapper",
     "VectorWrapper",
     "Wrapper",
     "XYPositionWrapper",

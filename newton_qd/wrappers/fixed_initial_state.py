@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -41,22 +40,19 @@ class FixedInitialStateWrapper(Wrapper):
                 ``None``: that of the environment.
         """
         base = env.unwrapped
-        fixed_state = getattr(base, "fixed_state", None)
         if get_obs_fn is not None and not isinstance(base, PhysicsEnv):
             raise NotImplementedError(
                 f"This wrapper does not support {base_env_name or base.name} yet. "
                 f"get_obs_fn={get_obs_fn!r} with {type(base).__name__}; allowed: None"
             )
-        if not callable(fixed_state):
+        if not callable(getattr(base, "fixed_state", None)):
             raise NotImplementedError(
                 f"This wrapper does not support {base_env_name or base.name} yet. "
                 f"Given: {type(base).__name__}; allowed: environments with a method "
                 "fixed_state(), as every PhysicsEnv"
             )
-        self._fixed_state: Callable[[], Any] | None = None
-        if env is base:
-            self._fixed_state = fixed_state
-        else:
+        self._effective = env is base
+        if not self._effective:
             env = env.with_base(
                 lambda inside: FixedInitialStateWrapper(
                     inside, base_env_name, get_obs_fn
@@ -67,9 +63,11 @@ class FixedInitialStateWrapper(Wrapper):
 
     def reset(self, rng: RNGKey) -> State:
         """Begins an episode; the key is not used."""
-        if self._fixed_state is None:
+        if not self._effective:
             return self.env.reset(rng)
-        state = self._fixed_state()
+        # of what is inside now: ``with_base`` may have put something else there
+        inside: Any = self.env
+        state = inside.fixed_state()
         return state if self._get_obs_fn is None else self._observed(state)
 
     def _observed(self, state: State) -> State:

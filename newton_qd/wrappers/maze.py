@@ -1,0 +1,51 @@
+"""A maze with a target in one corner."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+
+from newton_qd.envs.base import Env, safe_norm
+from newton_qd.envs.state import State
+from newton_qd.scenes import MAZE
+from newton_qd.wrappers.scene_task import SceneTaskWrapper
+
+_HEIGHTS = (0.2, 5.0)  # the torso of a robot that goes on is between these [m]
+
+
+class MazeWrapper(SceneTaskWrapper):
+    """Borders around 45 m by 45 m, three walls inside, and a target to come near to.
+
+    The observation begins with (x - 17.5, y - 17.5) / 22.5. The reward is minus the
+    distance of the torso from the target on the ground [m], at a reset too. Done
+    when the torso is below 0.2 m or above 5 m; the target itself ends nothing.
+    """
+
+    scene = MAZE
+    xy_centre = (17.5, 17.5)
+    xy_scale = (22.5, 22.5)
+
+    def __init__(self, env: Env, env_name: str) -> None:
+        """Wraps a simulated robot with a floating torso; ``env`` is not changed.
+
+        Args:
+            env: The environment, with or without wrappers.
+            env_name: Its name, for the error.
+        """
+        super().__init__(env, env_name)
+        system = self.system
+        self._target = system.scene_frames[system.scene_links.index("target"), :2]
+
+    def _outcome(self, state: State) -> State:
+        """Returns the state with the reward and the end of the task."""
+        position = self._position(state)
+        away = position[:2] - np.asarray(self._target, self.dtype)
+        low, high = (np.asarray(height, self.dtype) for height in _HEIGHTS)
+        outside = (position[2] < low) | (position[2] > high)
+        # a world at fault is frozen: reward 0 and done 1, as from the robot itself
+        faulty = state.info["fault"] != 0
+        reward = -safe_norm(away)
+        return state.replace(
+            reward=jnp.where(faulty, jnp.zeros_like(reward), reward),
+            done=(outside | faulty).astype(self.dtype),
+        )

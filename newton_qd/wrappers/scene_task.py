@@ -1,0 +1,99 @@
+"""What trap and maze have in common: walls, and where the robot is among them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from newton_qd.envs.base import Env, PhysicsEnv
+from newton_qd.envs.state import State
+from newton_qd.physics.system import JointKind, System
+from newton_qd.scenes import Scene
+from newton_qd.types import Action, Params, RNGKey
+from newton_qd.wrappers.base import Wrapper
+
+
+class SceneTaskWrapper(Wrapper):
+    """Puts a robot into a scene and its scaled position in front of the observation.
+
+    It takes effect directly around the environment inside all wrappers, wherever it
+    is put: so wrappers around it see the rewards and the ends of the task.
+    """
+
+    scene: Scene
+    """The walls."""
+    xy_centre: tuple[float, float]
+    """Position that is observed as zero [m]."""
+    xy_scale: tuple[float, float]
+    """Distances from it that are observed as one [m]."""
+
+    def __init__(self, env: Env, env_name: str) -> None:
+        """Wraps a simulated robot with a floating torso; ``env`` is not changed.
+
+        Args:
+            env: The environment, with or without wrappers.
+            env_name: Its name, for the error.
+        """
+        base = env.unwrapped
+        if not isinstance(base, PhysicsEnv) or not _floats(base.system):
+            raise NotImplementedError(
+                f"This wrapper does not support {env_name} yet. Given: "
+                f"{type(base).__name__}; allowed: simulated robots whose torso floats"
+            )
+        self._effective = env is base
+        if self._effective:
+            env = base.with_scene(self.scene)
+        else:
+            env = env.with_base(lambda inside: type(self)(inside, env_name))
+        super().__init__(env)
+
+    def reset(self, rng: RNGKey) -> State:
+        """Begins an episode."""
+        return self._judged(self.env.reset(rng))
+
+    def step(self, state: State, action: Action, params: Params = None) -> State:
+        """Advances by one step."""
+        return self._judged(self.env.step(state, action, params))
+
+    def fixed_state(self) -> State:
+        """Returns the state of a reset without noise."""
+        inside: Any = self.env
+        return self._judged(inside.fixed_state())
+
+    def _judged(self, state: State) -> State:
+        if not self._effective:
+            return state
+        centre, scale = (
+            np.asarray(pair, self.dtype) for pair in (self.xy_centre, self.xy_scale)
+        )
+        place = (self._position(state)[:2] - centre) / scale
+        return self._outcome(state.replace(obs=jnp.concatenate([place, state.obs])))
+
+    def _outcome(self, state: State) -> State:
+        """Returns the state with the reward and the end of the task."""
+        return state
+
+    def _position(self, state: State) -> jax.Array:
+        """Returns the position (3,) of the torso [m]."""
+        base: Any = self.unwrapped
+        start = int(base.system.q_start[base.system.torso])
+        return state.pipeline_state.q[start : start + 3]
+
+    @property
+    def observation_layout(self) -> tuple[tuple[str, int], ...]:
+        """Name and size of each block of the observation, in order."""
+        inside: Any = self.env
+        own = (("torso position x y, scaled to the scene [-]", 2),)
+        return (own if self._effective else ()) + inside.observation_layout
+
+    @property
+    def observation_size(self) -> int:
+        """Length of an observation."""
+        return sum(size for _, size in self.observation_layout)
+
+
+def _floats(system: System) -> bool:
+    return system.joint_kind[system.torso] == JointKind.FREE

@@ -1,0 +1,18 @@
+"""A trap in the way of a robot that runs forward."""
+
+from __future__ import annotations
+
+from newton_qd.scenes import TRAP
+from newton_qd.wrappers.scene_task import SceneTaskWrapper
+
+
+class TrapWrapper(SceneTaskWrapper):
+    """Three walls in a U, open towards the robot, 12 m ahead.
+
+    The observation begins with ((x - 15) / 15, y / 8); reward and end are those of
+    the environment inside.
+    """
+
+    scene = TRAP
+    xy_centre = (15.0, 0.0)
+    xy_scale = (15.0, 8.0)

@@ -1,0 +1,248 @@
+"""Trap and maze as tasks, reckoned again in NumPy, and scenes under any wrappers."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import newton_qd
+from newton_qd.envs.ant import Ant
+from newton_qd.envs.base import Env
+from newton_qd.envs.pointmaze import PointMaze
+from newton_qd.envs.state import State
+from newton_qd.scenes import MAZE, TRAP
+from newton_qd.wrappers import (
+    AutoResetWrapper,
+    EpisodeWrapper,
+    FixedInitialStateWrapper,
+    MazeWrapper,
+    TrapWrapper,
+    VectorWrapper,
+    Wrapper,
+)
+
+KEY = jax.random.key(0)
+TASKS = {"trap": TrapWrapper, "maze": MazeWrapper}
+ROWS = {"trap": 11, "maze": 12}  # of the contact block: bodies, ground and walls
+CENTRE = {"trap": [15, 0], "maze": [17.5, 17.5]}
+SCALE = {"trap": [15, 8], "maze": [22.5, 22.5]}
+TARGET = np.array([35.0, 0.0])
+
+
+def action_of(env: Env, size: float = 0.0) -> jax.Array:
+    return jnp.full((env.action_size,), size, env.dtype)
+
+
+def placed(env: Env, position: list[float]) -> State:
+    """A state of the reset with the torso elsewhere."""
+    state = env.reset(KEY)
+    physics: Any = state.pipeline_state
+    q = physics.q.at[:3].set(jnp.asarray(position, env.dtype))
+    return state.replace(pipeline_state=dataclasses.replace(physics, q=q))
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_observation(task: str) -> None:
+    """Scaled position, then the ant's, then contact rows of the walls too."""
+    env, ant = TASKS[task](Ant(), "ant"), Ant()
+    rows = ROWS[task]
+    assert env.observation_size == 2 + 27 + 6 * rows
+    assert sum(size for _, size in env.observation_layout) == env.observation_size
+    start = placed(env, [3.0, -1.5, 0.6])
+    after = jax.jit(env.step)(start, action_of(env, 0.3))
+    plain = jax.jit(ant.step)(placed(ant, [3.0, -1.5, 0.6]), action_of(ant, 0.3))
+    obs, expected = np.asarray(after.obs), np.asarray(plain.obs)
+    xy = np.asarray(after.pipeline_state.q[:2])
+    place = (xy - CENTRE[task]) / np.array(SCALE[task])
+    np.testing.assert_allclose(obs[:2], place, rtol=1e-5, atol=1e-6)
+    np.testing.assert_array_equal(obs[2:29], expected[:27])
+    linear, angular = np.split(obs[29:], 2)
+    assert linear.shape == (3 * rows,)
+    np.testing.assert_array_equal(linear[:27], expected[27:54])
+    np.testing.assert_array_equal(angular[:27], expected[57:84])
+    assert not linear[27:].any() and not angular[27:].any()
+
+
+def test_position_is_not_clipped() -> None:
+    env = TrapWrapper(Ant(), "ant")
+    after = jax.jit(env.step)(placed(env, [60.0, 40.0, 0.6]), action_of(env))
+    np.testing.assert_allclose(after.obs[:2], [3.0, 5.0], atol=0.01)
+
+
+def test_trap_keeps_reward_and_end() -> None:
+    env, ant = TrapWrapper(Ant(), "ant"), Ant()
+    for height in (0.6, 1.5):
+        ours = jax.jit(env.step)(placed(env, [3.0, 0.0, height]), action_of(env, 0.5))
+        theirs = jax.jit(ant.step)(placed(ant, [3.0, 0.0, height]), action_of(ant, 0.5))
+        assert float(ours.reward) == float(theirs.reward)
+        assert float(ours.done) == float(theirs.done) == float(height > 1)
+        assert set(ours.metrics) == set(theirs.metrics)
+
+
+def test_trap_walls_are_there() -> None:
+    """An ant at rest against the back wall is pushed back; the plain ant is not."""
+    env, ant = TrapWrapper(Ant(), "ant"), Ant()
+    pushed = jax.jit(env.step)(placed(env, [10.9, 0.0, 0.6]), action_of(env))
+    free = jax.jit(ant.step)(placed(ant, [10.9, 0.0, 0.6]), action_of(ant))
+    assert float(pushed.pipeline_state.v[0]) < -0.1
+    assert abs(float(free.pipeline_state.v[0])) < 0.02
+
+
+def test_maze_reward() -> None:
+    env = MazeWrapper(Ant(), "ant")
+    first = env.reset(KEY)
+    assert float(first.reward) == pytest.approx(-35.0)
+    assert float(first.done) == 0
+    for position in ([3.0, -1.5, 0.6], [34.0, 1.0, 0.6], [35.0, 0.0, 0.6]):
+        after = jax.jit(env.step)(placed(env, position), action_of(env, 0.2))
+        xy = np.asarray(after.pipeline_state.q[:2], np.float64)
+        expected = -np.linalg.norm(xy - TARGET)
+        assert float(after.reward) == pytest.approx(expected, rel=1e-5, abs=1e-6)
+        assert float(after.done) == 0
+        assert float(after.metrics["reward_survive"]) == 1
+
+
+@pytest.mark.parametrize(
+    ("height", "done"), [(0.3, 1), (0.6, 0), (1.5, 0), (4.9, 0), (5.3, 1)]
+)
+def test_maze_end(height: float, done: int) -> None:
+    env = MazeWrapper(Ant(), "ant")
+    state = placed(env, [3.0, 0.0, height])
+    if height < 0.5:  # it falls on its back
+        physics = state.pipeline_state
+        q = physics.q.at[3:7].set(jnp.array([1.0, 0.0, 0.0, 0.0]))
+        moving = dataclasses.replace(physics, q=q, v=physics.v.at[2].set(-10.0))
+        state = state.replace(pipeline_state=moving)
+    after = jax.jit(env.step)(state, action_of(env))
+    reached = float(after.pipeline_state.q[2])
+    assert (reached < 0.2 or reached > 5.0) == bool(done)
+    assert float(after.done) == done
+
+
+def test_maze_reward_has_a_gradient_at_the_target() -> None:
+    env = MazeWrapper(Ant(), "ant")
+
+    def reward(xy: jax.Array) -> jax.Array:
+        state = env.reset(KEY)
+        q = state.pipeline_state.q.at[:2].set(xy)
+        physics = dataclasses.replace(state.pipeline_state, q=q)
+        return env.step(state.replace(pipeline_state=physics), action_of(env)).reward
+
+    gradient = jax.jit(jax.grad(reward))
+    assert np.isfinite(gradient(jnp.asarray(TARGET, np.float32))).all()
+    slope = gradient(jnp.array([3.0, 0.0], np.float32))
+    np.testing.assert_allclose(slope, [1.0, 0.0], atol=0.01)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_fault_is_contained(task: str) -> None:
+    env = TASKS[task](Ant(), "ant")
+    after = jax.jit(env.step)(env.reset(KEY), action_of(env, np.nan))
+    assert int(after.info["fault"]) == 1
+    assert float(after.reward) == 0 and float(after.done) == 1
+    assert np.isfinite(after.obs).all()
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_argument_stays_as_it_is(task: str) -> None:
+    ant = Ant()
+    chain = AutoResetWrapper(EpisodeWrapper(ant, 10, 1))
+    system, size = ant.system, chain.observation_size
+    env = TASKS[task](chain, "ant")
+    assert ant.system is system and chain.unwrapped is ant
+    assert chain.observation_size == size == 87
+    assert env.unwrapped is not ant
+    assert env.unwrapped.system is not system  # pyright: ignore
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("typed", [True, False])
+def test_by_hand_around_episodes(task: str, typed: bool) -> None:
+    """As in the original's examples: around what ``create`` has made, eagerly."""
+    key = KEY if typed else jax.random.PRNGKey(0)
+    made = newton_qd.create("ant", episode_length=3)
+    env = TASKS[task](made, "ant")
+    inner = TASKS[task](Ant(), "ant")
+    expected = AutoResetWrapper(EpisodeWrapper(inner, 3, 1))
+    ours, theirs = env.reset(key), expected.reset(key)
+    for _ in range(4):
+        for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
+            np.testing.assert_array_equal(a, b)
+        assert ours.obs.shape == (env.observation_size,)
+        ours = env.step(ours, action_of(env, 0.1))
+        theirs = expected.step(theirs, action_of(env, 0.1))
+    assert float(ours.info["steps"]) == 1  # the episode of 3 steps has ended
+
+
+def test_maze_ends_episodes_inside_auto_reset() -> None:
+    """The height that ends the plain ant's episode does not end one in the maze."""
+    env = MazeWrapper(newton_qd.create("ant"), "ant")
+    state = env.reset(KEY)
+    q = state.pipeline_state.q.at[2].set(1.5)
+    physics = dataclasses.replace(state.pipeline_state, q=q)
+    after = jax.jit(env.step)(state.replace(pipeline_state=physics), action_of(env))
+    assert float(after.done) == 0
+    assert float(after.pipeline_state.q[2]) > 1.4
+    q = state.pipeline_state.q.at[2].set(6.0)
+    physics = dataclasses.replace(state.pipeline_state, q=q)
+    after = jax.jit(env.step)(state.replace(pipeline_state=physics), action_of(env))
+    assert float(after.done) == 1
+    np.testing.assert_array_equal(after.obs, after.info["first_obs"])
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_fixed_initial_state(task: str) -> None:
+    """Whichever wrapper is put on first."""
+    first = FixedInitialStateWrapper(TASKS[task](Ant(), "ant"))
+    last = TASKS[task](FixedInitialStateWrapper(Ant()), "ant")
+    batch = VectorWrapper(last, 2).reset(KEY)
+    one, other = first.reset(KEY), last.reset(jax.random.key(1))
+    for state in (one, other):
+        assert state.obs.shape == (last.observation_size,)
+        np.testing.assert_array_equal(state.obs, last.fixed_state().obs)
+        assert not np.asarray(state.pipeline_state.v).any()
+    np.testing.assert_array_equal(batch.obs, np.stack([other.obs] * 2))
+
+
+def test_with_scene() -> None:
+    ant = Ant(healthy_reward=7.0)
+    moved = ant.with_scene(TRAP)
+    assert ant.system.scene is None and moved.system.scene is TRAP
+    assert (ant.observation_size, moved.observation_size) == (87, 93)
+    assert moved.with_scene(None).system is ant.system
+    after = jax.jit(moved.step)(moved.reset(KEY), action_of(moved))
+    assert float(after.metrics["reward_survive"]) == 7.0
+    chain = EpisodeWrapper(Wrapper(ant), 5, 1)
+    other: Any = chain.with_scene(MAZE)
+    assert type(other) is EpisodeWrapper and other.episode_length == 5
+    assert other.system.scene is MAZE and chain.unwrapped is ant
+
+
+def test_precision(x64: None) -> None:
+    env = MazeWrapper(Ant(dtype="float64"), "ant")
+    after = env.step(env.reset(KEY), action_of(env))
+    for leaf in (after.obs, after.reward, after.done):
+        assert leaf.dtype == np.float64
+    single = TrapWrapper(Ant(), "ant")
+    after = single.step(single.reset(KEY), action_of(single))
+    for leaf in (after.obs, after.reward, after.done):
+        assert leaf.dtype == np.float32
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_other_environments_are_refused(task: str) -> None:
+    message = (
+        "This wrapper does not support pointmaze yet. Given: PointMaze; allowed: "
+        "simulated robots whose torso floats"
+    )
+    with pytest.raises(NotImplementedError, match=message):
+        TASKS[task](PointMaze(), "pointmaze")
+    with pytest.raises(NotImplementedError, match="pointmaze is not a simulated robot"):
+        PointMaze().with_scene(TRAP)
+    with pytest.raises(TypeError, match="scene='maze': allowed: None, or a Scene"):
+        Ant().with_scene("maze")  # pyright: ignore[reportArgumentType]
