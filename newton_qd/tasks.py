@@ -20,7 +20,9 @@ from newton_qd.extractors import get_feet_contact_proportion, get_final_xy_posit
 from newton_qd.robots import ROBOTS, Robot
 from newton_qd.wrappers import (
     FeetContactWrapper,
+    MazeWrapper,
     NoForwardRewardWrapper,
+    TrapWrapper,
     XYPositionWrapper,
 )
 
@@ -121,6 +123,8 @@ ROWS: dict[str, EnvironmentRow] = {
     "ant_uni": _uni(Ant, "ant", 3.24),
     "ant_omni": _position(Ant, "ant", 3.0, _ANYWHERE, NoForwardRewardWrapper),
     "antnotrap": _position(Ant, "ant", 3.38, ((0.0, -8.0), (70.0, 8.0))),
+    "anttrap": _position(Ant, "ant", 3.38, ((0.0, -8.0), (30.0, 8.0)), TrapWrapper),
+    "antmaze": _position(Ant, "ant", 40.32, ((-5.0, -5.0), (40.0, 40.0)), MazeWrapper),
     "halfcheetah": EnvironmentRow(HalfCheetah, "halfcheetah"),
     "halfcheetah_uni": _uni(HalfCheetah, "halfcheetah", 9.231),
     "hopper": EnvironmentRow(Hopper, "hopper"),

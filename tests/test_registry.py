@@ -58,6 +58,8 @@ def test_names() -> None:
         "ant_uni",
         "ant_omni",
         "antnotrap",
+        "anttrap",
+        "antmaze",
         "pointmaze",
     )
 
@@ -149,6 +151,8 @@ def test_tables_are_columns_of_the_rows() -> None:
         "ant_uni": get_feet_contact_proportion,
         "ant_omni": get_final_xy_position,
         "antnotrap": get_final_xy_position,
+        "anttrap": get_final_xy_position,
+        "antmaze": get_final_xy_position,
         "pointmaze": get_final_xy_position,
     }
     assert newton_qd.descriptor_extractor is extractors
@@ -156,9 +160,11 @@ def test_tables_are_columns_of_the_rows() -> None:
         "ant_uni": 3.24,
         "ant_omni": 3.0,
         "antnotrap": 3.38,
+        "anttrap": 3.38,
+        "antmaze": 40.32,
         "pointmaze": 2.3431,
     }
-    assert len(newton_qd.reward_offset) == 4 and "ant" not in newton_qd.reward_offset
+    assert len(newton_qd.reward_offset) == 6 and "ant" not in newton_qd.reward_offset
     assert "ant_uni" in repr(newton_qd.reward_offset)
     with pytest.raises(
         KeyError, match="'ant' has no reward_offset; known: ant_uni, ant_"
