@@ -23,10 +23,10 @@ from newton_qd.physics.xml_reader import IDENTITY, RobotDescriptionError, XmlRea
 from newton_qd.robots import Robot
 from newton_qd.scenes import Scene
 
+# A sphere is a capsule of no length; a box has no contact kernel yet.
 _KINDS = {
     "sphere": ObstacleKind.CAPSULE,
     "capsule": ObstacleKind.CAPSULE,
-    "box": ObstacleKind.BOX,
 }
 # Colliders of a robot that may touch an obstacle.
 _TOUCHING = ("sphere", "capsule")
