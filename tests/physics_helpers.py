@@ -200,6 +200,15 @@ def penetration(gap: Any, width: float) -> np.ndarray:
     return np.where(gap <= -width, -gap, inside)
 
 
+def nearest(at: np.ndarray, along: np.ndarray, half: float) -> np.ndarray:
+    """Distances (n,) of segments from a segment on the z axis, by brute force."""
+    share = np.linspace(-1.0, 1.0, 801)[:, None]
+    points = at[:, None] + share * along[:, None]
+    beyond = points[..., 2] - np.clip(points[..., 2], -half, half)
+    flat = np.concatenate([points[..., :2], beyond[..., None]], axis=-1)
+    return np.linalg.norm(flat, axis=-1).min(axis=1)
+
+
 BOX_MASS = 4.0  # [kg]
 BOX_HEIGHT = 0.07  # of its centre when its spheres just touch [m]
 _RADIUS = 0.02  # of its corner spheres [m]
