@@ -14,10 +14,11 @@ from newton_qd.envs.base import Env
 from newton_qd.envs.halfcheetah import HalfCheetah
 from newton_qd.envs.hopper import Hopper
 from newton_qd.envs.humanoid import Humanoid
+from newton_qd.envs.humanoid_trap import HumanoidTrap
 from newton_qd.envs.pointmaze import PointMaze
 from newton_qd.envs.walker2d import Walker2d
 from newton_qd.extractors import get_feet_contact_proportion, get_final_xy_position
-from newton_qd.robots import ROBOTS, Robot
+from newton_qd.robots import HUMANOID, ROBOTS, Robot
 from newton_qd.wrappers import (
     FeetContactWrapper,
     MazeWrapper,
@@ -101,6 +102,7 @@ def _position(
     offset: float,
     limits: tuple[tuple[float, float], tuple[float, float]],
     *wrappers: Callable[..., Env],
+    robot: Robot | None = None,
 ) -> EnvironmentRow:
     """Returns a task described by the last position within limits [m]."""
     options = {"minval": limits[0], "maxval": limits[1]}
@@ -113,6 +115,7 @@ def _position(
         ),
         descriptor_extractor=get_final_xy_position,
         reward_offset=offset,
+        robot=robot,
     )
 
 
@@ -133,6 +136,10 @@ ROWS: dict[str, EnvironmentRow] = {
     "humanoid_uni": _uni(Humanoid, "humanoid", 0.0),
     "humanoid_omni": _position(
         Humanoid, "humanoid", 0.0, _ANYWHERE, NoForwardRewardWrapper
+    ),
+    "humanoid_w_trap": EnvironmentRow(HumanoidTrap, "humanoid_w_trap", robot=HUMANOID),
+    "humanoidtrap": _position(
+        HumanoidTrap, "humanoid_w_trap", 0.0, ((0.0, -8.0), (30.0, 8.0)), robot=HUMANOID
     ),
     "walker2d": EnvironmentRow(Walker2d, "walker2d"),
     "walker2d_uni": _uni(Walker2d, "walker2d", 1.413),

@@ -33,7 +33,7 @@ from newton_qd.physics import reference
 from newton_qd.physics.launch import LANES, lane_count, thread_count
 from newton_qd.physics.model import build_system
 from newton_qd.physics.system import System
-from newton_qd.robots import ANT, Material
+from newton_qd.robots import ANT, ROBOTS, Material
 
 TESTS = Path(__file__).parent
 
@@ -151,16 +151,18 @@ def test_full_gear_overshoots_a_limit_as_stated(
 
 
 @pytest.mark.slow
-def test_ten_thousand_steps_are_finite() -> None:
+@pytest.mark.parametrize("name", ROBOTS)
+def test_ten_thousand_steps_are_finite(name: str) -> None:
     """64 worlds, uniformly random actions, no auto-reset."""
-    env = newton_qd.create("ant_uni", episode_length=20_000, auto_reset=False)
+    env = newton_qd.create(f"{name}_uni", episode_length=20_000, auto_reset=False)
     worlds, steps, chunk = 64, 10_000, 1_000
 
     @jax.jit
     def play(state: Any, key: jax.Array) -> Any:
         def advance(carry: Any, key: jax.Array) -> Any:
             state, finite = carry
-            action = jax.random.uniform(key, (worlds, 8), np.float32, -1.0, 1.0)
+            shape = (worlds, env.action_size)
+            action = jax.random.uniform(key, shape, np.float32, -1.0, 1.0)
             state = jax.vmap(env.step)(state, action)
             for leaf in jax.tree.leaves(state):
                 finite &= jnp.isfinite(leaf).all()

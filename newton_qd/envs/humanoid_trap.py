@@ -9,19 +9,17 @@ from newton_qd.envs.contacts import angular_changes, linear_changes
 from newton_qd.envs.humanoid import Humanoid
 from newton_qd.envs.vectors import rounded
 from newton_qd.physics.system import PhysicsState
+from newton_qd.scenes import HUMANOID_TRAP
 from newton_qd.types import Action, Metrics
 
 
 class HumanoidTrap(Humanoid):
     """The humanoid with its contacts in the observation and a cheaper control.
 
-    The robot is the humanoid. Its observation ends with contact velocity changes of
-    every body and of the scene, unclipped. The walls are not here: a scene brings
-    them, and the names of its bodies go into ``scene_bodies``.
+    The robot is the humanoid, in front of a trap that its shins run into. Its
+    observation ends with contact velocity changes of every body, of the ground and of
+    the walls, unclipped.
     """
-
-    scene_bodies: tuple[str, ...] = ("floor",)
-    """Bodies of the scene, which never move: a row of zeros each."""
 
     def __init__(
         self,
@@ -61,6 +59,7 @@ class HumanoidTrap(Humanoid):
             ),
             dtype=dtype,
         )
+        self._load(HUMANOID_TRAP)
 
     @property
     def name(self) -> str:
@@ -72,17 +71,16 @@ class HumanoidTrap(Humanoid):
         bodies = self._bodies
         linear = linear_changes(self.system, state, bodies)
         angular = angular_changes(self.system, state, bodies, "contact changes")
+        names = ", ".join(("bodies", "ground", *self.system.scene_links))
         return super()._observe(state, action) | {
-            "contact velocity changes, bodies and scene [m/s]": self._rows(linear),
-            "contact angular velocity changes, bodies and scene [rad/s]": self._rows(
-                angular
-            ),
+            f"contact velocity changes, {names} [m/s]": self._rows(linear),
+            f"contact angular velocity changes, {names} [rad/s]": self._rows(angular),
         }
 
     def _rows(self, changes: jax.Array) -> jax.Array:
-        """Returns the rows of the bodies (n, 3) and of the scene's bodies, flat."""
-        scene = jnp.zeros((len(self.scene_bodies), 3), changes.dtype)
-        return jnp.concatenate([changes, scene]).reshape(-1)
+        """Returns the rows of the bodies (n, 3), the ground and the walls, flat."""
+        still = jnp.zeros((1 + len(self.system.scene_links), 3), changes.dtype)
+        return jnp.concatenate([changes, still]).reshape(-1)
 
     def _inertia_about_centre(
         self, mass: jax.Array, arm: jax.Array, square: jax.Array

@@ -5,8 +5,9 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from newton_qd.envs.base import Env, safe_norm
+from newton_qd.envs.base import Env
 from newton_qd.envs.state import State
+from newton_qd.envs.vectors import length
 from newton_qd.scenes import MAZE
 from newton_qd.wrappers.scene_task import SceneTaskWrapper
 
@@ -44,7 +45,7 @@ class MazeWrapper(SceneTaskWrapper):
         outside = (position[2] < low) | (position[2] > high)
         # a world at fault is frozen: reward 0 and done 1, as from the robot itself
         faulty = state.info["fault"] != 0
-        reward = -safe_norm(away)
+        reward = -length(away)
         return state.replace(
             reward=jnp.where(faulty, jnp.zeros_like(reward), reward),
             done=(outside | faulty).astype(self.dtype),
