@@ -245,14 +245,16 @@ def test_every_observation_element_moves(name: str) -> None:
 
 
 def contact_never_moves(env: PhysicsEnv, block: str) -> np.ndarray:
-    """Entries (bodies, ground and walls, 3) that no contact can change."""
+    """Entries (bodies with mass, ground and walls, 3) that no contact can change."""
     system = env.system
-    never = np.ones((system.nb + 1 + len(system.scene_links), 3), bool)
+    row = np.cumsum(system.mass > 0) - 1
+    still = 1 + len(system.scene_links)
+    never = np.ones((np.count_nonzero(system.mass) + still, 3), bool)
     for body, centre in zip(system.contact_body, system.contact_position, strict=True):
-        never[body] = False
+        never[row[body]] = False
         # a sphere around the centre of mass is touched straight below it: no yaw
         central = np.allclose(centre, system.com[body], atol=1e-12)
-        never[body, 2] = central and "angular" in block
+        never[row[body], 2] = central and "angular" in block
     return never
 
 

@@ -277,7 +277,7 @@ def test_a_world_at_fault_observes_no_torque() -> None:
 
 def test_observation_of_the_trap_task(rolled_trap: Rolled) -> None:
     _, after, actions = rolled_trap
-    assert TRAP_ENV.observation_size == 227 + 2 * 3 * 12
+    assert TRAP_ENV.observation_size == 227 + 2 * 3 * 13
     rows = solid(TRAP_ENV.system)
     mass = TRAP_ENV.system.mass[rows, None]
     seen = []
@@ -289,16 +289,16 @@ def test_observation_of_the_trap_task(rolled_trap: Rolled) -> None:
         close(state.obs[:227], expected)
         linear = state.pipeline_state.impulse[rows, :3] / mass
         angular = state.pipeline_state.impulse[rows, 3:]  # 1 kg m^2
-        floor = np.zeros((1, 3))
-        contact = np.concatenate([linear, floor, angular, floor]).ravel()
+        still = np.zeros((2, 3))  # floor and trap
+        contact = np.concatenate([linear, still, angular, still]).ravel()
         close(state.obs[227:], contact)
         seen.append(linear)
     assert np.abs(seen).max() > 1  # it is not clipped
 
 
-def test_scene_bodies_add_rows(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(HumanoidTrap, "scene_bodies", ("floor", "trap"))
+def test_size_of_the_trap_task() -> None:
     assert HumanoidTrap().observation_size == 305
+    assert HumanoidTrap().system.scene_links == ("trap",)
 
 
 def test_reward_of_the_trap_task(rolled_trap: Rolled, rolled: Rolled) -> None:

@@ -52,16 +52,70 @@ def rows(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     yield
 
 
+class Task(NamedTuple):
+    """What the original says of a task (its offset, too)."""
+
+    base: str
+    observation: int
+    action: int
+    descriptor: str
+    limits: tuple[tuple[float, ...], tuple[float, ...]]
+    offset: float
+
+
+_UNIT = ((0.0, 0.0), (1.0, 1.0))
+_OMNI = ((-30.0, -30.0), (30.0, 30.0))
+_LANE = ((0.0, -8.0), (30.0, 8.0))
+FEET, XY = "feet_contact", "xy_position"
+TASKS = {
+    "ant_uni": Task("ant", 87, 8, FEET, ((0.0,) * 4, (1.0,) * 4), 3.24),
+    "ant_omni": Task("ant", 87, 8, XY, _OMNI, 3.0),
+    "antnotrap": Task("ant", 87, 8, XY, ((0.0, -8.0), (70.0, 8.0)), 3.38),
+    "anttrap": Task("ant", 95, 8, XY, _LANE, 3.38),
+    "antmaze": Task("ant", 101, 8, XY, ((-5.0, -5.0), (40.0, 40.0)), 40.32),
+    "halfcheetah_uni": Task("halfcheetah", 18, 6, FEET, _UNIT, 9.231),
+    "hopper_uni": Task("hopper", 11, 3, FEET, ((0.0,), (1.0,)), 0.9),
+    "humanoid_uni": Task("humanoid", 227, 17, FEET, _UNIT, 0.0),
+    "humanoid_omni": Task("humanoid", 227, 17, XY, _OMNI, 0.0),
+    "humanoidtrap": Task("humanoid_w_trap", 305, 17, XY, _LANE, 0.0),
+    "walker2d_uni": Task("walker2d", 17, 6, FEET, _UNIT, 1.413),
+    "pointmaze": Task("pointmaze", 2, 2, XY, ((-1.0, -1.0), (1.0, 1.0)), 2.3431),
+}
+ROBOTS = {
+    "ant": (87, 8),
+    "halfcheetah": (18, 6),
+    "hopper": (11, 3),
+    "humanoid": (227, 17),
+    "humanoid_w_trap": (305, 17),
+    "walker2d": (17, 6),
+}
+
+
 def test_names() -> None:
-    assert newton_qd.registered_envs() == (
-        "ant",
-        "ant_uni",
-        "ant_omni",
-        "antnotrap",
-        "anttrap",
-        "antmaze",
-        "pointmaze",
-    )
+    assert set(newton_qd.registered_envs()) == {*TASKS, *ROBOTS}
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_sizes_of_robots_are_those_of_the_original(name: str) -> None:
+    env = newton_qd.create(name)
+    assert (env.observation_size, env.action_size) == ROBOTS[name]
+    assert env.name == name
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_tasks_are_those_of_the_original(name: str) -> None:
+    task, env = TASKS[name], newton_qd.create(name)
+    assert (env.observation_size, env.action_size) == (task.observation, task.action)
+    assert env.name == task.base
+    qd: Any = env
+    assert qd.state_descriptor_name == task.descriptor
+    assert qd.behavior_descriptor_length == qd.descriptor_length == len(task.limits[0])
+    for limits in (
+        qd.state_descriptor_limits,
+        qd.descriptor_limits,
+        qd.behavior_descriptor_limits,
+    ):
+        np.testing.assert_array_equal(limits, task.limits)
 
 
 def test_wrappers_are_stacked_in_order() -> None:
@@ -147,24 +201,12 @@ def test_float64_needs_x64() -> None:
 
 def test_tables_are_columns_of_the_rows() -> None:
     extractors = newton_qd.behavior_descriptor_extractor
-    assert dict(extractors) == {
-        "ant_uni": get_feet_contact_proportion,
-        "ant_omni": get_final_xy_position,
-        "antnotrap": get_final_xy_position,
-        "anttrap": get_final_xy_position,
-        "antmaze": get_final_xy_position,
-        "pointmaze": get_final_xy_position,
-    }
+    read = {FEET: get_feet_contact_proportion, XY: get_final_xy_position}
+    assert dict(extractors) == {n: read[task.descriptor] for n, task in TASKS.items()}
     assert newton_qd.descriptor_extractor is extractors
-    assert dict(newton_qd.reward_offset) == {
-        "ant_uni": 3.24,
-        "ant_omni": 3.0,
-        "antnotrap": 3.38,
-        "anttrap": 3.38,
-        "antmaze": 40.32,
-        "pointmaze": 2.3431,
-    }
-    assert len(newton_qd.reward_offset) == 6 and "ant" not in newton_qd.reward_offset
+    offsets = {name: task.offset for name, task in TASKS.items()}
+    assert dict(newton_qd.reward_offset) == offsets
+    assert len(newton_qd.reward_offset) == 12 and "ant" not in newton_qd.reward_offset
     assert "ant_uni" in repr(newton_qd.reward_offset)
     with pytest.raises(
         KeyError, match="'ant' has no reward_offset; known: ant_uni, ant_"

@@ -246,3 +246,12 @@ def test_other_environments_are_refused(task: str) -> None:
         PointMaze().with_scene(TRAP)
     with pytest.raises(TypeError, match="scene='maze': allowed: None, or a Scene"):
         Ant().with_scene("maze")  # pyright: ignore[reportArgumentType]
+
+
+def test_views_show_the_scene() -> None:
+    """Rows of ground, maze and target come after those of the robot."""
+    env: Any = newton_qd.create("antmaze")
+    qp = env.reset(KEY).qp
+    assert qp.pos.shape == (12, 3)
+    np.testing.assert_allclose(qp.pos[9:], [[0, 0, 0], [0, 0, 0], [35, 0, 0.5]])
+    assert env.sys.body.index["Target"] == env.sys.body.index["target"] == 11

@@ -291,8 +291,9 @@ def _rotate(rot: jax.Array, vector: jax.Array) -> jax.Array:
 def _still_bodies(system: System) -> list[tuple[tuple[str, ...], np.ndarray]]:
     """Returns names and frame (7,) in the world of each body that never moves."""
     ground = (_GROUND, np.array([0, 0, 0, 0, 0, 0, 1.0]))
-    walls = zip(system.scene_links, system.scene_frames, strict=True)
-    return [ground, *(((name,), frame) for name, frame in walls)]
+    scene = zip(system.scene_links, system.scene_frames, strict=True)
+    # the original's names begin with a capital letter: Trap, Maze, Target
+    return [ground, *(((name, name.capitalize()), frame) for name, frame in scene)]
 
 
 def _with_still(system: System, rows: jax.Array) -> jax.Array:

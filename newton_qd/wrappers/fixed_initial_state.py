@@ -68,7 +68,7 @@ class FixedInitialStateWrapper(Wrapper):
             return self.env.reset(rng)
         # of what is inside now: ``with_base`` may have put something else there
         inside: Any = self.env
-        state = inside.fixed_state()
+        state: State = inside.fixed_state()
         return state if self._get_obs_fn is None else self._observed(state)
 
     def _observed(self, state: State) -> State:
