@@ -15,7 +15,14 @@ from newton_qd.envs.base import Env
 from newton_qd.envs.state import State
 from newton_qd.physics.system import PhysicsState
 
-NAMES = newton_qd.registered_envs()
+# The tasks, and of those that differ by constants only, one: plain robots are the
+# bases of their tasks, and two names repeat what other names do.
+_REPEATED = {"antnotrap", "humanoid_omni"}
+NAMES = [
+    name
+    for name in newton_qd.registered_envs()
+    if name in newton_qd.descriptor_extractor and name not in _REPEATED
+]
 STACKS: dict[str, dict[str, Any]] = {
     "default": {},
     "bare": {"episode_length": None, "auto_reset": False},

@@ -105,7 +105,7 @@ def test_a_signal_before_the_first_generation(
         (["evolve", "--resume"], "name an environment"),
         (["evolve", "--resume", "--out", "nowhere"], "name an environment"),
         (["evolve", "ant_unicorn"], "known names: ant, ant_uni"),
-        (["evolve", "ant"], "has no descriptor; evolve takes ant_uni"),
+        (["evolve", "ant"], "has no descriptor; evolve takes ant_omni, "),
         (["evolve", "ant_uni", "--batch-size", "0"], "batch_size must be"),
         (["evolve", "ant_uni", "--seed", "-3"], "seed must be"),
         (["evolve", "ant_uni", "--grid", "5x5"], "5x5 has 2 dimensions"),

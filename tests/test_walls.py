@@ -79,7 +79,7 @@ def test_directional_derivatives(x64: None, steps: int, bound: float) -> None:
     after = batched_step(system)(*inputs)
     pushed = -np.asarray(after[2])[:, :, 0].sum(axis=1)
     report("share of the ants that the wall pushes back", (pushed > 0.1).mean())
-    assert (pushed > 0.1).mean() > 0.8
+    assert (pushed > 0.1).mean() > 0.7
     errors = directional_errors(functional(system, steps), inputs)
     report("largest error for q, v, control", errors.max(axis=1))
     assert errors.max() < bound

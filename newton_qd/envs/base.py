@@ -229,7 +229,7 @@ class PhysicsEnv(Env):
         refuse_params(params)
         action = checked_action(action, self.action_size, self._dtype)
         # The physics freezes a world at fault and passes no gradient through it; a
-        # world that was at fault before is handed over as one. The outcome sees zeros
+        # world that was at fault before is handed over as one. The outcome sees numbers
         # instead, so that its zero gradient is not 0 * nan (double where).
         start: PhysicsState = state.pipeline_state
         sound = jnp.all(jnp.isfinite(action)) & (state.info["fault"] == 0)
@@ -238,7 +238,8 @@ class PhysicsEnv(Env):
         fault = jnp.maximum(state.info["fault"], fault)
         faulty = fault != 0
         action = jnp.where(faulty, jnp.zeros_like(action), action)
-        reward, done, metrics = self._outcome(start, after, action)
+        before = select(faulty, after, start)
+        reward, done, metrics = self._outcome(before, after, action)
         reward, metrics = select(
             faulty, jax.tree.map(jnp.zeros_like, (reward, metrics)), (reward, metrics)
         )
