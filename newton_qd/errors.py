@@ -26,7 +26,7 @@ class UnknownEnvironment(NotImplementedError):  # noqa: N818 - a name, not an ev
 
 
 class FaultError(FloatingPointError):
-    """A world met a value that is not finite and was frozen."""
+    """A world met a value that is not finite, or diverged, and was frozen."""
 
 
 class MissingExtra(ImportError):  # noqa: N818 - likewise

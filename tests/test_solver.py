@@ -272,12 +272,14 @@ def test_faulty_world_stays(device: jax.Device) -> None:
 
 def test_models_that_are_accepted(tmp_path: Path, device: jax.Device) -> None:
     robot = off_centre(tmp_path, ARM, sphere(0.1))
-    NewtonQDSolver(finalized(one_world(robot), device), robot)
+    one = NewtonQDSolver(finalized(one_world(robot), device), robot)
+    assert one.fault.shape == (1,)
     scene = newton.ModelBuilder()
     scene.add_ground_plane()
     scene.add_world(one_world(robot))
     scene.add_world(one_world(robot))
-    NewtonQDSolver(finalized(scene, device), robot)
+    two = NewtonQDSolver(finalized(scene, device), robot)
+    assert two.fault.shape == (2,)
 
 
 def _edited(name: str, index: Any, value: float) -> Callable[[newton.Model], None]:

@@ -139,10 +139,10 @@ class QDEnv(Env):
 class PhysicsEnv(Env):
     """A simulated robot: reset noise, checks of the input, containment of faults.
 
-    A subclass gives the observation and the outcome of a step. A world that meets
-    a value that is not finite is frozen where it was: ``info["fault"]`` becomes 1
-    and stays until a reset, reward and metrics are 0, done is 1, and no gradient
-    passes. Other worlds do not notice.
+    A subclass gives the observation and the outcome of a step. A world that meets a
+    value that is not finite, or a speed beyond 1,000 m/s or rad/s, is frozen where it
+    was: ``info["fault"]`` becomes 1 and stays until a reset, reward and metrics are 0,
+    done is 1, and no gradient passes. Other worlds do not notice.
     """
 
     forward_reward_name: str | None = None

@@ -124,6 +124,6 @@ def check(state: State) -> None:
         named.append(f"world {index}{at}" if world else f"the world{at}")
     more = f" and {len(worlds) - 8} more" if len(worlds) > 8 else ""
     raise FaultError(
-        f"not finite: {', '.join(named)}{more}; frozen there with reward 0 and done 1 "
-        "(a non-finite action or state, or a step that diverged)"
+        f"at fault: {', '.join(named)}{more}; frozen there with reward 0 and done 1 "
+        "(an action or a state that is not finite, or a step that diverged)"
     )

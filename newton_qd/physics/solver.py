@@ -82,8 +82,9 @@ class NewtonQDSolver(SolverBase):
     before a CUDA graph is captured, so that every buffer exists and stays.
 
     Attributes:
-        fault: (worlds,) 1 where the last step met a number that is not finite; such a
-            world keeps the coordinates and velocities of ``state_in``. Else 0.
+        fault: (worlds,) 1 where the last step met a number that is not finite or a
+            speed beyond 1,000 [m/s or rad/s]; such a world keeps the coordinates and
+            velocities of ``state_in``. Else 0.
         impulse: (worlds, nb, 6) contact impulses of the last step, as in
             :class:`~newton_qd.physics.system.PhysicsState`.
         normal_impulse: (worlds, nb) likewise [N s].

@@ -32,5 +32,5 @@ HALFCHEETAH = Robot(
     # 10 ms would let a foot, light and undamped, swing for ever about its limit
     substeps=10,
     # smoothing: a quarter to a third of the radius of the capsules
-    material=Material(friction=0.6, smoothing=0.015),
+    material=Material(friction=0.6, smoothing=0.015, limit_swing=0.36),
 )

@@ -42,6 +42,8 @@ class Material:
         dissipation: Hunt-Crossley dissipation [s/m].
         limit_overshoot: Angle by which a joint's full gear holds it past its limit
             [rad]; sets the stiffness of the limits.
+        limit_swing: Angle past its limit that a joint does not reach when its full
+            gear alone swings it there from rest [rad]; a promise, it sets nothing.
         limit_smoothing: Half width of the zone in which a limit switches on
             [rad]; the zone begins at the limit, where nothing is felt yet.
     """
@@ -53,6 +55,7 @@ class Material:
     slip_velocity: float = 0.1
     dissipation: float = 0.5
     limit_overshoot: float = 0.1
+    limit_swing: float = 0.25
     limit_smoothing: float = 0.05
 
 
