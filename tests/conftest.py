@@ -8,8 +8,12 @@ that are marked ``gpu`` themselves are skipped.
 from __future__ import annotations
 
 import functools
+import os
 from collections.abc import Iterator
 from typing import Any
+
+# Tests run in several processes, which share the memory of a GPU. JAX reads this once.
+os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
 import jax
 import pytest

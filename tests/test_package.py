@@ -292,6 +292,8 @@ def test_ci_runs_the_test_command_of_the_readme() -> None:
     (command,) = [line for line in readme_commands() if "pytest" in line][:1]
     script = (ROOT / ".ci" / "run").read_text(encoding="utf-8").splitlines()
     assert command in script
+    # what the README leaves out runs too
+    assert "python -m pytest -n auto -m slow" in script
 
 
 def test_readme_names_commands_that_exist() -> None:
