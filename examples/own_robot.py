@@ -1,8 +1,9 @@
-"""A robot of one's own as a QD task: its file, its row, its name.
+"""A robot of one's own as QD tasks: its file, its row, its names.
 
-    python examples/own_robot.py [--iterations 40]
+    python examples/own_robot.py [--env tripod_yard] [--iterations 40]
 
 ``tripod.urdf`` has masses, joints and colliders; the row says what a URDF cannot.
+``yard.urdf`` has the walls of the second task.
 """
 
 from __future__ import annotations
@@ -13,16 +14,18 @@ from pathlib import Path
 
 import newton_qd
 from newton_qd.envs.locomotion import Locomotion
-from newton_qd.extractors import get_feet_contact_proportion
+from newton_qd.extractors import get_feet_contact_proportion, get_final_xy_position
 from newton_qd.registry import WrapperRow
 from newton_qd.robots import Contact, Robot
-from newton_qd.wrappers import FeetContactWrapper
+from newton_qd.scenes import Scene
+from newton_qd.wrappers import FeetContactWrapper, XYPositionWrapper
 
+HERE = Path(__file__).resolve().parent
 LEGS = ("1", "2", "3")
 
 TRIPOD = Robot(
     name="tripod",
-    urdf=str(Path(__file__).resolve().with_name("tripod.urdf")),
+    urdf=str(HERE / "tripod.urdf"),
     torso="body",
     feet=tuple(f"foot_{leg}" for leg in LEGS),
     actuators=tuple(
@@ -43,16 +46,32 @@ newton_qd.register(
     reward_offset=2.0,
 )
 
+# The same robot among walls, described by where it comes to.
+YARD = Scene("yard", str(HERE / "yard.urdf"))
+newton_qd.register(
+    "tripod_yard",
+    functools.partial(Locomotion, TRIPOD, healthy_z_range=(0.21, 1.0), scene=YARD),
+    base_name="tripod",
+    wrappers=(
+        WrapperRow(XYPositionWrapper, {"minval": (-1.0, -4.0), "maxval": (8.0, 4.0)}),
+    ),
+    descriptor_extractor=get_final_xy_position,
+    reward_offset=2.0,
+)
+
 
 def main() -> None:
     from newton_qd.qd import EvolveConfig, evolve
 
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument(
+        "--env", choices=("tripod_uni", "tripod_yard"), default="tripod_uni"
+    )
     parser.add_argument("--iterations", type=int, default=40)
     options = parser.parse_args()
-    config = EvolveConfig(env_name="tripod_uni", iterations=options.iterations, seed=0)
+    config = EvolveConfig(env_name=options.env, iterations=options.iterations, seed=0)
     archive = evolve(config).archive
-    print(f"{archive.filled.sum()} gaits in {len(archive.filled)} cells")
+    print(f"{archive.filled.sum()} solutions in {len(archive.filled)} cells")
     print(f"best return {archive.fitnesses.max():.1f}")
 
 

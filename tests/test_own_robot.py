@@ -16,6 +16,7 @@ import pytest
 import newton_qd
 from newton_qd import registry
 from newton_qd.envs.locomotion import Locomotion
+from newton_qd.physics.system import PhysicsState
 
 EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "own_robot.py"
 
@@ -72,3 +73,24 @@ def test_bad_options(example: ModuleType) -> None:
         Locomotion(example.TRIPOD, healthy_z_range=(1.0, 0.5))
     with pytest.raises(FileNotFoundError, match="nowhere"):
         Locomotion(dataclasses.replace(example.TRIPOD, urdf="./nowhere.urdf"))
+
+
+def test_walls_of_the_yard_stop_the_tripod(example: ModuleType) -> None:
+    """Sent at the first wall it stays on this side; beside the wall it goes on."""
+    env = Locomotion(example.TRIPOD, scene=example.YARD)
+    start = jax.jit(env.reset)(jax.random.key(0))
+
+    def end(y: float) -> float:
+        """Forward position [m] after two seconds, thrown at 8 m/s."""
+        physics = start.pipeline_state
+        assert isinstance(physics, PhysicsState)
+        q = physics.q.at[1].set(y)
+        v = physics.v.at[0].set(8.0)
+        sent = start.replace(pipeline_state=dataclasses.replace(physics, q=q, v=v))
+        still = jnp.zeros((50, env.action_size))
+        last = jax.lax.scan(lambda s, a: (env.step(s, a), None), sent, still)[0]
+        return last.pipeline_state.q[0]
+
+    ends = jax.jit(jax.vmap(end))(jnp.array([1.5, -3.5]))
+    stopped, passed = ends.tolist()
+    assert stopped < 2.0 < passed, ends

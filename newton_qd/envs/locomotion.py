@@ -9,6 +9,7 @@ from newton_qd.envs.base import PhysicsEnv
 from newton_qd.envs.vectors import ordered_sum
 from newton_qd.physics.system import JointKind, PhysicsState
 from newton_qd.robots import Robot
+from newton_qd.scenes import Scene
 from newton_qd.types import Action, Metrics
 
 _ROOT_Q, _ROOT_V = 7, 6  # a free root has 7 coordinates and 6 velocities
@@ -34,6 +35,7 @@ class Locomotion(PhysicsEnv):
         healthy_z_range: tuple[float, float] = (0.0, float("inf")),
         reset_noise_scale: float = 0.1,
         dtype: str = "float32",
+        scene: Scene | None = None,
     ) -> None:
         """Loads a robot.
 
@@ -46,6 +48,7 @@ class Locomotion(PhysicsEnv):
             reset_noise_scale: Half width of the uniform noise on joint angles [rad]
                 and joint velocities [rad/s] at a reset.
             dtype: ``"float32"``, or ``"float64"`` with JAX x64 on.
+            scene: What stands on the ground; ``None``: nothing.
 
         Raises:
             ValueError: The robot's first joint is not free, or the range is empty.
@@ -59,7 +62,9 @@ class Locomotion(PhysicsEnv):
         self._ctrl_cost_weight = ctrl_cost_weight
         self._healthy_reward = healthy_reward
         self._healthy_z_range = healthy_z_range
-        super().__init__(robot, reset_noise_scale=reset_noise_scale, dtype=dtype)
+        super().__init__(
+            robot, reset_noise_scale=reset_noise_scale, dtype=dtype, scene=scene
+        )
         kind = JointKind(self.system.joint_kind[0])
         if kind != JointKind.FREE:
             raise ValueError(
