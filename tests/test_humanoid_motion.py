@@ -11,9 +11,7 @@ import pytest
 from physics_helpers import batched_step, random_states, report, variant
 
 import newton_qd
-from newton_qd import physics
 from newton_qd.envs.base import State
-from newton_qd.envs.humanoid import Humanoid
 from newton_qd.robots import HUMANOID
 
 
@@ -61,44 +59,3 @@ def test_it_stands_on_its_feet_and_falls_as_the_original() -> None:
     assert np.all(touching.mean(axis=0) > 0.85)
     assert 50 < np.argmax(states.done) + 1 < 66
     assert float(states.reward.sum()) == pytest.approx(558.6, rel=0.02)
-
-
-GRADIENT_STEPS, GRADIENT_STATES = 16, 50
-
-
-def test_gradient_of_a_reward_sum(x64: None) -> None:
-    env = Humanoid(dtype="float64")
-    system, rng = env.system, np.random.default_rng(0)
-    q, v, _ = random_states(system, rng, GRADIENT_STATES)
-    actions = rng.uniform(-1, 1, (GRADIENT_STATES, GRADIENT_STEPS, env.action_size))
-    fixed = env.fixed_state()
-
-    def total(q: jax.Array, v: jax.Array, actions: jax.Array) -> jax.Array:
-        start = physics.initial_state(system, q, v)
-
-        def advance(state: State, action: jax.Array) -> tuple[State, jax.Array]:
-            state = env.step(state, action)
-            return state, state.reward
-
-        state = fixed.replace(pipeline_state=start)
-        return jax.lax.scan(advance, state, actions)[1].sum()
-
-    value = jax.jit(jax.vmap(total))
-    inputs = (q, v, actions)
-    gradients = jax.jit(jax.vmap(jax.grad(total, argnums=(0, 1, 2))))(*inputs)
-    errors = []
-    for i, gradient in enumerate(map(np.asarray, gradients)):
-        assert np.all(np.isfinite(gradient))
-        assert np.all(np.abs(gradient).reshape(GRADIENT_STATES, -1).max(axis=1) > 0)
-        direction = rng.normal(size=inputs[i].shape)
-        ahead, behind = (
-            value(*inputs[:i], inputs[i] + h * direction, *inputs[i + 1 :])
-            for h in (1e-6, -1e-6)
-        )
-        difference = np.asarray(ahead - behind) / 2e-6
-        axes = tuple(range(1, gradient.ndim))
-        exact = (gradient * direction).sum(axis=axes)
-        size = np.sqrt((gradient**2).sum(axis=axes) * (direction**2).sum(axis=axes))
-        errors.append(np.max(np.abs(difference - exact) / size))
-    report("largest error for q, v, actions", errors)
-    assert max(errors) < 1e-4
