@@ -151,10 +151,12 @@ def test_full_gear_overshoots_a_limit_as_stated(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize(
+    "name", [*(f"{robot}_uni" for robot in ROBOTS), "anttrap", "antmaze", "humanoidtrap"]
+)
 def test_ten_thousand_steps_are_finite(name: str) -> None:
     """64 worlds, uniformly random actions, no auto-reset."""
-    env = newton_qd.create(f"{name}_uni", episode_length=20_000, auto_reset=False)
+    env = newton_qd.create(name, episode_length=20_000, auto_reset=False)
     worlds, steps, chunk = 64, 10_000, 1_000
 
     @jax.jit
