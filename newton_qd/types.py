@@ -15,7 +15,7 @@ Descriptor: TypeAlias = jax.Array
 Mask: TypeAlias = jax.Array
 Metrics: TypeAlias = dict[str, jax.Array]
 Info: TypeAlias = dict[str, Any]
-Params: TypeAlias = Any
+Params: TypeAlias = Any  # of simulated robots: physics.PhysicsParams
 
 INFO_KEYS: Mapping[str, str] = types.MappingProxyType(
     {

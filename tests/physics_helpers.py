@@ -63,9 +63,14 @@ def random_states(system: System, rng: np.random.Generator, worlds: int) -> Arra
 def one_step(system: System) -> Callable[..., tuple[jax.Array, ...]]:
     """The step of one world as a function of arrays: q, v, impulse, normal, fault."""
 
-    def step(q: jax.Array, v: jax.Array, control: jax.Array) -> tuple[jax.Array, ...]:
+    def step(
+        q: jax.Array,
+        v: jax.Array,
+        control: jax.Array,
+        params: physics.PhysicsParams | None = None,
+    ) -> tuple[jax.Array, ...]:
         state = physics.initial_state(system, q, v)
-        after, fault = physics.step(system, state, control)
+        after, fault = physics.step(system, state, control, params)
         return after.q, after.v, after.impulse, after.normal_impulse, fault
 
     return step
@@ -88,9 +93,14 @@ def functional(system: System, steps: int) -> Callable[..., jax.Array]:
     weights = [rng.normal(size=shape) for shape in shapes]
     step = one_step(system)
 
-    def value(q: jax.Array, v: jax.Array, control: jax.Array) -> jax.Array:
+    def value(
+        q: jax.Array,
+        v: jax.Array,
+        control: jax.Array,
+        params: physics.PhysicsParams | None = None,
+    ) -> jax.Array:
         def advance(state: Any, _: None) -> Any:
-            *state, impulse, normal, _fault = step(*state, control)
+            *state, impulse, normal, _fault = step(*state, control, params)
             return tuple(state), (impulse, normal)
 
         state, outputs = jax.lax.scan(advance, (q, v), None, length=steps)

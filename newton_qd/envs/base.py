@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from newton_qd import physics
-from newton_qd.envs.inputs import checked_action, refuse_params, require_precision
+from newton_qd.envs.inputs import checked_action, require_precision
 from newton_qd.envs.state import State, select
 from newton_qd.envs.views import SystemView
 from newton_qd.physics.system import PhysicsState, System
@@ -42,7 +42,8 @@ class Env(abc.ABC):
         Args:
             state: Where to start; it is not changed and may be stepped again.
             action: (nu,) array of the environment's dtype, meant for -1 to 1.
-            params: Physical parameters of the world; ``None``: as in its files.
+            params: Physical parameters of the world, as ``default_params`` with fields
+                replaced; ``None``: as in its files.
         """
 
     @property
@@ -69,6 +70,14 @@ class Env(abc.ABC):
     @abc.abstractmethod
     def name(self) -> str:
         """Name of the robot or of the task."""
+
+    @property
+    def default_params(self) -> Params:
+        """What a step takes for ``params``: as in the files, ``None`` without any.
+
+        In a batch every parameter has the batch axis in front.
+        """
+        return None
 
     @property
     def unwrapped(self) -> Env:
@@ -226,7 +235,6 @@ class PhysicsEnv(Env):
     def step(self, state: State, action: Action, params: Params = None) -> State:
         """Advances by one control step, or freezes a world at fault."""
         require_precision(self._dtype)
-        refuse_params(params)
         action = checked_action(action, self.action_size, self._dtype)
         # The physics freezes a world at fault and passes no gradient through it; a
         # world that was at fault before is handed over as one. The outcome sees numbers
@@ -234,7 +242,8 @@ class PhysicsEnv(Env):
         start: PhysicsState = state.pipeline_state
         sound = jnp.all(jnp.isfinite(action)) & (state.info["fault"] == 0)
         nan = jnp.full_like(action, jnp.nan)
-        after, fault = physics.step(self.system, start, jnp.where(sound, action, nan))
+        given = jnp.where(sound, action, nan)
+        after, fault = physics.step(self.system, start, given, params)
         fault = jnp.maximum(state.info["fault"], fault)
         faulty = fault != 0
         action = jnp.where(faulty, jnp.zeros_like(action), action)
@@ -251,6 +260,12 @@ class PhysicsEnv(Env):
             metrics={**state.metrics, **metrics},
             info={**state.info, "fault": fault},
         )
+
+    @property
+    def default_params(self) -> physics.PhysicsParams:
+        """Physical parameters of one world as in the robot's files."""
+        require_precision(self._dtype)
+        return physics.default_params(self.system)
 
     @property
     def observation_layout(self) -> tuple[tuple[str, int], ...]:

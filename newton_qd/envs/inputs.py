@@ -23,15 +23,15 @@ def require_precision(dtype: np.dtype) -> None:
 
 
 def refuse_params(params: Params) -> None:
-    """Raises where an environment without per-world parameters is given some.
+    """Raises where an environment without physical parameters is given some.
 
     Raises:
         ValueError: ``params`` is not ``None``.
     """
     if params is not None:
         raise ValueError(
-            f"params={params!r}: per-world parameters are not available yet; "
-            "allowed: None"
+            f"params: {type(params).__name__} given, and this environment has no "
+            "physical parameters; allowed: None"
         )
 
 

@@ -9,15 +9,18 @@ from newton_qd.physics.inspection import (
     mass_matrix,
 )
 from newton_qd.physics.model import load_system
+from newton_qd.physics.parameters import PhysicsParams, default_params
 from newton_qd.physics.rest import raising_coordinate
 from newton_qd.physics.step import initial_state, step
 from newton_qd.physics.system import PhysicsState, System
 
 __all__ = [
     "Kinematics",
+    "PhysicsParams",
     "PhysicsState",
     "System",
     "bias_forces",
+    "default_params",
     "forward_kinematics",
     "from_jax",
     "initial_state",

@@ -19,18 +19,19 @@ from warp._src.jax.ffi import FfiCallable
 
 from newton_qd.physics import interrupts
 from newton_qd.physics.launch import Launcher, thread_count
+from newton_qd.physics.parameters import parameter_count
 from newton_qd.physics.precision import SCALARS
 from newton_qd.physics.system import System
 
 
 @functools.cache
-def _launcher(system: System, alias: str) -> Launcher:
-    return Launcher(system, wp.get_device(alias))
+def _launcher(system: System, alias: str, parametric: bool) -> Launcher:
+    return Launcher(system, wp.get_device(alias), parametric)
 
 
-def launcher(system: System, device: Any) -> Launcher:
+def launcher(system: System, device: Any, parametric: bool = False) -> Launcher:
     """The launcher of ``system`` on a Warp device; made once."""
-    return _launcher(system, device.alias)
+    return _launcher(system, device.alias, parametric)
 
 
 @contextlib.contextmanager
@@ -47,7 +48,7 @@ def _errors_contained() -> Iterator[None]:
 
 
 @functools.cache
-def _kernel_call(system: System, name: str, size: int) -> Any:
+def _kernel_call(system: System, name: str, size: int, parametric: bool = False) -> Any:
     """A kernel as a function of contiguous rows.
 
     Args:
@@ -55,6 +56,7 @@ def _kernel_call(system: System, name: str, size: int) -> Any:
         name: Kernel; one that ends in ``_backward`` runs its adjoint, and takes the
             adjoints of the outputs as a second argument.
         size: Length of a row of the first argument.
+        parametric: Whether the row ends with the world's parameters.
 
     Returns:
         Function of one world's rows that returns a tuple of one row; its
@@ -64,7 +66,8 @@ def _kernel_call(system: System, name: str, size: int) -> Any:
 
     def forward(x: wp.array(dtype=real), y: wp.array(dtype=real)):
         with _errors_contained():
-            launcher(system, x.device).launch(name, x.shape[0] // size, x, y)
+            worlds = x.shape[0] // size
+            launcher(system, x.device, parametric).launch(name, worlds, x, y)
 
     def backward(
         x: wp.array(dtype=real),
@@ -73,12 +76,13 @@ def _kernel_call(system: System, name: str, size: int) -> Any:
     ):
         with _errors_contained():
             worlds, arrays = x.shape[0] // size, (x, y_bar, x_bar)
-            launcher(system, x.device).launch(name, worlds, *arrays, adjoint=True)
+            own = launcher(system, x.device, parametric)
+            own.launch(name, worlds, *arrays, adjoint=True)
 
     function = backward if name.endswith("_backward") else forward
     function.__name__ = function.__qualname__ = name
     # Warp loads the module of the function when a call is traced: the kernels' one
-    default = launcher(system, wp.device_from_jax(jax.devices()[0]))
+    default = launcher(system, wp.device_from_jax(jax.devices()[0]), parametric)
     function.__module__ = default.prepare(name).name
     call = wp.jax_callable(
         function,
@@ -111,19 +115,21 @@ def _row(system: System, **parts: tuple[jax.Array, int]) -> jax.Array:
     return jnp.concatenate([array for array, _ in parts.values()])
 
 
-def _differentiable(system: System, name: str, size: int, output_size: int) -> Any:
+def _differentiable(
+    system: System, name: str, size: int, output_size: int, parametric: bool = False
+) -> Any:
     """Reverse-mode function of one row; the adjoint is compiled when first traced."""
 
     @jax.custom_vjp
     def run(x: jax.Array) -> jax.Array:
-        forward = _kernel_call(system, f"{name}_forward", size)
+        forward = _kernel_call(system, f"{name}_forward", size, parametric)
         return forward(x, output_dims=output_size)[0]
 
     def run_forward(x: jax.Array) -> tuple[jax.Array, jax.Array]:
         return run(x), x
 
     def run_backward(x: jax.Array, y_bar: jax.Array) -> tuple[jax.Array]:
-        backward = _kernel_call(system, f"{name}_backward", size)
+        backward = _kernel_call(system, f"{name}_backward", size, parametric)
         return (backward(x, y_bar, output_dims=size)[0],)
 
     run.defvjp(run_forward, run_backward)
@@ -138,7 +144,9 @@ def control_step(system: System) -> Any:
         system: The system.
 
     Returns:
-        A function of ``q`` (nq,), ``v`` (nv,), ``control`` (nu,) that returns
+        A function of ``q`` (nq,), ``v`` (nv,), ``control`` (nu,) and, where the
+        world has its own, ``params``
+        (:func:`~newton_qd.physics.parameters.parameter_count`,) that returns
         ``q`` (nq,), ``v`` (nv,), ``impulse`` (nb, 6), ``normal_impulse`` (nb,) and
         ``fault`` () as in :class:`~newton_qd.physics.system.PhysicsState`; reverse
         mode once, no forward mode. Under ``vmap`` the worlds share one launch.
@@ -146,12 +154,20 @@ def control_step(system: System) -> Any:
     interrupts.install()
     nq, nv, nb = system.nq, system.nv, system.nb
     size, output_size = nq + nv + system.nu, nq + nv + 7 * nb + 1
+    count = parameter_count(system)
     step = _differentiable(system, "step", size, output_size)
+    own_step = _differentiable(system, "step", size + count, output_size, True)
     ends = np.cumsum([nq, nv, 6 * nb, nb])
 
-    def run(q: jax.Array, v: jax.Array, control: jax.Array) -> tuple[jax.Array, ...]:
+    def run(
+        q: jax.Array, v: jax.Array, control: jax.Array, params: jax.Array | None = None
+    ) -> tuple[jax.Array, ...]:
         thread_count()  # a bad setting is an error here, not inside a compiled call
-        y = step(_row(system, q=(q, nq), v=(v, nv), control=(control, system.nu)))
+        parts = {"q": (q, nq), "v": (v, nv), "control": (control, system.nu)}
+        if params is None:
+            y = step(_row(system, **parts))
+        else:
+            y = own_step(_row(system, **parts, params=(params, count)))
         q, v, impulse, normal_impulse, fault = jnp.split(y, ends)
         return q, v, impulse.reshape(nb, 6), normal_impulse, fault[0]
 

@@ -31,17 +31,18 @@ def _with_world(table: np.ndarray) -> np.ndarray:
     return np.concatenate([table[:1], table])
 
 
-def build_model(system: System, device: Any) -> Any:
+def build_model(system: System, device: Any, parametric: bool = False) -> Any:
     """Copy a system to a device as a ``Model`` struct.
 
     Args:
         system: The system; its ``dtype`` chooses the kernels.
         device: Warp device.
+        parametric: Whether it is for the kernels with parameters of each world.
 
     Returns:
         The struct of :mod:`newton_qd.physics.kernels.structs`.
     """
-    space = kernels(system.dtype, pack_width(system.dtype, device))
+    space = kernels(system.dtype, pack_width(system.dtype, device), parametric)
     tree = build_tree(system)
     model = space.structs.Model()
     robot, material = system.robot, system.robot.material
@@ -134,7 +135,12 @@ def _put_contacts(put: Any, system: System, tree: Tree) -> None:
 
 
 def build_scratch(
-    system: System, slots: int, device: Any, *, adjoint: bool
+    system: System,
+    slots: int,
+    device: Any,
+    *,
+    adjoint: bool,
+    parametric: bool = False,
 ) -> SimpleNamespace:
     """Allocate the intermediates of ``slots`` packs of worlds in flight.
 
@@ -144,12 +150,13 @@ def build_scratch(
         device: Warp device.
         adjoint: Whether every substep is kept, with adjoints; otherwise the substeps
             share their memory.
+        parametric: As in :func:`build_model`.
 
     Returns:
         ``values`` and ``adjoints`` (the latter ``values`` itself without adjoint),
         two ``Scratch`` structs, and ``bytes_per_slot``.
     """
-    space = kernels(system.dtype, pack_width(system.dtype, device))
+    space = kernels(system.dtype, pack_width(system.dtype, device), parametric)
     values, adjoints = space.structs.Scratch(), space.structs.Scratch()
     n, nc = system.robot.substeps, max(len(system.contact_body), 1)
     steps, solves = (n, _SOLVES * n) if adjoint else (1, 1)
@@ -158,6 +165,7 @@ def build_scratch(
         "q": (n + 1) * system.nq,
         "v": (n + 1) * system.nv,
         "ctrl": max(system.nu, 1),
+        "parameter": 4 + 2 * system.nb + system.nv,
         **dict.fromkeys(_PER_BODY, steps * (system.nb + 1)),
         **dict.fromkeys(("axis_w", "axis_v"), steps * system.nv),
         **dict.fromkeys(_PER_CONTACT, steps * nc),

@@ -64,12 +64,20 @@ class Launcher:
     and reused; launches of one stream follow each other, so they can share it.
     """
 
-    def __init__(self, system: System, device: Any) -> None:
+    def __init__(self, system: System, device: Any, parametric: bool = False) -> None:
+        """Copies the system to the device.
+
+        Args:
+            system: The system.
+            device: Warp device.
+            parametric: Whether every row of inputs ends with the world's parameters.
+        """
         self.system = system
         self.device = device
         self.width = pack_width(system.dtype, device)
-        self.kernels = kernels(system.dtype, self.width)
-        self.model = buffers.build_model(system, device)
+        self.parametric = parametric
+        self.kernels = kernels(system.dtype, self.width, parametric)
+        self.model = buffers.build_model(system, device, parametric)
         self._block = 1 if device.is_cpu else _GPU_BLOCK
         self._scratch: dict[tuple[bool, Any], tuple[int, Any]] = {}
         self._commands: dict[tuple[str, Any], Any] = {}
@@ -166,7 +174,11 @@ class Launcher:
         held = self._scratch.get((adjoint, owner))
         if held is None or held[0] < slots:
             scratch = buffers.build_scratch(
-                self.system, slots, self.device, adjoint=adjoint
+                self.system,
+                slots,
+                self.device,
+                adjoint=adjoint,
+                parametric=self.parametric,
             )
             held = self._scratch[adjoint, owner] = (slots, scratch)
             self._commands.clear()

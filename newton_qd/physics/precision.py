@@ -17,19 +17,25 @@ _VECTOR_BYTES = 32
 SCALARS = {"float32": wp.float32, "float64": wp.float64}
 
 
-@functools.cache
-def kernels(dtype: str, width: int) -> SimpleNamespace:
+def kernels(dtype: str, width: int, parametric: bool = False) -> SimpleNamespace:
     """Load the kernel package for one scalar type and one width.
 
     Args:
         dtype: ``"float32"`` or ``"float64"``.
         width: Worlds of a pack, see :mod:`newton_qd.physics.kernels`.
+        parametric: Whether every world brings physical parameters of its own.
 
     Returns:
         The modules of :mod:`newton_qd.physics.kernels` as attributes, loaded under a
         package name of their own so that Warp compiles each variant separately.
     """
-    name = f"newton_qd.physics.kernels_{dtype}_{width}"
+    return _load(dtype, width, parametric)
+
+
+@functools.cache
+def _load(dtype: str, width: int, parametric: bool) -> SimpleNamespace:
+    own = "_parametric" if parametric else ""
+    name = f"newton_qd.physics.kernels_{dtype}_{width}{own}"
     spec = importlib.util.spec_from_file_location(
         name, _TEMPLATE / "__init__.py", submodule_search_locations=[str(_TEMPLATE)]
     )
@@ -37,6 +43,7 @@ def kernels(dtype: str, width: int) -> SimpleNamespace:
     package = importlib.util.module_from_spec(spec)
     package.scalar = SCALARS[dtype]  # type: ignore[attr-defined]
     package.width = width  # type: ignore[attr-defined]
+    package.parametric = parametric  # type: ignore[attr-defined]
     sys.modules[name] = package
     spec.loader.exec_module(package)
     modules = ("structs", "world", "forward", "backward", "inspect")

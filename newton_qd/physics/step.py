@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from newton_qd.physics import bridge
+from newton_qd.physics.parameters import PhysicsParams, parameter_row
 from newton_qd.physics.system import PhysicsState, System
 
 
@@ -30,7 +31,10 @@ def initial_state(system: System, q: jax.Array, v: jax.Array) -> PhysicsState:
 
 
 def step(
-    system: System, state: PhysicsState, control: jax.Array
+    system: System,
+    state: PhysicsState,
+    control: jax.Array,
+    params: PhysicsParams | None = None,
 ) -> tuple[PhysicsState, jax.Array]:
     """Advance one world by one control step.
 
@@ -38,6 +42,8 @@ def step(
         system: The system.
         state: State of the world.
         control: (nu,) actions [-]; scaled by the gear, never clipped.
+        params: Physical parameters of the world; ``None``: those of the system,
+            with kernels that have no place for others.
 
     Returns:
         The next state, and the fault () int32: 0, or 1 where anything was not
@@ -46,11 +52,14 @@ def step(
         impulses are zero and every gradient through the step is exactly zero.
 
     Raises:
-        TypeError: The state or the control has another type than the system.
-        ValueError: The state or the control has another shape, or an environment
-            variable is wrong.
+        TypeError: The state, the control or a parameter has another type than the
+            system.
+        ValueError: The state, the control or a parameter has another shape, a
+            parameter that is not traced is out of bounds, or an environment variable
+            is wrong.
     """
+    own = None if params is None else parameter_row(system, params)
     q, v, impulse, normal_impulse, fault = bridge.control_step(system)(
-        state.q, state.v, control
+        state.q, state.v, control, own
     )
     return PhysicsState(q, v, impulse, normal_impulse), fault.astype(jnp.int32)

@@ -58,6 +58,11 @@ class Wrapper(Env):
         return self.env.name
 
     @property
+    def default_params(self) -> Params:
+        """What a step takes for ``params``: as in the files, ``None`` without any."""
+        return self.env.default_params
+
+    @property
     def unwrapped(self) -> Env:
         """The environment inside all wrappers."""
         return self.env.unwrapped

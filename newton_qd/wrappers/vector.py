@@ -48,4 +48,19 @@ class VectorWrapper(Wrapper):
                 f"action: shape {jnp.shape(action)} given; allowed: "
                 f"{(*batch, self.action_size)}"
             )
+        for leaf in jax.tree.leaves(params):
+            if jnp.shape(leaf)[:1] != batch:
+                raise ValueError(
+                    f"params: an array of shape {jnp.shape(leaf)} given; allowed: the "
+                    f"batch axis {batch} in front of every one, as in default_params"
+                )
         return jax.vmap(self.env.step)(state, action, params)
+
+    @property
+    def default_params(self) -> Params:
+        """Those of the environment inside, for each of ``batch_size`` worlds."""
+        size = (self.batch_size,)
+        return jax.tree.map(
+            lambda leaf: jnp.broadcast_to(leaf, size + jnp.shape(leaf)),
+            self.env.default_params,
+        )

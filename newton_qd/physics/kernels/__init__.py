@@ -2,12 +2,13 @@
 
 The package is a template: :func:`newton_qd.physics.precision.kernels` loads it once
 per scalar type and width under a name of its own, so that float32 and float64, CPU
-and GPU come from one source. A thread computes ``width`` worlds side by side: as the
-elements of one vector instruction on a CPU, where they fill it, and one on a GPU,
-whose threads are such elements already. So ``real``, ``vec3`` and the other types
-below hold one value for each world of a pack; what :mod:`.algebra` does with them it
-does with each world by itself, and a world's result depends neither on its place in
-the pack nor on its neighbours.
+and GPU come from one source; and once more where worlds bring physical parameters of
+their own, so that those who bring none pay nothing for them. A thread computes
+``width`` worlds side by side: as the elements of one vector instruction on a CPU,
+where they fill it, and one on a GPU, whose threads are such elements already. So
+``real``, ``vec3`` and the other types below hold one value for each world of a pack;
+what :mod:`.algebra` does with them it does with each world by itself, and a world's
+result depends neither on its place in the pack nor on its neighbours.
 
 Rules that the adjoint needs (Warp 1.19): every intermediate is stored once per step;
 a function that is marked ``stage`` is skipped when a caller is replayed, so its
@@ -17,9 +18,11 @@ a variable of its own that is only stored afterwards.
 
 import warp as wp
 
-# Set by the loader before this file runs; one world in float32 when imported directly.
+# Set by the loader before this file runs; these when imported directly.
 scalar = globals().get("scalar", wp.float32)
 width = globals().get("width", 1)
+# Whether every world brings physical parameters of its own.
+parametric = globals().get("parametric", False)
 
 # One value for each world of a pack.
 real = wp.types.vector(length=width, dtype=scalar)

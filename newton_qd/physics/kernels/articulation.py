@@ -29,6 +29,7 @@ from .algebra import (
 )
 from .memory import constant, load, store
 from .numbers import uniform
+from .parameters import body_mass, joint_damping
 from .smooth import gate, penetration
 from .structs import Model, Row, Scratch
 
@@ -75,7 +76,7 @@ def gather(m: Model, sc: Scratch, row: Row, i: int):
     body = row.body + i
     store(sc.total_ww, at, ww + load(sc.inertia, body))
     store(sc.total_wv, at, wv + skew(load(sc.moment, body)))
-    store(sc.total_vv, at, add_diagonal(vv, constant(m.mass, i)))
+    store(sc.total_vv, at, add_diagonal(vv, body_mass(m, sc, row, i)))
     store(sc.total_w, at, n - m.h * load(sc.wrench_w, body))
     store(sc.total_v, at, f - m.h * load(sc.wrench_v, body))
 
@@ -92,7 +93,7 @@ def eliminate_hinge(m: Model, sc: Scratch, row: Row, i: int):
     ahead = qk + h * vk
     ks = constant(m.stiffness, k)
     kl = constant(m.limit_stiffness, k)
-    kd = constant(m.damping, k)
+    kd = joint_damping(m, sc, row, k)
     width = uniform(m.limit_smoothing)
     lower = ahead - constant(m.limit_lower, k)
     upper = constant(m.limit_upper, k) - ahead

@@ -29,6 +29,7 @@ from .algebra import (
 from .memory import constant, load, store
 from .nearest import nearest_share, obstacle_distance, obstacle_normal
 from .numbers import sqrt, uniform
+from .parameters import contact_stiffness, friction, total_mass
 from .smooth import gate, penetration
 from .structs import Model, Row, Scratch
 
@@ -66,10 +67,14 @@ def contact_predictor(m: Model, sc: Scratch, row: Row, c: int):
     vt = vc - vn * normal
     reach = gap + m.h * vn
     damper = penetration(m.dissipation * vn - scalar(1.0), uniform(DISSIPATION_WIDTH))
-    k = (m.h * m.contact_stiffness) * damper
+    k = (m.h * contact_stiffness(m, sc, row)) * damper
     width = uniform(m.contact_smoothing)
     push = k * penetration(reach, width)
-    wt = m.friction * push / sqrt(m.slip_velocity * m.slip_velocity + dot(vt, vt))
+    wt = (
+        friction(m, sc, row)
+        * push
+        / sqrt(m.slip_velocity * m.slip_velocity + dot(vt, vt))
+    )
     store(sc.point, row.contact + c, r)
     store(sc.arm, row.contact + c, r - transform_point(x, constant(m.com, i)))
     store(sc.normal, row.contact + c, normal)
@@ -108,8 +113,8 @@ def contact_corrector(m: Model, sc: Scratch, row: Row, c: int):
     slip = v1 - dot(n, v1) * n
     normal_impulse = load(sc.normal_impulse, row.report + c)
     wt = friction_weight(
-        uniform(m.total_mass),
-        m.friction * normal_impulse,
+        total_mass(m, sc, row),
+        friction(m, sc, row) * normal_impulse,
         load(sc.weight_t, row.before + c),
         dot(slip, slip),
         m.slip_velocity,

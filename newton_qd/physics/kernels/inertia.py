@@ -15,6 +15,7 @@ from .algebra import (
     transpose,
 )
 from .memory import constant, load, store
+from .parameters import body_inertia, body_mass
 from .structs import Model, Row, Scratch
 
 
@@ -27,12 +28,12 @@ def rigid_inertia(m: Model, sc: Scratch, row: Row, i: int):
     """
     x = load(sc.pose, row.body + i)
     c = transform_point(x, constant(m.com, i))
-    mass = constant(m.mass, i)
+    mass = body_mass(m, sc, row, i)
     hm = mass * c
-    spin = constant(m.inertia, i)
+    spin = body_inertia(m, sc, row, i)
     if load(m.isotropic, i) == 0:
         r = matrix(rotation(x))
-        spin = r * constant(m.inertia, i) * transpose(r)
+        spin = r * body_inertia(m, sc, row, i) * transpose(r)
     io = add_diagonal(spin - outer(hm, c), dot(hm, c))
     w = load(sc.twist_w, row.body + i)
     v = load(sc.twist_v, row.body + i)

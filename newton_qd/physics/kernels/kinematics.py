@@ -23,6 +23,7 @@ from .algebra import (
 )
 from .memory import constant, load, store
 from .numbers import uniform
+from .parameters import gravity
 from .smooth import turn_about
 from .structs import Model, Row, Scratch
 
@@ -45,7 +46,7 @@ def world_frame(m: Model, sc: Scratch, row: Row):
     store(sc.twist_w, row.body, zero)
     store(sc.twist_v, row.body, zero)
     store(sc.bias_w, row.body, zero)
-    store(sc.bias_v, row.body, vector(real(), real(), uniform(m.gravity)))
+    store(sc.bias_v, row.body, vector(real(), real(), gravity(m, sc, row)))
 
 
 @stage

@@ -85,6 +85,7 @@ class Scratch:
     q: wp.array[real]
     v: wp.array[real]
     ctrl: wp.array[real]
+    parameter: wp.array[real]  # see the module of that name
     fault: wp.array[real]  # (slots,), 0 or 1
     # bodies; world axes, spatial vectors about O
     pose: wp.array[transform]
@@ -143,6 +144,7 @@ class Row:
     v: int
     v_next: int
     ctrl: int
+    parameter: int
     body: int
     dof: int
     contact: int
@@ -173,6 +175,7 @@ def row_at(m: Model, slot: int, keep: int, s: int, p: int):
     r.v = (slot * (m.substeps + 1) + s) * m.nv
     r.v_next = r.v + m.nv
     r.ctrl = slot * m.nu
+    r.parameter = slot * (4 + 2 * m.nb + m.nv)
     r.body = step * (m.nb + 1)
     r.dof = step * m.nv
     r.contact = step * m.nc

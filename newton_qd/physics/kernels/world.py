@@ -1,7 +1,8 @@
 """Moving a pack of worlds between the caller's arrays and the scratch, with adjoints.
 
-The arrays hold one contiguous row per world. Inputs: q, v, ctrl. Outputs: q, v, the
-contact impulse of each body (6), the normal impulse of each body, the fault.
+The arrays hold one contiguous row per world. Inputs: q, v, ctrl, and its parameters
+where it has its own. Outputs: q, v, the contact impulse of each body (6), the normal
+impulse of each body, the fault.
 """
 
 import warp as wp
@@ -10,6 +11,12 @@ from . import real, scalar, sync, vec3, width
 from .algebra import add, component, mul, vector
 from .memory import constant, gather, load, scatter, store
 from .numbers import beyond, choose
+from .parameters import (
+    PARAMETRIC,
+    load_parameters,
+    parameter_inputs,
+    return_parameters,
+)
 from .structs import Model, Row, Scratch, row_at
 
 WIDTH = wp.constant(width)
@@ -39,7 +46,7 @@ def pack_at(n: int, first: int, worlds: int, slot_stride: int):
 @wp.func
 def input_size(m: Model):
     """Length of a row of inputs."""
-    return m.nq + m.nv + m.nu
+    return m.nq + m.nv + m.nu + parameter_inputs(m)
 
 
 @wp.func
@@ -71,6 +78,9 @@ def load_world(
     at += m.nv
     for k in range(lane, m.nu, lanes):
         store(sc.ctrl, row.ctrl + k, gather(x, at + k, size, pack.count))
+    if PARAMETRIC:
+        at += m.nu
+        load_parameters(m, sc, row, x, at, size, pack.count, lane, lanes)
     sync(lane)
 
 
@@ -91,6 +101,11 @@ def adj_load_world(
     size = input_size(m)
     at = pack.first * size
     fault = load(sc.fault, pack.slot)
+    if PARAMETRIC:
+        last = at + m.nq + m.nv + m.nu
+        return_parameters(
+            m, g, row, x, x_bar, last, size, pack.count, fault, lane, lanes
+        )
     for k in range(lane, m.nq, lanes):
         value = choose(fault, real(), load(g.q, row.q + k))
         scatter(x_bar, at + k, size, pack.count, value)
