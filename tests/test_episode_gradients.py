@@ -338,7 +338,7 @@ def proportions(env: Any, steps: int = 40) -> Any:
 
 def test_smooth_proportion_goes_to_the_boolean_one() -> None:
     """As the width goes to 0, and a straight-through one is it at any width."""
-    plain = newton_qd.create("hopper_uni", auto_reset=False)
+    plain: Any = newton_qd.create("hopper_uni", auto_reset=False)
     actions = jax.random.uniform(jax.random.key(1), (40, 3), jnp.float32, -1.0, 1.0)
     expected, loads = proportions(plain)[1](actions)
     assert 0 < expected[0] < 1

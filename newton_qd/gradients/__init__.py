@@ -1,6 +1,7 @@
 """Gradients of fitness and descriptor over whole episodes, and what they are worth.
 
 - ``make_episode_gradient``: of a policy or of open-loop actions
+- ``make_mixed_gradient``: the same under noise, of first and zeroth order at once
 - ``GradientOptions``: windows, clipping, discounting, memory
 - ``with_smooth_descriptor``: an environment whose descriptor has a gradient
 
@@ -17,23 +18,28 @@ if TYPE_CHECKING:
     from newton_qd.gradients.episode import Outcome, make_episode
     from newton_qd.gradients.exact import EpisodeGradients, make_episode_gradient
     from newton_qd.gradients.flow import GradientOptions
+    from newton_qd.gradients.mixed import MixedGradients, make_mixed_gradient
     from newton_qd.gradients.smooth import with_smooth_descriptor
 
 __all__ = [
     "EpisodeGradients",
     "GradientOptions",
+    "MixedGradients",
     "Outcome",
     "make_episode",
     "make_episode_gradient",
+    "make_mixed_gradient",
     "with_smooth_descriptor",
 ]
 
 _HOME = {
     "EpisodeGradients": "exact",
     "GradientOptions": "flow",
+    "MixedGradients": "mixed",
     "Outcome": "episode",
     "make_episode": "episode",
     "make_episode_gradient": "exact",
+    "make_mixed_gradient": "mixed",
     "with_smooth_descriptor": "smooth",
 }
 
