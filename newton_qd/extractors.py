@@ -11,6 +11,17 @@ import jax.numpy as jnp
 from newton_qd.types import Descriptor, Mask, Observation
 
 
+@dataclasses.dataclass(frozen=True)
+class Trajectories:
+    """The part of the transitions that descriptor extractors read.
+
+    Attributes:
+        state_desc: (n, t, nd) state descriptors before each step.
+    """
+
+    state_desc: jax.Array
+
+
 def folded_sum(values: jax.Array, axis: int) -> jax.Array:
     """Sums by halving, in an order that does not depend on the other axes.
 

@@ -37,6 +37,7 @@ LAYERS = (
     "extractors",
     "tasks",
     "registry",
+    "gradients",
     "__init__",
 )
 # Leaves read every layer, and these leaves.

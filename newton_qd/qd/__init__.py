@@ -4,6 +4,8 @@
 - ``load_archive(folder)``, ``plot_archive(...)``: what a run has found
 - ``make_task``, ``make_policy``, ``make_scoring_function``: the parts, for other
   algorithms of QDax
+- ``make_gradient_scoring_function``: scores with the gradients of fitness and
+  descriptor
 
 Importing this package imports none of its parts: each name is loaded when it is
 first used. QDax and matplotlib (extra ``qd``) are imported by the functions that
@@ -20,6 +22,7 @@ if TYPE_CHECKING:
     from newton_qd.qd.config import ConfigError, EvolveConfig
     from newton_qd.qd.evolve import EvolveResult, evolve
     from newton_qd.qd.folder import Archive, load_archive
+    from newton_qd.qd.gradient_scoring import make_gradient_scoring_function
     from newton_qd.qd.plot import plot_archive
     from newton_qd.qd.rollout import Policy, make_policy, make_scoring_function
     from newton_qd.qd.search import SearchError
@@ -36,6 +39,7 @@ __all__ = [
     "Task",
     "evolve",
     "load_archive",
+    "make_gradient_scoring_function",
     "make_policy",
     "make_scoring_function",
     "make_task",
@@ -53,6 +57,7 @@ _HOME = {
     "Task": "task",
     "evolve": "evolve",
     "load_archive": "folder",
+    "make_gradient_scoring_function": "gradient_scoring",
     "make_policy": "rollout",
     "make_scoring_function": "rollout",
     "make_task": "task",

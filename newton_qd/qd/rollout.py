@@ -11,8 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from newton_qd.extractors import Trajectories
+from newton_qd.gradients.episode import make_episode
 from newton_qd.qd.extras import require_extra
 from newton_qd.qd.task import Task
+
+__all__ = ["Policy", "Trajectories", "make_policy", "make_scoring_function"]
 
 ScoringFunction = Callable[
     [jax.Array, jax.Array], tuple[jax.Array, jax.Array, dict[str, Any]]
@@ -35,17 +39,6 @@ class Policy:
     init: Callable[[jax.Array], jax.Array]
     unravel: Callable[[jax.Array], Any]
     apply: Callable[[Any, jax.Array], jax.Array]
-
-
-@dataclasses.dataclass(frozen=True)
-class Trajectories:
-    """The part of the transitions that descriptor extractors read.
-
-    Attributes:
-        state_desc: (N, T, D) state descriptors before each step.
-    """
-
-    state_desc: jax.Array
 
 
 def make_policy(env: Any, hidden: tuple[int, ...]) -> Policy:
@@ -99,46 +92,19 @@ def make_scoring_function(
         faulty or whose result is not finite has fitness ``-inf``: archives do not
         take it.
     """
-    step = jax.vmap(task.env.step)
-    act = jax.vmap(policy.apply)
+    episode = make_episode(
+        task.env,
+        policy.apply,
+        task.descriptor_extractor,
+        episode_length=episode_length,
+        unravel=policy.unravel,
+    )
 
     def score(
         genotypes: jax.Array, key: jax.Array
     ) -> tuple[jax.Array, jax.Array, dict[str, Any]]:
-        count = genotypes.shape[0]
-        parameters = jax.vmap(policy.unravel)(genotypes)
-        state = jax.vmap(task.env.reset, in_axes=None, axis_size=count)(key)
-
-        def advance(carry: tuple, _: None) -> tuple[tuple, tuple]:
-            state, fitness, over, bad = carry
-            descriptor = state.info["state_descriptor"]
-            state = step(state, act(parameters, state.obs))
-            # The sum runs in time order here, not in a reduction over time, so
-            # that a row's return does not depend on the size of the batch.
-            fitness = jnp.where(over, fitness, fitness + state.reward)
-            bad = bad | (~over & _faulty(state))
-            return (state, fitness, over | (state.done > 0), bad), (descriptor, over)
-
-        start = (
-            state,
-            jnp.zeros_like(state.reward),
-            jnp.zeros((count,), bool),
-            jnp.zeros((count,), bool),
-        )
-        (_, fitness, _, bad), (descriptors, over) = jax.lax.scan(
-            advance, start, None, length=episode_length
-        )
-        data = Trajectories(state_desc=jnp.swapaxes(descriptors, 0, 1))
-        mask = jnp.swapaxes(over, 0, 1).astype(descriptors.dtype)
-        result = task.descriptor_extractor(data, mask)
-        bad = bad | ~jnp.isfinite(fitness) | ~jnp.all(jnp.isfinite(result), axis=-1)
-        return jnp.where(bad, -jnp.inf, fitness), result, {}
+        outcome = jax.vmap(episode, in_axes=(0, None))(genotypes, key)
+        fitness = jnp.where(outcome.faulty, -jnp.inf, outcome.fitness)
+        return fitness, outcome.descriptor, {}
 
     return score
-
-
-def _faulty(state: Any) -> jax.Array:
-    """(N,) whether the physics contained a non-finite value in this step."""
-    if "fault" in state.info:
-        return state.info["fault"] != 0
-    return jnp.zeros(state.reward.shape, bool)

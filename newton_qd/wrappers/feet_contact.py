@@ -20,7 +20,11 @@ class FeetContactWrapper(Wrapper, QDEnv):
     """
 
     def __init__(
-        self, env: Env, env_name: str, smooth_width: float | None = None
+        self,
+        env: Env,
+        env_name: str,
+        smooth_width: float | None = None,
+        straight_through: bool = False,
     ) -> None:
         """Wraps a robot with feet.
 
@@ -29,6 +33,13 @@ class FeetContactWrapper(Wrapper, QDEnv):
             env_name: Its name, for the error.
             smooth_width: ``None``: 0 or 1 without a gradient; else the width of
                 :func:`~newton_qd.envs.feet.smooth_feet_contact`, above 0.
+            straight_through: Whether the reading stays 0 or 1 and has the gradient
+                of the smooth one.
+
+        Raises:
+            NotImplementedError: The environment is not a simulated robot with feet.
+            ValueError: A width that is not above 0, or none for a straight-through
+                gradient.
         """
         robot = env.unwrapped
         if not isinstance(robot, PhysicsEnv) or not len(robot.system.feet):
@@ -40,8 +51,14 @@ class FeetContactWrapper(Wrapper, QDEnv):
             raise ValueError(
                 f"smooth_width={smooth_width!r}: allowed: None, or above 0"
             )
+        if straight_through and smooth_width is None:
+            raise ValueError(
+                "straight_through=True, smooth_width=None: allowed: a width above 0, "
+                "over which the gradient is smooth"
+            )
         super().__init__(env)
         self._smooth_width = smooth_width
+        self._straight_through = straight_through
 
     def reset(self, rng: RNGKey) -> State:
         """Begins an episode."""
@@ -60,7 +77,10 @@ class FeetContactWrapper(Wrapper, QDEnv):
         if width is None:
             return per_world(lambda physics: feet_contact(system, physics), state)
         return per_world(
-            lambda physics: smooth_feet_contact(system, physics, width), state
+            lambda physics: smooth_feet_contact(
+                system, physics, width, self._straight_through
+            ),
+            state,
         )
 
     @property

@@ -1,0 +1,57 @@
+"""Gradients of fitness and descriptor over whole episodes, and what they are worth.
+
+- ``make_episode_gradient``: of a policy or of open-loop actions
+- ``make_mixed_gradient``: the same under noise, of first and zeroth order at once
+- ``GradientOptions``: windows, clipping, discounting, memory
+- ``with_smooth_descriptor``: an environment whose descriptor has a gradient
+
+Importing this package imports none of its parts: each name is loaded when it is
+first used.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from newton_qd.gradients.episode import Outcome, make_episode
+    from newton_qd.gradients.exact import EpisodeGradients, make_episode_gradient
+    from newton_qd.gradients.flow import GradientOptions
+    from newton_qd.gradients.mixed import MixedGradients, make_mixed_gradient
+    from newton_qd.gradients.smooth import with_smooth_descriptor
+
+__all__ = [
+    "EpisodeGradients",
+    "GradientOptions",
+    "MixedGradients",
+    "Outcome",
+    "make_episode",
+    "make_episode_gradient",
+    "make_mixed_gradient",
+    "with_smooth_descriptor",
+]
+
+_HOME = {
+    "EpisodeGradients": "exact",
+    "GradientOptions": "flow",
+    "MixedGradients": "mixed",
+    "Outcome": "episode",
+    "make_episode": "episode",
+    "make_episode_gradient": "exact",
+    "make_mixed_gradient": "mixed",
+    "with_smooth_descriptor": "smooth",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Loads a name of this package when it is first used."""
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -1,0 +1,142 @@
+"""How a gradient flows back from a control step to the one before it."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+Tree = TypeVar("Tree")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class GradientOptions:
+    """What becomes of the gradient on its way back through an episode.
+
+    The value of the episode never changes. Windows, clipping and discounting act on
+    the adjoint of the state that one control step hands to the next, in the order
+    clip, then discount; without them the gradient is exact. They bias it, and keep its
+    size in bounds where the exact one grows without.
+
+    Attributes:
+        window: Control steps after which the gradient is cut: a reward counts towards
+            actions of its own window only (Xu et al. 2022, "Accelerated policy
+            learning with parallel differentiable simulation"). Windows begin at
+            multiples of it; ``None``: one window.
+        clip: Largest Euclidean norm of the adjoint, over all floating-point numbers of
+            the state of one world; longer ones are shortened to it. ``None``: no limit.
+        discount: Factor for each control step that the adjoint goes back [-].
+        checkpoint_every: Control steps between the states that are kept for the way
+            back; what lies between is computed again. With 1, one state per control
+            step is kept; with the square root of the episode's length, the memory is
+            least. ``None``: every intermediate of the environment and of the policy
+            is kept and only the physics computed again, the fastest.
+    """
+
+    window: int | None = None
+    clip: float | None = None
+    discount: float = 1.0
+    checkpoint_every: int | None = 1
+
+    def __post_init__(self) -> None:
+        """Checks every value."""
+        for name in ("window", "checkpoint_every"):
+            value = getattr(self, name)
+            whole = isinstance(value, int) and not isinstance(value, bool)
+            if value is not None and not (whole and value >= 1):
+                raise ValueError(f"{name}={value!r}: allowed: None, integers from 1")
+        if self.clip is not None and not 0 < self.clip < math.inf:
+            raise ValueError(f"clip={self.clip!r}: allowed: None, or finite above 0")
+        if not 0 <= self.discount <= 1:
+            raise ValueError(f"discount={self.discount!r}: allowed: 0 to 1")
+
+    @property
+    def exact(self) -> bool:
+        """Whether the gradient is that of the episode."""
+        return self.window is None and self.clip is None and self.discount == 1
+
+    def factors(self, steps: int) -> np.ndarray:
+        """Factor of the adjoint of the state before each step, (steps,) [-]."""
+        factors = np.full(steps, self.discount)
+        if self.window is not None:
+            factors[:: self.window] = 0.0
+        return factors
+
+
+def passed_back(tree: Tree, factor: jax.Array, clip: float | None) -> Tree:
+    """Returns a pytree as it is, and changes the gradient that flows back into it.
+
+    Args:
+        tree: Any pytree; leaves that are not floating-point have no gradient.
+        factor: () by which the gradient is multiplied; at 0 it is exactly 0, whatever
+            flowed in.
+        clip: Largest norm of the gradient before that; ``None``: no limit.
+    """
+    leaves, structure = jax.tree.flatten(tree)
+    real = [jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves]
+    passed = iter(
+        _identity(clip, [x for x, yes in zip(leaves, real, strict=True) if yes], factor)
+    )
+    leaves = [next(passed) if yes else x for x, yes in zip(leaves, real, strict=True)]
+    return jax.tree.unflatten(structure, leaves)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _identity(
+    clip: float | None, leaves: list[jax.Array], factor: jax.Array
+) -> list[jax.Array]:
+    del clip, factor
+    return leaves
+
+
+def _forward(
+    clip: float | None, leaves: list[jax.Array], factor: jax.Array
+) -> tuple[list[jax.Array], jax.Array]:
+    del clip
+    return leaves, factor
+
+
+def _backward(
+    clip: float | None, factor: jax.Array, adjoint: list[jax.Array]
+) -> tuple[list[jax.Array], jax.Array]:
+    scale = factor
+    if clip is not None:
+        norm = tree_norm(adjoint)
+        # no division where nothing is clipped; an adjoint that is not finite stays so
+        scale = scale * jnp.where(
+            norm > clip, clip / jnp.where(norm > clip, norm, 1), 1
+        )
+    cut = factor == 0
+    changed = [jnp.where(cut, 0, x * scale.astype(x.dtype)) for x in adjoint]
+    return changed, jnp.zeros_like(factor)
+
+
+_identity.defvjp(_forward, _backward)
+
+
+def tree_norm(tree: Any) -> jax.Array:
+    """Euclidean norm () over all leaves; for use without gradient.
+
+    Args:
+        tree: Pytree of floating-point arrays.
+    """
+    # squares of numbers above 1e19 would not be finite in single precision
+    largest = tree_largest(tree)
+    unit = jnp.where((largest > 0) & jnp.isfinite(largest), largest, 1)
+    squares = [jnp.sum(jnp.square(x / unit)) for x in jax.tree.leaves(tree)]
+    return unit * jnp.sqrt(functools.reduce(jnp.add, squares))
+
+
+def tree_largest(tree: Any) -> jax.Array:
+    """Largest magnitude () over all leaves; for use without gradient.
+
+    Args:
+        tree: Pytree of floating-point arrays.
+    """
+    leaves = [jnp.max(jnp.abs(x), initial=0) for x in jax.tree.leaves(tree)]
+    return functools.reduce(jnp.maximum, leaves)

@@ -1,0 +1,212 @@
+"""The gradient of a smoothed episode, of first and zeroth order at once."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from newton_qd.envs.state import select
+from newton_qd.gradients.episode import Policy, make_episode
+from newton_qd.gradients.exact import (
+    EpisodeGradients,
+    make_episode_gradient,
+)
+from newton_qd.gradients.flow import GradientOptions
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class MixedGradients(EpisodeGradients):
+    """Gradients of smoothed episodes, and what their two estimates are worth.
+
+    Fitness, descriptor and ``faulty`` are those of the genotype without noise.
+    ``overflowed``: fewer than two pairs of samples were sound.
+
+    Attributes:
+        order: (N, 1 + D) weight of the first-order estimate, 0 to 1 [-].
+        first_variance: (N, 1 + D) variance of a first-order sample, summed over the
+            genotype; infinite where a sample was not finite.
+        zeroth_variance: (N, 1 + D) likewise of a zeroth-order sample.
+        bias: (N, 1 + D) distance between the means of the two, less what their
+            variance explains.
+    """
+
+    order: jax.Array
+    first_variance: jax.Array
+    zeroth_variance: jax.Array
+    bias: jax.Array
+
+
+def make_mixed_gradient(
+    env: Any,
+    policy: Policy | None,
+    descriptor_extractor: Callable[[Any, jax.Array], jax.Array],
+    *,
+    episode_length: int,
+    unravel: Callable[[Any], Any] = lambda genotype: genotype,
+    options: GradientOptions | None = None,
+    samples: int = 16,
+    sigma: float = 0.02,
+    tolerance: float = math.inf,
+) -> Callable[[Any, jax.Array], MixedGradients]:
+    """Builds the alpha-order gradient of an episode under noise on its genotype.
+
+    It estimates the gradient of the mean of f(x + w), w normal with standard deviation
+    ``sigma``, by alpha times the mean gradient of the samples plus (1 - alpha) times
+    the mean of (f(x + w) - f(x - w)) w / (2 sigma^2), in pairs of w and -w. Alpha
+    weights them by their inverse variances, and less where the two differ by more
+    than the tolerance (Suh et al. 2022, "Do differentiable simulators give better
+    policy gradients?", eqs. 6 to 9).
+
+    Args:
+        env: As in :func:`~newton_qd.gradients.make_episode_gradient`; so are the
+            policy, the extractor, the episode length, ``unravel`` and ``options``.
+        policy: Maps parameters and an observation to an action, or ``None``.
+        descriptor_extractor: Reads the descriptor of an episode.
+        episode_length: Control steps.
+        unravel: Maps a genotype to the parameters of the policy.
+        options: Windows, clipping, discounting and memory of the first order.
+        samples: Pairs of samples of a genotype, from 2; N individuals are
+            2 N ``samples`` worlds, in one launch.
+        sigma: Standard deviation of the noise, in the units of the genotype.
+        tolerance: Error that the estimate may have where first and zeroth order
+            disagree, in units of the gradient; infinite: inverse variances alone,
+            which trusts a first order that is wrong without being noisy.
+
+    Returns:
+        Function of genotypes and a key: the reset's, which gives the noise too.
+
+    Raises:
+        ValueError: A setting is out of its range.
+    """
+    if isinstance(samples, bool) or not isinstance(samples, int) or samples < 2:
+        raise ValueError(f"samples={samples!r}: allowed: integers from 2")
+    for name, value in (("sigma", sigma), ("tolerance", tolerance)):
+        if not value > 0:
+            raise ValueError(f"{name}={value!r}: allowed: above 0")
+    episode = make_episode(
+        env,
+        policy,
+        descriptor_extractor,
+        episode_length=episode_length,
+        unravel=unravel,
+    )
+    gradient = make_episode_gradient(
+        env,
+        policy,
+        descriptor_extractor,
+        episode_length=episode_length,
+        unravel=unravel,
+        options=options,
+    )
+
+    def mixed(genotypes: Any, key: jax.Array) -> MixedGradients:
+        noise = _noise(jax.random.fold_in(key, 1), genotypes, samples, sigma)
+        signs = jnp.array([1, -1], jnp.int32)
+        around = jax.tree.map(
+            lambda x, w: x[:, None, None] + w[:, :, None] * _like(signs, w[0]),
+            genotypes,
+            noise,
+        )
+        found = gradient(
+            jax.tree.map(lambda x: x.reshape(-1, *x.shape[3:]), around), key
+        )
+        count = jax.tree.leaves(genotypes)[0].shape[0]
+        found = jax.tree.map(
+            lambda x: x.reshape(count, samples, 2, *x.shape[1:]), found
+        )
+        centre = jax.vmap(episode, in_axes=(0, None))(genotypes, key)
+        combine = functools.partial(_combined, sigma=sigma, tolerance=tolerance)
+        return jax.vmap(combine)(centre, found, noise)
+
+    return mixed
+
+
+def _noise(key: jax.Array, genotypes: Any, samples: int, sigma: float) -> Any:
+    """Normal noise of every genotype, leaves (N, samples, ...)."""
+    leaves, structure = jax.tree.flatten(genotypes)
+    keys = jax.random.split(key, len(leaves))
+    noise = [
+        sigma * jax.random.normal(k, (len(x), samples, *x.shape[1:]), x.dtype)
+        for k, x in zip(keys, leaves, strict=True)
+    ]
+    return jax.tree.unflatten(structure, noise)
+
+
+def _like(factors: jax.Array, array: jax.Array) -> jax.Array:
+    """Factors (n,) that multiply arrays (..., n, *the axes of ``array`` but one)."""
+    shape = factors.shape + (1,) * (array.ndim - 1)
+    return factors.astype(array.dtype).reshape(shape)
+
+
+def _combined(
+    centre: Any, found: EpisodeGradients, noise: Any, *, sigma: float, tolerance: float
+) -> MixedGradients:
+    """The estimate of one individual from its pairs (samples, 2, ...)."""
+    sound = ~found.faulty.any(axis=1)
+    fitness = jnp.where(sound[:, None], found.fitnesses, 0)
+    values = jnp.concatenate([fitness[..., None], found.descriptors], axis=-1)
+    slope = jnp.where(sound[:, None], values[:, 0] - values[:, 1], 0) / (2 * sigma**2)
+    zeroth = jax.tree.map(lambda w: jax.vmap(jnp.multiply.outer)(slope, w), noise)
+    first = jax.tree.map(lambda g: g.mean(axis=1), found.gradients)
+    spread = functools.partial(_mean_and_variance, sound=sound)
+    first_mean, first_variance = spread(first)
+    zeroth_mean, zeroth_variance = spread(zeroth)
+    apart, apart_variance = spread(jax.tree.map(jnp.subtract, first, zeroth))
+    lost = (found.overflowed & sound[:, None, None]).any(axis=(0, 1))
+    first_variance = jnp.where(lost, jnp.inf, first_variance)
+    pairs = jnp.maximum(sound.sum(), 1)
+    # what the scatter of the samples adds to the distance of their means
+    distance = _squared(apart)
+    explained = jnp.where(jnp.isfinite(first_variance), apart_variance / pairs, 0)
+    bias = jnp.sqrt(jnp.maximum(distance - explained, 0))
+    total = zeroth_variance + first_variance
+    flat = total == 0
+    order = jnp.where(flat, 1, zeroth_variance / jnp.where(flat, 1, total))
+    error = jnp.sqrt(zeroth_variance / pairs)
+    allowed = jnp.maximum(tolerance - error, 0) / jnp.maximum(jnp.sqrt(distance), 1e-30)
+    order = jnp.where(lost, 0, jnp.minimum(order, allowed))
+    gradients = jax.tree.map(
+        lambda a, b: b + _like(order, a) * (a - b), first_mean, zeroth_mean
+    )
+    few = jnp.broadcast_to(sound.sum() < 2, order.shape)
+    keep = ~few & ~centre.faulty
+    zeros = jax.tree.map(jnp.zeros_like, gradients)
+    return MixedGradients(
+        fitnesses=jnp.where(centre.faulty, -jnp.inf, centre.fitness),
+        descriptors=centre.descriptor,
+        gradients=select(keep, gradients, zeros),
+        faulty=centre.faulty,
+        overflowed=few & ~centre.faulty,
+        order=order,
+        first_variance=first_variance,
+        zeroth_variance=zeroth_variance,
+        bias=bias,
+    )
+
+
+def _mean_and_variance(samples: Any, sound: jax.Array) -> tuple[Any, jax.Array]:
+    """Mean over sound samples, leaves (rows, ...), and total variance (rows,)."""
+    count = sound.sum()
+
+    def mean(x: jax.Array) -> jax.Array:
+        kept = jnp.where(_like(sound, x) != 0, x, 0)
+        return kept.sum(axis=0) / jnp.maximum(count, 1).astype(x.dtype)
+
+    means = jax.tree.map(mean, samples)
+    scatter = jax.tree.map(lambda x, m: mean(jnp.square(x - m)), samples, means)
+    parts = [x.reshape(x.shape[0], -1).sum(axis=1) for x in jax.tree.leaves(scatter)]
+    total = functools.reduce(jnp.add, parts)
+    return means, total * count / jnp.maximum(count - 1, 1)
+
+
+def _squared(rows: Any) -> jax.Array:
+    """Squared norm (rows,) of leaves (rows, ...)."""
+    squares = [jnp.square(x).reshape(x.shape[0], -1) for x in jax.tree.leaves(rows)]
+    return functools.reduce(jnp.add, [x.sum(axis=1) for x in squares])

@@ -1,0 +1,382 @@
+"""Gradients of whole episodes: values, options, memory and faults."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from physics_helpers import report
+
+import newton_qd
+from newton_qd.envs.feet import CONTACT_FRACTION
+from newton_qd.envs.state import State
+from newton_qd.extractors import (
+    Trajectories,
+    get_feet_contact_proportion,
+    get_final_xy_position,
+)
+from newton_qd.gradients import (
+    EpisodeGradients,
+    GradientOptions,
+    make_episode,
+    make_episode_gradient,
+    with_smooth_descriptor,
+)
+from newton_qd.qd.gradient_scoring import make_gradient_scoring_function
+from newton_qd.qd.task import Task
+
+STEPS = 12
+
+
+def feedback(parameters: Any, obs: jax.Array) -> jax.Array:
+    """A linear policy behind a tanh, in plain JAX."""
+    return jnp.tanh(parameters["w"] @ obs + parameters["b"])
+
+
+def feedback_weights(env: Any, count: int, gain: float = 0.01) -> Any:
+    """Weights of ``feedback``; the bias is what moves the robot."""
+    rng = np.random.default_rng(0)
+    sizes = (count, env.action_size, env.observation_size)
+    return {
+        "w": (gain * rng.normal(size=sizes)).astype(env.dtype),
+        "b": (0.3 * rng.normal(size=sizes[:2])).astype(env.dtype),
+    }
+
+
+@functools.cache
+def make(name: str, dtype: str = "float64") -> Any:
+    env = newton_qd.create(name, auto_reset=False, dtype=dtype)
+    return with_smooth_descriptor(env, 0.02)
+
+
+def task_of(name: str) -> Task:
+    env = make(name)
+    low, high = (np.asarray(x) for x in env.descriptor_limits)
+    labels = tuple("d" * len(low))
+    return Task(env, newton_qd.descriptor_extractor[name], (low, high), labels, 0.0)
+
+
+def norms(tree: Any) -> np.ndarray:
+    """Euclidean norm of each row (n,) of leaves (n, ...)."""
+    squares = [(np.asarray(x) ** 2).reshape(len(x), -1).sum(1) for x in tree]
+    return np.sqrt(sum(squares))
+
+
+_OTHERS = ["ant_uni", "ant_omni", "anttrap", "antmaze", "halfcheetah_uni"]
+_OTHERS += ["humanoid_uni", "humanoid_omni", "humanoidtrap", "walker2d_uni"]
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in _OTHERS]
+
+
+@pytest.mark.parametrize("name", ["hopper_uni", "pointmaze", *SLOW])
+def test_scores_have_the_gradients_of_their_differences(x64: None, name: str) -> None:
+    """32 steps, along the gradient itself: relative error below 1e-4."""
+    task, count = task_of(name), 4
+    score = jax.jit(make_gradient_scoring_function(task, feedback, 32))
+    weights, key = feedback_weights(task.env, count), jax.random.key(0)
+    _, descriptors, extra = score(weights, key)
+    assert not extra["faulty"].any() and not extra["overflowed"].any()
+    leaves, structure = jax.tree.flatten(weights)
+    gradients = jax.tree.leaves(extra["gradients"])
+    worst = 0.0
+    for row in range(1 + descriptors.shape[1]):
+        along = [np.asarray(x[..., row]) for x in gradients]
+        size = norms(along)
+        moved = size > 0
+        unit = 1 / np.where(moved, size, 1.0)
+        # far enough for the rounding of values, near enough for their curvature
+        distance = np.minimum(1e-5, 1e-6 * unit)
+        ends = []
+        for sign in (1, -1):
+            step = sign * distance * unit
+            there = [
+                x + y * step.reshape(-1, *[1] * (y.ndim - 1))
+                for x, y in zip(leaves, along, strict=True)
+            ]
+            f, d, _ = score(jax.tree.unflatten(structure, there), key)
+            ends.append(np.asarray(f if row == 0 else d[:, row - 1]))
+        difference = (ends[0] - ends[1]) / (2 * distance)
+        error = np.abs(difference - size)[moved] / size[moved]
+        worst = max(worst, error.max(initial=0.0))
+        assert row or moved.all()
+    report(f"{name}: largest relative error", worst)
+    assert worst < 1e-4
+
+
+@pytest.fixture(scope="module")
+def hoppers() -> tuple[Any, Callable[..., EpisodeGradients], Any, jax.Array]:
+    """Hoppers under feedback: environment, compiled gradient, weights, key."""
+    env = make("hopper_uni", "float32")
+    run = make_episode_gradient(
+        env, feedback, get_feet_contact_proportion, episode_length=STEPS
+    )
+    return env, jax.jit(run), feedback_weights(env, 16), jax.random.key(3)
+
+
+def test_value_is_that_without_gradient(hoppers: Any) -> None:
+    env, gradient, weights, key = hoppers
+    plain = make_episode(
+        env, feedback, get_feet_contact_proportion, episode_length=STEPS
+    )
+    outcome = jax.jit(jax.vmap(plain, in_axes=(0, None)))(weights, key)
+    result = gradient(weights, key)
+    np.testing.assert_array_equal(result.fitnesses, outcome.fitness)
+    np.testing.assert_array_equal(result.descriptors, outcome.descriptor)
+
+
+def test_worlds_and_runs_are_independent(hoppers: Any, device: Any) -> None:
+    """Bitwise: again, with another neighbour, and beside a faulty one."""
+    _, gradient, weights, key = hoppers
+    first = gradient(weights, key)
+    assert not first.faulty.any() and not first.overflowed.any()
+    assert (norms([x[:, 0] for x in jax.tree.leaves(first.gradients)]) > 0).all()
+    others = np.arange(16) != 5
+    for number in (0.5, np.nan):
+        changed = {**weights, "b": weights["b"].copy()}
+        changed["b"][5, 0] = number
+        result = gradient(changed, key)
+        pairs = zip(*map(jax.tree.leaves, (result, first)), strict=True)
+        for a, b in pairs:
+            if device.platform == "cpu":  # lanes add to an adjoint in any order
+                np.testing.assert_array_equal(a[others], b[others])
+        assert bool(result.faulty[5]) == np.isnan(number)
+    assert result.fitnesses[5] == -np.inf
+    assert not any(np.any(x[5]) for x in jax.tree.leaves(result.gradients))
+    assert not result.overflowed.any()
+
+
+def memory(worlds: int, steps: int, every: int | None) -> int:
+    """Bytes that XLA allocates for a gradient of ants beside arguments and results."""
+    env = make("ant_uni", "float32")
+    run = make_episode_gradient(
+        env,
+        feedback,
+        get_feet_contact_proportion,
+        episode_length=steps,
+        options=GradientOptions(checkpoint_every=every),
+    )
+    many = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct((worlds, *x.shape[1:]), x.dtype),
+        feedback_weights(env, 1),
+    )
+    compiled = jax.jit(run).lower(many, jax.random.key(0)).compile()
+    analysis = compiled.memory_analysis()
+    assert analysis is not None
+    return analysis.temp_size_in_bytes
+
+
+@pytest.mark.slow
+def test_memory_is_a_state_per_control_step() -> None:
+    """What docs/gradients.md states, of 1,000 steps; nothing is run."""
+    short, long = (memory(1024, steps, 1) for steps in (100, 1000))
+    slope = (long - short) / (900 * 1024)
+    report("bytes per world and control step", slope)
+    assert slope < 700
+    report("GiB for 1,024 worlds", long / 2**30)
+    assert long < 24 * 2**30
+    many = memory(65536, 1000, 32)
+    report("GiB for 65,536 worlds, a state every 32", many / 2**30)
+    assert many < 64 * 2**30
+
+
+class Line:
+    """x' = growth x + action; the reward is x', the state descriptor x.
+
+    The state is at fault where x is above a thousand, and done above ten.
+    """
+
+    observation_size = action_size = 1
+
+    def __init__(self, growth: float, limit: float = 10.0) -> None:
+        self.growth, self.limit = growth, limit
+
+    def reset(self, rng: jax.Array) -> State:
+        del rng
+        return self._state(jnp.zeros((1,), jnp.float32))
+
+    def step(self, state: State, action: jax.Array) -> State:
+        return self._state(self.growth * state.pipeline_state + action)
+
+    def _state(self, x: jax.Array) -> State:
+        return State(
+            pipeline_state=x,
+            obs=x,
+            reward=x[0],
+            done=(x[0] > self.limit).astype(jnp.float32),
+            metrics={},
+            info={
+                "fault": (x[0] > 1000.0).astype(jnp.int32),
+                "state_descriptor": x,
+            },
+        )
+
+
+def on_line(
+    growth: float, plan: Any, options: GradientOptions, limit: float = 10.0
+) -> EpisodeGradients:
+    plans = jnp.asarray(plan, jnp.float32)
+    run = make_episode_gradient(
+        Line(growth, limit),
+        None,
+        get_final_xy_position,
+        episode_length=plans.shape[1],
+        options=options,
+    )
+    return jax.jit(run)(plans, jax.random.key(0))
+
+
+def by_hand(growth: float, steps: int, options: GradientOptions) -> np.ndarray:
+    """Gradient of the fitness on the line, by the recursion of the adjoint."""
+    rows, flowing = [], 0.0
+    for step in reversed(range(steps)):
+        rows.append(1.0 + flowing)
+        flowing = growth * rows[-1]
+        if options.clip is not None:
+            flowing = min(flowing, options.clip)
+        flowing *= options.discount
+        if options.window is not None and step % options.window == 0:
+            flowing = 0.0
+    return np.array(rows[::-1])
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        GradientOptions(),
+        GradientOptions(window=3),
+        GradientOptions(clip=2.0),
+        GradientOptions(discount=0.5),
+        GradientOptions(window=4, clip=2.5, discount=0.7, checkpoint_every=3),
+        GradientOptions(window=4, clip=2.5, discount=0.7, checkpoint_every=None),
+        GradientOptions(checkpoint_every=5),
+        GradientOptions(checkpoint_every=100),
+    ],
+)
+def test_options_compose(options: GradientOptions) -> None:
+    plan = 0.1 * np.ones((2, 10, 1))
+    result = on_line(1.1, plan, options)
+    expected = by_hand(1.1, 10, options)
+    for world in range(2):
+        np.testing.assert_allclose(result.gradients[world, 0, :, 0], expected, 1e-5)
+    exact = on_line(1.1, plan, GradientOptions())
+    np.testing.assert_array_equal(result.fitnesses, exact.fitnesses)
+    np.testing.assert_array_equal(result.descriptors, exact.descriptors)
+
+
+def test_an_episode_ends_at_the_first_done() -> None:
+    plan = np.ones((2, 8, 1))
+    plan[0, 3] = 20.0
+    result = on_line(1.0, plan, GradientOptions())
+    assert result.fitnesses[0] == 1 + 2 + 3 + 23
+    assert result.fitnesses[1] == sum(range(1, 9))
+    np.testing.assert_array_equal(
+        result.gradients[0, 0, :, 0], [4, 3, 2, 1, 0, 0, 0, 0]
+    )
+    # its descriptor is read before its last step
+    np.testing.assert_array_equal(
+        result.gradients[0, 1, :, 0], [1, 1, 1, 0, 0, 0, 0, 0]
+    )
+
+
+def test_no_gradient_is_silently_not_finite() -> None:
+    """A fault, a gradient beyond the numbers, and a sound neighbour."""
+    plan = np.zeros((3, 4, 1))
+    plan[0, 1], plan[2, 3] = 2000.0, 1.0
+    growth, limit = 1e20, np.inf
+    result = on_line(growth, plan, GradientOptions(), limit)
+    np.testing.assert_array_equal(result.faulty, [True, False, False])
+    np.testing.assert_array_equal(result.overflowed[:, 0], [False, True, True])
+    assert result.fitnesses[0] == -np.inf
+    for leaf in (result.gradients, result.descriptors[1:], result.fitnesses[1:]):
+        assert np.isfinite(leaf).all()
+    assert not result.gradients[0].any() and not result.gradients[1:, 0].any()
+    clipped = on_line(growth, plan, GradientOptions(clip=1.0), limit)
+    assert not clipped.overflowed.any()
+    np.testing.assert_array_equal(clipped.gradients[1, 0, :, 0], [2, 2, 2, 1])
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("window", 0),
+        ("window", 2.5),
+        ("clip", 0.0),
+        ("clip", float("inf")),
+        ("discount", 1.5),
+        ("checkpoint_every", True),
+    ],
+)
+def test_bad_options(name: str, value: Any) -> None:
+    with pytest.raises(ValueError, match=f"{name}={value}.*allowed"):
+        GradientOptions(**{name: value})
+
+
+WIDTHS = (1.0, 0.1, 1e-2, 1e-3, 1e-4, 1e-5)
+
+
+@functools.cache
+def proportions(env: Any, steps: int = 40) -> Any:
+    """Jitted feet-contact proportion (nf,) of an episode, and its loads (t, nf)."""
+
+    def run(actions: jax.Array) -> tuple[jax.Array, jax.Array]:
+        def advance(state: State, action: jax.Array) -> tuple[State, Any]:
+            reading = state.info["state_descriptor"]
+            load = state.pipeline_state.normal_impulse[env.system.feet]
+            return env.step(state, action), (reading, load)
+
+        start = env.reset(jax.random.key(0))
+        _, (readings, loads) = jax.lax.scan(advance, start, actions)
+        data, mask = Trajectories(readings[None]), jnp.zeros((1, steps), env.dtype)
+        return get_feet_contact_proportion(data, mask)[0], loads
+
+    return jax.jit(jax.value_and_grad(lambda a: run(a)[0].sum())), jax.jit(run)
+
+
+def test_smooth_proportion_goes_to_the_boolean_one() -> None:
+    """As the width goes to 0, and a straight-through one is it at any width."""
+    plain: Any = newton_qd.create("hopper_uni", auto_reset=False)
+    actions = jax.random.uniform(jax.random.key(1), (40, 3), jnp.float32, -1.0, 1.0)
+    expected, loads = proportions(plain)[1](actions)
+    assert 0 < expected[0] < 1
+    robot, mass = plain.unwrapped.robot, plain.system.total_mass
+    shares = np.asarray(loads) / (mass * robot.gravity * robot.dt)
+    assert np.abs(shares - CONTACT_FRACTION).min() > 1e-3
+    errors = []
+    for width in WIDTHS:
+        smooth = with_smooth_descriptor(plain, width)
+        value, _ = proportions(smooth)[1](actions)
+        errors.append(float(np.abs(value - expected).max()))
+    report("distance from the boolean proportion by width", errors)
+    assert (np.diff(errors) <= 0).all()
+    assert errors[-1] < 1e-6
+    through = with_smooth_descriptor(plain, 0.1, straight_through=True)
+    value, gradient = proportions(through)[0](actions)
+    assert value == expected.sum()
+    smooth = with_smooth_descriptor(plain, 0.1)
+    np.testing.assert_array_equal(gradient, proportions(smooth)[0](actions)[1])
+    assert np.abs(gradient).max() > 0
+
+
+def test_smooth_descriptor_leaves_the_environment_as_it_was() -> None:
+    env: Any = newton_qd.create("ant_uni")
+    smooth = with_smooth_descriptor(env, 0.05)
+    asked = newton_qd.create("ant_uni", qdax_wrappers_kwargs=[{"smooth_width": 0.05}])
+    key = jax.random.key(0)
+    readings = [
+        np.asarray(e.reset(key).info["state_descriptor"]) for e in (env, smooth, asked)
+    ]
+    assert not readings[0].any()
+    np.testing.assert_array_equal(readings[1], readings[2])
+    assert readings[1].all()
+    for name in ("ant_omni", "pointmaze"):
+        other = newton_qd.create(name)
+        same = with_smooth_descriptor(other)
+        assert same.state_descriptor_name == "xy_position"
+    with pytest.raises(ValueError, match=r"smooth_width=0.*above 0"):
+        with_smooth_descriptor(env, 0.0)
+    with pytest.raises(ValueError, match=r"smooth_width=None.*width above 0"):
+        newton_qd.create("ant_uni", qdax_wrappers_kwargs=[{"straight_through": True}])

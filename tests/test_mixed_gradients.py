@@ -1,0 +1,127 @@
+"""First- and zeroth-order gradients of a smoothed episode, weighted."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from newton_qd.envs.state import State
+from newton_qd.extractors import get_final_xy_position
+from newton_qd.gradients import MixedGradients, make_mixed_gradient
+
+
+class Landscape:
+    """One step; the reward is a function of the action, the descriptor is 0."""
+
+    observation_size, action_size = 1, 3
+
+    def __init__(self, reward: Callable[[jax.Array], jax.Array]) -> None:
+        self.reward = reward
+
+    def reset(self, rng: jax.Array) -> State:
+        del rng
+        return self._state(jnp.zeros((), jnp.float32))
+
+    def step(self, state: State, action: jax.Array) -> State:
+        del state
+        return self._state(self.reward(action))
+
+    def _state(self, reward: jax.Array) -> State:
+        no = jnp.zeros((), jnp.float32)
+        info = {
+            "fault": jnp.isnan(reward).astype(jnp.int32),
+            "state_descriptor": jnp.zeros((1,), jnp.float32),
+        }
+        return State((), jnp.zeros((1,), jnp.float32), reward, no, {}, info)
+
+
+def estimate(
+    reward: Callable[[jax.Array], jax.Array], actions: Any, **options: Any
+) -> MixedGradients:
+    run = make_mixed_gradient(
+        Landscape(reward), None, get_final_xy_position, episode_length=1, **options
+    )
+    return jax.jit(run)(jnp.asarray(actions, jnp.float32), jax.random.key(0))
+
+
+WEIGHTS = jnp.array([1.0, -2.0, 0.5], jnp.float32)
+
+
+def test_first_order_where_it_has_no_variance() -> None:
+    result = estimate(lambda a: a @ WEIGHTS, np.zeros((4, 1, 3)), sigma=0.1)
+    np.testing.assert_allclose(
+        result.gradients[:, 0, 0], np.tile(WEIGHTS, (4, 1)), 1e-5
+    )
+    np.testing.assert_array_equal(result.order, 1)
+    np.testing.assert_allclose(result.first_variance[:, 0], 0, atol=1e-10)
+    assert (result.zeroth_variance[:, 0] > 1).all()
+    # what the scatter of 16 pairs explains is no bias
+    assert (result.bias[:, 0] < 2.0).all()
+    assert not result.faulty.any() and not result.overflowed.any()
+
+
+def test_zeroth_order_where_the_first_is_noise() -> None:
+    """A slope of 1 under ripples of 2 mm, whose own slope is 100."""
+
+    def reward(action: jax.Array) -> jax.Array:
+        return action[0] + 0.2 * jnp.sin(500 * action[0])
+
+    result = estimate(reward, np.zeros((1, 1, 3)), sigma=1.0, samples=2000)
+    assert result.order[0, 0] < 0.01
+    np.testing.assert_allclose(result.gradients[0, 0, 0], [1, 0, 0], atol=0.15)
+    ratio = result.zeroth_variance / (result.first_variance + result.zeroth_variance)
+    np.testing.assert_allclose(result.order[0, 0], ratio[0, 0], 1e-5)
+
+
+def test_tolerance_finds_a_jump() -> None:
+    """A step: its first order is 0 without any variance, and wrong."""
+
+    def reward(action: jax.Array) -> jax.Array:
+        return jnp.where(action[0] > 0, 1.0, 0.0).astype(jnp.float32)
+
+    at = functools.partial(estimate, reward, np.zeros((1, 1, 3)), samples=4000)
+    trusting = at(sigma=0.5)
+    assert trusting.order[0, 0] == 1 and not trusting.gradients.any()
+    # the slope of a step under normal noise: its density at 0
+    slope = 1 / (0.5 * math.sqrt(2 * math.pi))
+    np.testing.assert_allclose(trusting.bias[0, 0], slope, rtol=0.1)
+    careful = at(sigma=0.5, tolerance=0.05)
+    assert careful.order[0, 0] < 0.1
+    np.testing.assert_allclose(careful.gradients[0, 0, 0, 0], slope, rtol=0.1)
+
+
+def test_samples_that_are_not_finite_are_left_out() -> None:
+    """Faulty samples; slopes beyond the numbers; an individual that is faulty."""
+
+    def reward(action: jax.Array) -> jax.Array:
+        bad = jnp.where(action[1] > 0.1, jnp.nan, 0.0).astype(jnp.float32)
+        steep = action[2] > 0.5
+        # forward 0; backward infinity times 0
+        cliff = jnp.sqrt(jnp.where(steep, 0 * action[2], 1))
+        return action[0] + bad + jnp.where(steep, cliff, 0)
+
+    actions = np.array([[[0, 0, 0]], [[0, 1, 0]], [[0, 0, 0.5]]])
+    result = estimate(reward, actions, sigma=0.1, samples=64)
+    np.testing.assert_array_equal(result.faulty, [False, True, False])
+    assert all(np.isfinite(x).all() for x in (result.gradients, result.order))
+    np.testing.assert_allclose(result.gradients[0, 0, 0, 0], 1.0, 1e-4)
+    assert not result.gradients[1].any() and result.fitnesses[1] == -np.inf
+    # the third's first order has samples that are not finite: the zeroth alone
+    assert result.order[2, 0] == 0 and np.isinf(result.first_variance[2, 0])
+    np.testing.assert_allclose(result.gradients[2, 0, 0, 0], 1.0, atol=0.6)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("samples", 1), ("samples", 2.0), ("sigma", 0.0), ("tolerance", -1.0)],
+)
+def test_bad_settings(name: str, value: Any) -> None:
+    with pytest.raises(ValueError, match=f"{name}={value}: allowed"):
+        estimate(lambda a: a[0], np.zeros((1, 1, 3)), **{name: value})
