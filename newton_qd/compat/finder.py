@@ -1,0 +1,97 @@
+"""Puts modules of this library where QDax looks for its own."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import sys
+from collections.abc import Sequence
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
+from importlib.util import find_spec, spec_from_loader
+from types import ModuleType
+from typing import Any
+
+from newton_qd.compat.contents import CONTENTS
+from newton_qd.errors import MissingExtra
+
+SUPPORTED = ("0.5.0",)
+"""Releases of QDax that the tests run with."""
+
+
+class _Finder(MetaPathFinder, Loader):
+    """Finds and fills the modules of ``CONTENTS``."""
+
+    def find_spec(
+        self,
+        fullname: str,
+        path: Sequence[str] | None,
+        target: ModuleType | None = None,
+    ) -> ModuleSpec | None:
+        del path, target
+        if fullname not in CONTENTS:
+            return None
+        package = any(name.startswith(f"{fullname}.") for name in CONTENTS)
+        return spec_from_loader(fullname, self, is_package=package)
+
+    def exec_module(self, module: ModuleType) -> None:
+        for home, names in CONTENTS[module.__name__].items():
+            source = importlib.import_module(home)
+            for name in names:
+                setattr(module, name, getattr(source, name))
+
+
+_FINDER = _Finder()
+
+
+def install() -> None:
+    """Makes QDax import and run on the environments of this library.
+
+    Call it before anything of QDax is imported; calling it again does nothing.
+
+    Raises:
+        MissingExtra: QDax is not installed.
+        ImportError: The installed release of QDax is not in ``SUPPORTED``, or it is
+            already imported with environments that are not of this library.
+    """
+    if _FINDER in sys.meta_path:
+        return
+    if find_spec("qdax") is None:
+        raise MissingExtra("qdax", "qd")
+    version = importlib.metadata.version("qdax")
+    if version not in SUPPORTED:
+        raise ImportError(
+            f"qdax {version} is installed; newton_qd.compat knows "
+            f"{', '.join(SUPPORTED)}: pip install 'qdax=={SUPPORTED[-1]}'"
+        )
+    imported = [name for name in CONTENTS if name in sys.modules]
+    if imported:
+        raise ImportError(
+            f"{imported[0]} is imported already, with environments that are not of "
+            "newton_qd; call newton_qd.compat.install() before importing QDax"
+        )
+    sys.meta_path.insert(0, _FINDER)
+    _restore_jax()
+
+
+def uninstall() -> None:
+    """Undoes ``install``; modules of QDax that are imported keep what they have."""
+    if _FINDER not in sys.meta_path:
+        return
+    sys.meta_path.remove(_FINDER)
+    for name in CONTENTS:
+        module = sys.modules.pop(name, None)
+        parent, _, child = name.rpartition(".")
+        if module is not None and parent in sys.modules:
+            vars(sys.modules[parent]).pop(child, None)
+
+
+def _restore_jax() -> None:
+    """Lets TensorFlow Probability be imported, which QDax's DADS needs."""
+    from jax import core
+
+    # TensorFlow Probability 0.25, the last release, registers a type under a name
+    # that JAX has moved.
+    xla: Any = importlib.import_module("jax.interpreters.xla")
+    if not hasattr(xla, "pytype_aval_mappings"):
+        xla.pytype_aval_mappings = core.pytype_aval_mappings

@@ -1,0 +1,128 @@
+"""What the scoring functions of every release of QDax have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from newton_qd.envs.base import Env
+from newton_qd.envs.state import State
+from newton_qd.extractors import folded_sum
+
+Extractor = Callable[[Any, jax.Array], jax.Array]
+Scores = tuple[jax.Array, jax.Array, dict[str, Any]]
+
+
+def make_policy_network_play_step_fn_brax(
+    env: Env, policy_network: Any
+) -> Callable[[State, Any, Any], tuple[State, Any, Any, Any]]:
+    """Makes the function that lets a policy take one step.
+
+    Args:
+        env: Environment with a state descriptor.
+        policy_network: Flax module from observations to actions.
+
+    Returns:
+        Function of a state, parameters and a key; returns the next state, both of
+        them as they are, and a ``QDTransition``.
+    """
+    from qdax.core.neuroevolution.buffers.buffer import QDTransition
+
+    def play_step(state: State, params: Any, key: Any) -> tuple[State, Any, Any, Any]:
+        actions = policy_network.apply(params, state.obs)
+        following = env.step(state, actions)
+        transition = QDTransition(
+            obs=state.obs,
+            next_obs=following.obs,
+            rewards=following.reward,
+            dones=following.done,
+            truncations=following.info["truncation"],
+            actions=actions,
+            state_desc=state.info["state_descriptor"],
+            next_state_desc=following.info["state_descriptor"],
+        )
+        return following, params, key, transition
+
+    return play_step
+
+
+def get_mask_from_transitions(data: Any) -> jax.Array:
+    """Marks what comes after the end of an episode.
+
+    Args:
+        data: Transitions with ``dones`` (N, T).
+
+    Returns:
+        (N, T) 1 where a step comes after one that is done, else 0.
+    """
+    ended = jax.lax.cummax(data.dones, axis=1)
+    return jnp.concatenate([jnp.zeros_like(ended[:, :1]), ended[:, :-1]], axis=1)
+
+
+def unroll(
+    play_step: Callable[..., tuple], carry: tuple[Any, ...], episode_length: int
+) -> Any:
+    """Takes the steps of one episode.
+
+    Args:
+        play_step: Maps the carry, as arguments, to the carry and a transition.
+        carry: State, parameters and what else ``play_step`` takes.
+        episode_length: Number of steps T.
+
+    Returns:
+        Transitions (T, ...).
+    """
+
+    def body(carry: tuple[Any, ...], _: None) -> tuple[tuple[Any, ...], Any]:
+        *carry_list, transition = play_step(*carry)
+        return tuple(carry_list), transition
+
+    return jax.lax.scan(body, carry, None, length=episode_length)[1]
+
+
+def scores(data: Any, descriptor_extractor: Extractor) -> Scores:
+    """Reads fitnesses and descriptors from transitions.
+
+    Args:
+        data: Transitions (N, T, ...).
+        descriptor_extractor: Maps transitions and their mask to descriptors (N, D).
+
+    Returns:
+        Fitnesses (N,), summed so that a row does not depend on N; descriptors
+        (N, D); and the transitions.
+    """
+    mask = get_mask_from_transitions(data)
+    fitnesses = folded_sum(data.rewards * (1.0 - mask), 1)
+    return fitnesses, descriptor_extractor(data, mask), {"transitions": data}
+
+
+def population_size(params: Any) -> int:
+    """Number of individuals whose parameters have them on the leading axis."""
+    return jax.tree.leaves(params)[0].shape[0]
+
+
+def reset_function(
+    env: Env,
+    key: jax.Array,
+    deterministic: bool,
+    play_reset_fn: Callable[[jax.Array], State] | None,
+) -> Callable[[jax.Array], State]:
+    """Chooses how evaluations begin: all in one state, or each in its own."""
+    if deterministic:
+        state = env.reset(key)
+        return lambda _: state
+    return env.reset if play_reset_fn is None else play_reset_fn
+
+
+def default_policy(env: Env, hidden: tuple[int, ...]) -> Any:
+    """Returns the perceptron that QDax gives to a task."""
+    from qdax.core.neuroevolution.networks.networks import MLP
+
+    return MLP(
+        layer_sizes=(*hidden, env.action_size),
+        kernel_init=jax.nn.initializers.lecun_uniform(),
+        final_activation=jnp.tanh,
+    )

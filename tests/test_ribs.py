@@ -1,0 +1,177 @@
+"""pyribs: its schedulers evaluated here, its archives converted both ways."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_evolve import SMALL, PointEnv, point_task, run
+
+from newton_qd.errors import MissingExtra
+from newton_qd.qd.ribs import from_ribs, make_ribs_evaluation, to_ribs
+from newton_qd.qd.rollout import make_policy, make_scoring_function
+
+# QDax and what it imports warn about their own use of other packages.
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
+
+LIMITS = (np.zeros(2), np.ones(2))
+WORST = -5.0 * SMALL.episode_length
+
+
+def test_a_scheduler_evolves_policies() -> None:
+    from ribs.archives import GridArchive
+    from ribs.emitters import EvolutionStrategyEmitter
+    from ribs.schedulers import Scheduler
+
+    task = point_task(SMALL)
+    policy = make_policy(task.env, SMALL.hidden)
+    score = make_scoring_function(task, policy, SMALL.episode_length)
+    traced = []
+
+    def counted(genotypes: Any, key: Any) -> Any:
+        traced.append(genotypes.shape)
+        return score(genotypes, key)
+
+    evaluate = make_ribs_evaluation(
+        counted, jax.random.key(0), limits=task.limits, worst=WORST
+    )
+    archive = GridArchive(
+        solution_dim=policy.size, dims=(4, 4), ranges=[(0, 1), (0, 1)], seed=1
+    )
+    start = np.asarray(policy.init(jax.random.key(1)))
+    emitters = [
+        EvolutionStrategyEmitter(
+            archive, x0=start, sigma0=0.3, batch_size=16, seed=seed
+        )
+        for seed in (1, 2)
+    ]
+    scheduler = Scheduler(archive, emitters)
+    objectives, measures = evaluate(scheduler.ask())
+    assert type(objectives) is np.ndarray and measures.shape == (32, 2)
+    scheduler.tell(objectives, measures)
+    first = archive.stats
+    for _ in range(10):
+        scheduler.tell(*evaluate(scheduler.ask()))
+    assert archive.stats.coverage > first.coverage
+    assert archive.stats.obj_max > first.obj_max
+    assert traced == [(32, policy.size)]
+
+
+def test_faulty_individuals_have_the_worst_objective() -> None:
+    class Faulty(PointEnv):
+        fault_beyond = -100.0
+
+    task = point_task(SMALL, Faulty())
+    policy = make_policy(task.env, SMALL.hidden)
+    score = make_scoring_function(task, policy, SMALL.episode_length)
+    key = jax.random.key(0)
+    evaluate = make_ribs_evaluation(score, key, limits=task.limits, worst=WORST)
+    objectives, measures = evaluate(np.ones((3, policy.size)))
+    np.testing.assert_array_equal(objectives, WORST)
+    np.testing.assert_array_equal(measures, 0.0)
+    with pytest.raises(ValueError, match="worst=-inf: allowed: a finite number"):
+        make_ribs_evaluation(score, key, limits=LIMITS, worst=-np.inf)
+
+
+def test_gradients_reach_the_scheduler() -> None:
+    from ribs.archives import GridArchive
+    from ribs.emitters import GradientArborescenceEmitter
+    from ribs.schedulers import Scheduler
+
+    def one(x: jax.Array) -> jax.Array:
+        descriptor = jax.nn.sigmoid(jnp.stack([x[:3].sum(), x[3:].sum()]))
+        return jnp.concatenate([-jnp.sum(jnp.square(x - 1.0))[None], descriptor])
+
+    def score(genotypes: jax.Array, key: jax.Array) -> Any:
+        del key
+        values = jax.vmap(one)(genotypes)
+        gradients = jax.vmap(jax.jacrev(one))(genotypes)
+        return values[:, 0], values[:, 1:], {"gradients": gradients}
+
+    common: dict[str, Any] = {"limits": LIMITS, "worst": -100.0}
+    key = jax.random.key(0)
+    evaluate = make_ribs_evaluation(score, key, **common)
+    evaluate_dqd = make_ribs_evaluation(score, key, jacobian=True, **common)
+    archive = GridArchive(solution_dim=6, dims=(8, 8), ranges=[(0, 1), (0, 1)], seed=1)
+    emitter = GradientArborescenceEmitter(
+        archive, x0=np.zeros(6), sigma0=0.1, lr=0.1, batch_size=8, seed=2
+    )
+    scheduler = Scheduler(archive, [emitter])
+    best = []
+    for _ in range(20):
+        scheduler.tell_dqd(*evaluate_dqd(scheduler.ask_dqd()))
+        scheduler.tell(*evaluate(scheduler.ask()))
+        best.append(archive.stats.obj_max)
+    assert best[-1] > best[0] and archive.stats.num_elites > 10
+    jacobian = evaluate_dqd(np.zeros((2, 6)))[2]
+    np.testing.assert_allclose(jacobian[:, 0], 2.0)
+    assert jacobian.shape == (2, 3, 6)
+
+
+# --- archives --------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def individuals() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    random = np.random.default_rng(0)
+    return (
+        random.normal(size=(40, 5)).astype(np.float32),
+        random.normal(size=40).astype(np.float32),
+        random.uniform(size=(40, 2)).astype(np.float32),
+    )
+
+
+@pytest.mark.parametrize("kind", ["grid", "cvt"])
+def test_archives_survive_the_way_there_and_back(kind: str, individuals: Any) -> None:
+    from ribs.archives import CVTArchive, GridArchive
+
+    ranges = [(0.0, 1.0), (-1.0, 2.0)]
+    limits = (np.array([0.0, -1.0]), np.array([1.0, 2.0]))
+    common: Any = {"solution_dim": 5, "ranges": ranges, "dtype": np.float32}
+    if kind == "grid":
+        archive, grid = GridArchive(dims=(4, 6), **common), (4, 6)
+    else:
+        archive, grid = CVTArchive(centroids=24, seed=3, samples=500, **common), None
+    archive.add(*individuals)
+    repertoire = from_ribs(archive)
+    assert repertoire.fitnesses.shape == (24, 1)
+    back = to_ribs(repertoire, limits, grid)
+    before, after = (
+        a.data(["index", "solution", "objective", "measures"]) for a in (archive, back)
+    )
+    for name in before:
+        left, right = np.argsort(before["index"]), np.argsort(after["index"])
+        np.testing.assert_array_equal(before[name][left], after[name][right])
+    # QDax, too, finds the individuals in these cells.
+    again = type(repertoire).init(
+        *(jnp.asarray(individuals[i]) for i in (0, 1, 2)), repertoire.centroids
+    )
+    np.testing.assert_array_equal(again.fitnesses, repertoire.fitnesses)
+    np.testing.assert_array_equal(again.genotypes, repertoire.genotypes)
+
+
+def test_what_evolve_has_found_becomes_a_ribs_archive() -> None:
+    result = run(SMALL.replace(iterations=2))
+    for grid in (None, (4, 4)):
+        archive = to_ribs(result.archive, LIMITS, grid)
+        assert archive.stats.obj_max == result.archive.fitnesses.max()
+        assert 0 < len(archive) <= result.archive.filled.sum()
+    with pytest.raises(ValueError, match=r"grid=\(3, 4\) has 12 cells.*has 16"):
+        to_ribs(result.archive, LIMITS, (3, 4))
+
+
+def test_what_cannot_be_converted(monkeypatch: pytest.MonkeyPatch) -> None:
+    from ribs.archives import ProximityArchive
+
+    archive = ProximityArchive(
+        solution_dim=2, measure_dim=2, k_neighbors=1, novelty_threshold=0.1
+    )
+    with pytest.raises(TypeError, match="archive=ProximityArchive: allowed: Grid"):
+        from_ribs(archive)
+    monkeypatch.setitem(sys.modules, "ribs", None)
+    with pytest.raises(MissingExtra, match=r"newton_qd\[ribs\]"):
+        to_ribs(None, LIMITS)
