@@ -152,7 +152,8 @@ def test_full_gear_overshoots_a_limit_as_stated(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "name", [*(f"{robot}_uni" for robot in ROBOTS), "anttrap", "antmaze", "humanoidtrap"]
+    "name",
+    [*(f"{name}_uni" for name in ROBOTS), "anttrap", "antmaze", "humanoidtrap"],
 )
 def test_ten_thousand_steps_are_finite(name: str) -> None:
     """64 worlds, uniformly random actions, no auto-reset."""
