@@ -6,6 +6,8 @@ The facade:
 - ``registered_envs()``, ``register(name, base, ...)``: the names; a new one
 - ``Env``, ``State``: what ``create`` returns; what ``reset`` and ``step`` return
 - ``check(state)``: raises ``FaultError`` where a world was frozen
+- ``diagnose_gradients(env)``: over how many steps gradients can be used, and why;
+  ``newton_qd.gradients`` has the gradients of whole episodes
 - ``behavior_descriptor_extractor``, ``descriptor_extractor``, ``reward_offset``:
   tables by environment name
 - ``FEET_NAMES``, ``COG_NAMES``, ``FORWARD_REWARD_NAMES``: read-only tables of links
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
     from newton_qd.envs.base import Env
     from newton_qd.envs.state import State, check
     from newton_qd.errors import FaultError, MissingExtra, UnknownEnvironment
+    from newton_qd.gradients.doctor import diagnose_gradients
     from newton_qd.registry import (
         COG_NAMES,
         FEET_NAMES,
@@ -53,6 +56,7 @@ __all__ = [
     "create",
     "create_fn",
     "descriptor_extractor",
+    "diagnose_gradients",
     "register",
     "registered_envs",
     "reward_offset",
@@ -72,6 +76,7 @@ _HOME = {
     "create": "newton_qd.registry",
     "create_fn": "newton_qd.registry",
     "descriptor_extractor": "newton_qd.registry",
+    "diagnose_gradients": "newton_qd.gradients.doctor",
     "register": "newton_qd.registry",
     "registered_envs": "newton_qd.registry",
     "reward_offset": "newton_qd.registry",

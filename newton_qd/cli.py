@@ -1,4 +1,4 @@
-"""The command ``newton-qd``: lists environments and evolves archives of policies."""
+"""The command ``newton-qd``: environments, evolution, and what gradients are worth."""
 
 from __future__ import annotations
 
@@ -49,6 +49,8 @@ def main(
     try:
         if arguments.command == "envs":
             return _envs()
+        if arguments.command == "doctor":
+            return _doctor(arguments)
         return _evolve(arguments, task_factory)
     except (ConfigError, UnknownEnvironment) as error:
         return _complain(arguments, error, BAD_ARGUMENTS)
@@ -77,7 +79,54 @@ def _make_parser() -> argparse.ArgumentParser:
     )
     _add_run_arguments(evolve)
     _add_setting_arguments(evolve)
+    doctor = commands.add_parser("doctor", help="measure what gradients are worth")
+    ailments = doctor.add_subparsers(dest="ailment", required=True, metavar="WHAT")
+    _add_doctor_arguments(
+        ailments.add_parser(
+            "gradients",
+            help="over how many control steps a gradient can be used, and why",
+            description="Compares the gradient of the return with central differences "
+            "and with an evolution strategy, horizon by horizon.",
+        )
+    )
     return parser
+
+
+def _add_doctor_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("env_name", metavar="ENV", help="environment, as ant_uni")
+    parser.add_argument(
+        "--horizons",
+        type=_widths,
+        default=(1, 2, 4, 8, 16, 32, 64),
+        metavar="N,N",
+        help="numbers of control steps (default: 1,2,4,8,16,32,64)",
+    )
+    for name, default, text in (
+        ("worlds", 8, "random plans of actions"),
+        ("directions", 8, "directions of the differences, in each world"),
+        ("samples", 16, "pairs of noisy samples, in each world"),
+        ("seed", 0, "seed of every random number"),
+    ):
+        parser.add_argument(
+            f"--{name}",
+            type=int,
+            default=default,
+            metavar="N",
+            help=f"{text} (default: {default})",
+        )
+    parser.add_argument(
+        "--sigma",
+        type=float,
+        default=0.05,
+        metavar="X",
+        help="standard deviation of the noise on actions (default: 0.05)",
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="folder for horizons.csv, contacts.csv, report.txt and gradients.png",
+    )
 
 
 def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
@@ -190,6 +239,31 @@ def _envs() -> int:
     for row in rows:
         cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
         print("  ".join(cells).rstrip())
+    return OK
+
+
+def _doctor(arguments: argparse.Namespace) -> int:
+    """Prints a report, and writes it where asked."""
+    import newton_qd
+    from newton_qd.physics.precision import quiet
+
+    quiet()
+    try:
+        report = newton_qd.diagnose_gradients(
+            arguments.env_name,
+            horizons=arguments.horizons,
+            worlds=arguments.worlds,
+            directions=arguments.directions,
+            samples=arguments.samples,
+            sigma=arguments.sigma,
+            seed=arguments.seed,
+        )
+    except ValueError as error:
+        return _complain(arguments, error, BAD_ARGUMENTS)
+    print(report)
+    if arguments.out is not None:
+        report.write(arguments.out)
+        print(f"written to {arguments.out}")
     return OK
 
 

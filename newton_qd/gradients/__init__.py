@@ -3,6 +3,7 @@
 - ``make_episode_gradient``: of a policy or of open-loop actions
 - ``make_mixed_gradient``: the same under noise, of first and zeroth order at once
 - ``GradientOptions``: windows, clipping, discounting, memory
+- ``diagnose_gradients``: over how many steps the gradient can be used
 - ``with_smooth_descriptor``: an environment whose descriptor has a gradient
 
 Importing this package imports none of its parts: each name is loaded when it is
@@ -15,17 +16,21 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from newton_qd.gradients.doctor import diagnose_gradients
     from newton_qd.gradients.episode import Outcome, make_episode
     from newton_qd.gradients.exact import EpisodeGradients, make_episode_gradient
     from newton_qd.gradients.flow import GradientOptions
     from newton_qd.gradients.mixed import MixedGradients, make_mixed_gradient
+    from newton_qd.gradients.report import GradientReport
     from newton_qd.gradients.smooth import with_smooth_descriptor
 
 __all__ = [
     "EpisodeGradients",
     "GradientOptions",
+    "GradientReport",
     "MixedGradients",
     "Outcome",
+    "diagnose_gradients",
     "make_episode",
     "make_episode_gradient",
     "make_mixed_gradient",
@@ -35,8 +40,10 @@ __all__ = [
 _HOME = {
     "EpisodeGradients": "exact",
     "GradientOptions": "flow",
+    "GradientReport": "report",
     "MixedGradients": "mixed",
     "Outcome": "episode",
+    "diagnose_gradients": "doctor",
     "make_episode": "episode",
     "make_episode_gradient": "exact",
     "make_mixed_gradient": "mixed",

@@ -152,42 +152,88 @@ def _combined(
     sound = ~found.faulty.any(axis=1)
     fitness = jnp.where(sound[:, None], found.fitnesses, 0)
     values = jnp.concatenate([fitness[..., None], found.descriptors], axis=-1)
+    lost = (found.overflowed & sound[:, None, None]).any(axis=(0, 1))
+    mixed = mixture(
+        values, found.gradients, noise, sound, lost, sigma=sigma, tolerance=tolerance
+    )
+    few = jnp.broadcast_to(sound.sum() < 2, lost.shape)
+    zeros = jax.tree.map(jnp.zeros_like, mixed.gradients)
+    return MixedGradients(
+        fitnesses=jnp.where(centre.faulty, -jnp.inf, centre.fitness),
+        descriptors=centre.descriptor,
+        gradients=select(~few & ~centre.faulty, mixed.gradients, zeros),
+        faulty=centre.faulty,
+        overflowed=few & ~centre.faulty,
+        order=mixed.order,
+        first_variance=mixed.first_variance,
+        zeroth_variance=mixed.zeroth_variance,
+        bias=mixed.bias,
+    )
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Mixture:
+    """Alpha-order, first- and zeroth-order gradients (rows, ...), and their worth."""
+
+    gradients: Any
+    first: Any
+    zeroth: Any
+    order: jax.Array
+    first_variance: jax.Array
+    zeroth_variance: jax.Array
+    bias: jax.Array
+
+
+def mixture(
+    values: jax.Array,
+    gradients: Any,
+    noise: Any,
+    sound: jax.Array,
+    lost: jax.Array,
+    *,
+    sigma: float,
+    tolerance: float = math.inf,
+) -> Mixture:
+    """Weights the two estimates of the gradients of several functions.
+
+    Args:
+        values: (samples, 2, rows) the functions at x + w and at x - w.
+        gradients: Leaves (samples, 2, rows, ...): their gradients there.
+        noise: Leaves (samples, ...): w.
+        sound: (samples,) which pairs count.
+        lost: (rows,) which first orders do not.
+        sigma: Standard deviation of the noise.
+        tolerance: Error allowed where the two disagree.
+    """
     slope = jnp.where(sound[:, None], values[:, 0] - values[:, 1], 0) / (2 * sigma**2)
     zeroth = jax.tree.map(lambda w: jax.vmap(jnp.multiply.outer)(slope, w), noise)
-    first = jax.tree.map(lambda g: g.mean(axis=1), found.gradients)
+    first = jax.tree.map(lambda g: g.mean(axis=1), gradients)
     spread = functools.partial(_mean_and_variance, sound=sound)
     first_mean, first_variance = spread(first)
     zeroth_mean, zeroth_variance = spread(zeroth)
     apart, apart_variance = spread(jax.tree.map(jnp.subtract, first, zeroth))
-    lost = (found.overflowed & sound[:, None, None]).any(axis=(0, 1))
     first_variance = jnp.where(lost, jnp.inf, first_variance)
     pairs = jnp.maximum(sound.sum(), 1)
     # what the scatter of the samples adds to the distance of their means
     distance = _squared(apart)
     explained = jnp.where(jnp.isfinite(first_variance), apart_variance / pairs, 0)
-    bias = jnp.sqrt(jnp.maximum(distance - explained, 0))
     total = zeroth_variance + first_variance
     flat = total == 0
     order = jnp.where(flat, 1, zeroth_variance / jnp.where(flat, 1, total))
     error = jnp.sqrt(zeroth_variance / pairs)
     allowed = jnp.maximum(tolerance - error, 0) / jnp.maximum(jnp.sqrt(distance), 1e-30)
     order = jnp.where(lost, 0, jnp.minimum(order, allowed))
-    gradients = jax.tree.map(
-        lambda a, b: b + _like(order, a) * (a - b), first_mean, zeroth_mean
-    )
-    few = jnp.broadcast_to(sound.sum() < 2, order.shape)
-    keep = ~few & ~centre.faulty
-    zeros = jax.tree.map(jnp.zeros_like, gradients)
-    return MixedGradients(
-        fitnesses=jnp.where(centre.faulty, -jnp.inf, centre.fitness),
-        descriptors=centre.descriptor,
-        gradients=select(keep, gradients, zeros),
-        faulty=centre.faulty,
-        overflowed=few & ~centre.faulty,
+    return Mixture(
+        gradients=jax.tree.map(
+            lambda a, b: b + _like(order, a) * (a - b), first_mean, zeroth_mean
+        ),
+        first=first_mean,
+        zeroth=zeroth_mean,
         order=order,
         first_variance=first_variance,
         zeroth_variance=zeroth_variance,
-        bias=bias,
+        bias=jnp.sqrt(jnp.maximum(distance - explained, 0)),
     )
 
 

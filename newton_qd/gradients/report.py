@@ -1,0 +1,300 @@
+"""What the gradient doctor found: a table, words, files and a picture."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import importlib.util
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from newton_qd.errors import MissingExtra
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+AGREEMENT = 0.999
+"""Cosine with central differences from which a gradient counts as right [-]."""
+
+
+@dataclasses.dataclass(frozen=True)
+class HorizonRow:
+    """What the gradient of the return over some control steps is worth.
+
+    Attributes:
+        steps: Control steps of the return.
+        seconds: The same in simulated time [s].
+        alive: Share of the worlds whose episode reaches the last step [-].
+        norm: Norm of the gradient, median over the worlds.
+        largest_norm: Its largest.
+        cosine: Cosine with central differences along random directions, median [-].
+        worst_cosine: Its smallest [-].
+        first_deviation: Standard deviation of a first-order sample, over the whole
+            genotype, median; infinite where one was not finite.
+        zeroth_deviation: Likewise of a zeroth-order sample.
+        bias: Share of the first-order slope, along the gradient without noise, that
+            the zeroth order does not confirm, mean over the worlds [-].
+        bias_error: Standard error of that mean [-].
+        order: Weight that inverse variances give to the first order, median [-].
+    """
+
+    steps: int
+    seconds: float
+    alive: float
+    norm: float
+    largest_norm: float
+    cosine: float
+    worst_cosine: float
+    first_deviation: float
+    zeroth_deviation: float
+    bias: float
+    bias_error: float
+    order: float
+
+
+@dataclasses.dataclass(frozen=True)
+class ContactRow:
+    """A body whose contact differed before a finite change left the gradient.
+
+    Attributes:
+        body: Link, or ``no contact`` where none differed.
+        share: Share of the pairs of world and direction in which it did [-].
+        first_step: Earliest control step at which the gradient broke, from 1.
+        median_step: Median of these steps.
+    """
+
+    body: str
+    share: float
+    first_step: int
+    median_step: float
+
+
+@dataclasses.dataclass(frozen=True)
+class GradientReport:
+    """The findings of :func:`~newton_qd.diagnose_gradients`; ``print`` shows them.
+
+    Attributes:
+        name: Environment.
+        dt: Duration of a control step [s].
+        open_loop: Whether the genotypes were actions, not policies.
+        sigma: Standard deviation of the noise of the estimates.
+        horizons: One row a horizon, ascending.
+        contacts: Where finite changes leave the gradient, most frequent first.
+    """
+
+    name: str
+    dt: float
+    open_loop: bool
+    sigma: float
+    horizons: tuple[HorizonRow, ...]
+    contacts: tuple[ContactRow, ...]
+
+    @property
+    def growth(self) -> float:
+        """Factor by which the norm grows with a step, over the later half of them."""
+        last = self.horizons[-1]
+        middle = min(self.horizons, key=lambda row: abs(row.steps - last.steps / 2))
+        if middle is last or not (middle.norm > 0 and last.norm > 0):
+            return 1.0
+        return (last.norm / middle.norm) ** (1 / (last.steps - middle.steps))
+
+    @property
+    def exact_horizon(self) -> int:
+        """Control steps up to which the gradient agrees with differences, or 0."""
+        return self._last(lambda row: row.worst_cosine >= AGREEMENT)
+
+    @property
+    def useful_horizon(self) -> int:
+        """Control steps up to which first orders vary less than zeroth ones, or 0."""
+        return self._last(lambda row: row.order > 0.5)
+
+    def _last(self, good: Any) -> int:
+        last = 0
+        for row in self.horizons:
+            if not good(row):
+                break
+            last = row.steps
+        return last
+
+    @property
+    def verdict(self) -> str:
+        """Which horizon is usable, in words."""
+        exact, useful = self.exact_horizon, self.useful_horizon
+        longest = self.horizons[-1].steps
+        usable = min(exact, useful)
+        agrees = (
+            f"The gradient agrees with differences up to {self._time(exact)}"
+            if exact
+            else "The gradient agrees with differences over none of these horizons"
+        )
+        guides = (
+            f"a first-order sample varies less than a zeroth-order one up to "
+            f"{self._time(useful)}"
+            if useful
+            else "a zeroth-order sample varies less than a first-order one throughout"
+        )
+        if usable == longest:
+            advice = "Use it over all of them."
+        elif usable:
+            advice = (
+                f"Use it up to {usable} control steps; beyond, cut it into windows of "
+                f"that length (window={usable}), clip it, or mix in the zeroth order."
+            )
+        else:
+            advice = "Use zeroth-order gradients, or soften the contacts."
+        fallen = next((row for row in self.horizons if row.alive < 0.5), None)
+        note = ""
+        if fallen is not None:
+            note = (
+                f" Most episodes end before step {fallen.steps}: rows from there on "
+                "repeat shorter ones."
+            )
+        return f"{agrees}; {guides}. {advice}{note}"
+
+    def _time(self, steps: int) -> str:
+        return f"{steps} control steps ({steps * self.dt:g} s)"
+
+    def __str__(self) -> str:
+        kind = "open-loop actions" if self.open_loop else "a policy"
+        lines = [f"{self.name}: gradient of the return to {kind}", ""]
+        lines += _table(
+            (
+                "steps",
+                "time [s]",
+                "alive",
+                "norm",
+                "largest",
+                "cosine",
+                "worst",
+                "1st order sd",
+                "0th order sd",
+                "bias",
+                "alpha",
+            ),
+            [
+                (
+                    str(row.steps),
+                    f"{row.seconds:g}",
+                    f"{row.alive:.2f}",
+                    f"{row.norm:.3g}",
+                    f"{row.largest_norm:.3g}",
+                    f"{row.cosine:.6f}",
+                    f"{row.worst_cosine:.6f}",
+                    f"{row.first_deviation:.3g}",
+                    f"{row.zeroth_deviation:.3g}",
+                    f"{row.bias:.2f} +- {row.bias_error:.2f}",
+                    f"{row.order:.3f}",
+                )
+                for row in self.horizons
+            ],
+        )
+        lines += ["", f"The norm grows by a factor of {self.growth:.3f} a step."]
+        if self.contacts:
+            lines += ["", "Where a finite change leaves the gradient:", ""]
+            lines += _table(
+                ("body that touched or not", "share", "first step", "median step"),
+                [
+                    (
+                        row.body,
+                        f"{row.share:.2f}",
+                        str(row.first_step),
+                        f"{row.median_step:g}",
+                    )
+                    for row in self.contacts
+                ],
+            )
+        return "\n".join([*lines, "", self.verdict])
+
+    def write(self, folder: Path | str) -> None:
+        """Writes ``horizons.csv``, ``contacts.csv``, ``report.txt``, ``gradients.png``.
+
+        Args:
+            folder: Where to; made if it does not exist.
+
+        Raises:
+            MissingExtra: matplotlib is not installed; the other files are written.
+        """
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        _write_csv(folder / "horizons.csv", HorizonRow, self.horizons)
+        _write_csv(folder / "contacts.csv", ContactRow, self.contacts)
+        (folder / "report.txt").write_text(f"{self}\n", encoding="utf-8")
+        self.plot().savefig(folder / "gradients.png", dpi=120)
+
+    def plot(self) -> Figure:
+        """Draws norm, agreement and scatter over the horizon.
+
+        Raises:
+            MissingExtra: matplotlib is not installed.
+        """
+        if importlib.util.find_spec("matplotlib") is None:
+            raise MissingExtra("matplotlib", "viz")
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(11, 3.6), layout="constrained")
+        left, middle, right = figure.subplots(1, 3)
+        steps = [row.steps for row in self.horizons]
+        left.plot(steps, [row.norm for row in self.horizons], "o-", label="median")
+        left.plot(
+            steps, [row.largest_norm for row in self.horizons], "^:", label="largest"
+        )
+        left.set_ylabel("norm of the gradient of the return")
+        middle.plot(
+            steps, [_error(row.cosine) for row in self.horizons], "o-", label="median"
+        )
+        middle.plot(
+            steps,
+            [_error(row.worst_cosine) for row in self.horizons],
+            "^:",
+            label="worst",
+        )
+        middle.axhline(1 - AGREEMENT, color="0.6", lw=1, label="usable below")
+        middle.set_ylabel("1 - cosine with central differences")
+        right.plot(
+            steps,
+            [row.first_deviation for row in self.horizons],
+            "o-",
+            label="1st order",
+        )
+        right.plot(
+            steps,
+            [row.zeroth_deviation for row in self.horizons],
+            "s--",
+            label="0th order",
+        )
+        right.set_ylabel(f"standard deviation of a sample, noise {self.sigma:g}")
+        for axes in (left, middle, right):
+            axes.set_xscale("log", base=2)
+            axes.set_yscale("log")
+            axes.set_xticks(steps, [str(s) for s in steps])
+            axes.set_xlabel("control steps of the return")
+            axes.grid(True, color="0.9")
+            axes.legend()
+        figure.suptitle(f"{self.name}: what the gradient is worth")
+        return figure
+
+
+def _error(cosine: float) -> float:
+    """Distance of a cosine from 1, at least what a picture can show."""
+    return max(1 - cosine, 1e-16)
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a table with columns aligned to the right, the first to the left."""
+    widths = [max(len(row[i]) for row in (head, *rows)) for i in range(len(head))]
+    return [
+        "  ".join(
+            cell.rjust(width) if i else cell.ljust(width)
+            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in (head, *rows)
+    ]
+
+
+def _write_csv(path: Path, kind: type, rows: Sequence[Any]) -> None:
+    names = [field.name for field in dataclasses.fields(kind)]
+    with open(path, "w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(names)
+        writer.writerows([getattr(row, name) for name in names] for row in rows)
