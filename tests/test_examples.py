@@ -1,0 +1,52 @@
+"""The examples run, with tiny arguments."""
+
+from __future__ import annotations
+
+import re
+import runpy
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import newton_qd.compat
+
+# QDax and what it imports warn about their own use of other packages.
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.filterwarnings("ignore::DeprecationWarning"),
+]
+
+EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
+TINY = ["--env", "pointmaze", "--batch-size", "8", "--episode-length", "5"]
+FEW = ["--iterations", "2"]
+
+
+@pytest.fixture(autouse=True)
+def no_trace() -> Iterator[None]:
+    yield
+    newton_qd.compat.uninstall()
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "printed"),
+    [
+        ("qdax_map_elites", [*TINY, *FEW], r"iteration 2: QD score [\d,]+, coverage"),
+        ("qdax_pga_me", [*TINY, *FEW, "--training-steps", "2"], r"QD score [\d,]+"),
+        ("ribs_cma_me", [*TINY, *FEW], r"as a repertoire of QDax: \d+ elites"),
+        ("sharded_evaluation", TINY, "the same results: True"),
+    ],
+)
+def test_example_runs(
+    name: str,
+    arguments: list[str],
+    printed: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    path = EXAMPLES / f"{name}.py"
+    assert len(path.read_text(encoding="utf-8").splitlines()) < 80
+    monkeypatch.setattr(sys, "argv", [str(path), *arguments])
+    runpy.run_path(str(path), run_name="__main__")
+    assert re.search(printed, capsys.readouterr().out)
