@@ -10,7 +10,7 @@ import warp as wp
 
 from newton_qd.physics import reference
 from newton_qd.physics.precision import kernels, pack_width
-from newton_qd.physics.system import ObstacleKind, System
+from newton_qd.physics.system import System
 from newton_qd.physics.tree import Tree, build_tree, origin_axes
 
 # Solves of a substep: the predictor and two correctors.
@@ -119,16 +119,22 @@ def _put_dofs(put: Any, system: System) -> None:
 
 
 def _put_contacts(put: Any, system: System, tree: Tree) -> None:
-    if np.any(system.obstacle_kind == ObstacleKind.BOX):
-        raise NotImplementedError(
-            "obstacle_kind: a box has no contact kernel yet; allowed: plane, capsule"
-        )
     put("contact_start", tree.contact)
     put("contact_body", system.contact_body + 1)
     put("contact_position", system.contact_position)
     put("contact_segment", system.contact_segment)
     put("contact_radius", system.contact_radius)
     put("contact_obstacle", system.contact_obstacle)
+    partner, lead = np.full((2, len(system.contact_body)), -1, np.int32)
+    split = np.ones(len(partner))
+    first, second = system.contact_pairs.T
+    partner[first], partner[second] = second, first
+    lead[first] = lead[second] = first
+    split[first] = 1.0 / system.contact_pair_share
+    split[second] = 1.0 / (1.0 - system.contact_pair_share)
+    put("contact_partner", partner)
+    put("contact_lead", lead)
+    put("contact_split", split)
     put("obstacle_kind", system.obstacle_kind)
     put("obstacle_frame", system.obstacle_frame)
     put("obstacle_size", system.obstacle_size)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import jax
@@ -17,6 +16,7 @@ import numpy as np
 
 from newton_qd.assets import find_urdf
 from newton_qd.physics import reference
+from newton_qd.physics.contacts import body_of, contact_tables, pair_shares
 from newton_qd.physics.description import (
     UNLIMITED,
     Body,
@@ -26,16 +26,11 @@ from newton_qd.physics.description import (
 )
 from newton_qd.physics.rest import rest_coordinates
 from newton_qd.physics.row import check_row, index_of
-from newton_qd.physics.scene import (
-    ContactRow,
-    obstacle_tables,
-    read_scene,
-    wall_contacts,
-)
+from newton_qd.physics.scene import obstacle_tables, read_scene
 from newton_qd.physics.system import JointKind, System
 from newton_qd.physics.verify import BuiltModel, ModelMismatchError, verify
 from newton_qd.physics.xml_reader import IDENTITY, RobotDescriptionError
-from newton_qd.robots import Contact, Robot
+from newton_qd.robots import Robot
 from newton_qd.scenes import Scene
 
 if TYPE_CHECKING:
@@ -180,13 +175,6 @@ def _control(robot: Robot, built: BuiltModel) -> dict[str, np.ndarray]:
     }
 
 
-def _body_of(robot: Robot, field: str, link: str, bodies: list[Body]) -> int:
-    """Returns the body that holds a link which the row's field names."""
-    links = {name: i for i, body in enumerate(bodies) for name in body.links}
-    index_of(robot, field, link, tuple(links))
-    return links[link]
-
-
 def _body_arrays(bodies: list[Body]) -> dict[str, np.ndarray]:
     """Returns the joint frames and the inertias, each (nb, ...)."""
     joints = [body.joint for body in bodies]
@@ -224,61 +212,6 @@ def _dof_arrays(
         "limit_lower": lower,
         "limit_upper": upper,
         "limit_stiffness": np.where(limited, gear / compressed, 0.0),
-    }
-
-
-def _contact_sphere(shape: Shape, end: int) -> tuple[np.ndarray, float]:
-    """Returns centre (3,) in the body and radius of one end of a collider [m]."""
-    axis = reference.rotation_matrix(shape.frame[3:])[:, 2]
-    half_length = shape.size[1] if end else 0.0
-    return shape.frame[:3] + end * half_length * axis, float(shape.size[0])
-
-
-def _collider(robot: Robot, contact: Contact, body: Body) -> Shape:
-    """Returns the one collider of a body that a row's contact means."""
-    kind = "capsule" if contact.end else "sphere"
-    found = [s for s in body.shapes if s.link == contact.link and s.kind == kind]
-    if contact.collider is not None:
-        found = [shape for shape in found if shape.name == contact.collider]
-    if len(found) != 1:
-        named = "" if contact.collider is None else f" named {contact.collider!r}"
-        raise RobotDescriptionError(
-            f"robot {robot.name!r}, contacts: end={contact.end} of link "
-            f"{contact.link!r} needs a {kind} collider{named} and the link has "
-            f"{len(found)}; allowed: exactly one, with end 0 for a sphere, 1 or -1 "
-            "for a capsule, and its name in the file where there are several"
-        )
-    return found[0]
-
-
-def _ground_contacts(robot: Robot, bodies: list[Body]) -> Iterator[ContactRow]:
-    """Pairs the spheres of the robot's row with the ground."""
-    for contact in robot.contacts:
-        body = _body_of(robot, "contacts", contact.link, bodies)
-        shape = _collider(robot, contact, bodies[body])
-        centre, radius = _contact_sphere(shape, contact.end)
-        yield ContactRow(body, 0, centre, np.zeros(3), radius)
-
-
-def _contacts(
-    robot: Robot, scene: Scene | None, bodies: list[Body], obstacles: int
-) -> dict[str, np.ndarray]:
-    """Returns the contact tables, sorted by body, the ground before the walls."""
-    rows = list(_ground_contacts(robot, bodies))
-    if scene is not None:
-        colliders = {
-            name: (i, tuple(shape for shape in body.shapes if shape.link == name))
-            for i, body in enumerate(bodies)
-            for name in body.links
-        }
-        rows += wall_contacts(robot, scene, obstacles, colliders)
-    rows.sort(key=lambda row: row.body)
-    return {
-        "contact_body": np.array([row.body for row in rows], dtype=np.int32),
-        "contact_obstacle": np.array([row.obstacle for row in rows], dtype=np.int32),
-        "contact_position": np.array([row.position for row in rows]).reshape(-1, 3),
-        "contact_segment": np.array([row.segment for row in rows]).reshape(-1, 3),
-        "contact_radius": np.array([row.radius for row in rows], dtype=np.float64),
     }
 
 
@@ -322,20 +255,21 @@ def build_system(robot: Robot, dtype: str, scene: Scene | None = None) -> System
         v_start=built.v_start,
         contact_stiffness=weight / (material.support * material.static_penetration),
         feet=np.array(
-            [_body_of(robot, "feet", foot, bodies) for foot in robot.feet],
+            [body_of(robot, "feet", foot, bodies) for foot in robot.feet],
             dtype=np.int32,
         ),
-        torso=_body_of(robot, "torso", robot.torso, bodies),
+        torso=body_of(robot, "torso", robot.torso, bodies),
         rest_q=np.zeros(int(model.joint_coord_count)),
         **_body_arrays(bodies),
         **_dof_arrays(robot, built, bodies, control),
         **control,
-        **_contacts(robot, scene, bodies, len(obstacles["obstacle_kind"])),
+        **contact_tables(robot, scene, bodies, len(obstacles["obstacle_kind"])),
         **obstacles,
         scene_links=tuple(link.name for link in links),
         scene_frames=np.array([link.frame for link in links]).reshape(-1, 7),
     )
-    return dataclasses.replace(system, rest_q=rest_coordinates(system))
+    system = dataclasses.replace(system, rest_q=rest_coordinates(system))
+    return dataclasses.replace(system, contact_pair_share=pair_shares(system))
 
 
 def _check_dtype(dtype: str) -> None:

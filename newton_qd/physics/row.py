@@ -73,6 +73,13 @@ def check_row(robot: Robot) -> None:
                 f"robot {robot.name!r}, contacts: end={contact.end!r} of link "
                 f"{contact.link!r}; allowed: -1, 0, 1"
             )
+    for pair in robot.pairs:
+        for contact in pair:
+            if contact.end != 0:
+                raise RobotDescriptionError(
+                    f"robot {robot.name!r}, pairs: end={contact.end!r} of link "
+                    f"{contact.link!r}; allowed: 0, the whole collider"
+                )
     _check_unique(robot, "actuators", [joint for joint, _ in robot.actuators])
     _check_unique(robot, "rest_pose", [joint for joint, _ in robot.rest_pose])
     _check_unique(robot, "feet", list(robot.feet))

@@ -23,13 +23,14 @@ from newton_qd.physics.xml_reader import IDENTITY, RobotDescriptionError, XmlRea
 from newton_qd.robots import Robot
 from newton_qd.scenes import Scene
 
-# A sphere is a capsule of no length; a box has no contact kernel yet.
+# A sphere is a capsule of no length.
 _KINDS = {
     "sphere": ObstacleKind.CAPSULE,
     "capsule": ObstacleKind.CAPSULE,
+    "box": ObstacleKind.BOX,
 }
-# Colliders of a robot that may touch an obstacle.
-_TOUCHING = ("sphere", "capsule")
+# Colliders of a robot that may touch an obstacle, or each other.
+TOUCHING = ("sphere", "capsule")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -47,7 +48,7 @@ class ContactRow:
 
     Attributes:
         body: Body of the robot.
-        obstacle: Row of the obstacle tables.
+        obstacle: Row of the obstacle tables; -1 for a side of a pair.
         position: (3,) centre in the body frame [m].
         segment: (3,) from the centre to an end of a capsule's axis, body frame [m].
         radius: [m].
@@ -135,6 +136,13 @@ def obstacle_tables(links: tuple[SceneLink, ...]) -> dict[str, np.ndarray]:
     }
 
 
+def whole_collider(body: int, obstacle: int, shape: Shape) -> ContactRow:
+    """Returns the contact of a sphere or of a whole capsule with an obstacle."""
+    axis = reference.rotation_matrix(shape.frame[3:])[:, 2]
+    half = shape.size[1] * axis
+    return ContactRow(body, obstacle, shape.frame[:3], half, float(shape.size[0]))
+
+
 def wall_contacts(
     robot: Robot,
     scene: Scene,
@@ -163,16 +171,12 @@ def wall_contacts(
                 f"allowed: {', '.join(colliders)}"
             )
         body, shapes = colliders[name]
-        if not shapes or any(shape.kind not in _TOUCHING for shape in shapes):
+        if not shapes or any(shape.kind not in TOUCHING for shape in shapes):
             found = ", ".join(shape.kind for shape in shapes) or "none"
             raise RobotDescriptionError(
                 f"scene {scene.name!r}, links: colliders of {name!r} are {found}; "
-                f"allowed: at least one, each of {', '.join(_TOUCHING)}"
+                f"allowed: at least one, each of {', '.join(TOUCHING)}"
             )
         for shape in shapes:
-            axis = reference.rotation_matrix(shape.frame[3:])[:, 2]
-            half = shape.size[1] * axis
             for obstacle in range(1, obstacles):
-                yield ContactRow(
-                    body, obstacle, shape.frame[:3], half, float(shape.size[0])
-                )
+                yield whole_collider(body, obstacle, shape)

@@ -68,9 +68,13 @@ class System:
         contact_body: (nc,) body of each contact sphere or capsule, ascending.
         contact_position: (nc, 3) centre in the body frame [m].
         contact_segment: (nc, 3) from the centre to an end of a capsule's axis in
-            the body frame [m]; zero for a sphere, and read for walls only.
+            the body frame [m]; zero for a sphere, and not read for the ground.
         contact_radius: (nc,) [m].
-        contact_obstacle: (nc,) row of the obstacle tables.
+        contact_obstacle: (nc,) row of the obstacle tables; -1 for a side of a pair.
+        contact_pairs: (np, 2) rows of the two sides of each pair of colliders, on
+            two bodies, that may touch each other.
+        contact_pair_share: (np,) how much of a pair's relative motion an impulse
+            gives to its first side, between 0 and 1 [-].
         obstacle_kind: (no,) see :class:`ObstacleKind`.
         obstacle_frame: (no, 7) world pose; a plane's normal and a capsule's
             axis are the local z axis.
@@ -113,6 +117,8 @@ class System:
     contact_segment: np.ndarray
     contact_radius: np.ndarray
     contact_obstacle: np.ndarray
+    contact_pairs: np.ndarray
+    contact_pair_share: np.ndarray
     obstacle_kind: np.ndarray
     obstacle_frame: np.ndarray
     obstacle_size: np.ndarray

@@ -18,7 +18,7 @@ class Contact:
     Attributes:
         link: URDF link whose collider carries the sphere.
         end: Which end of a capsule's axis: ``+1`` or ``-1`` along the local z
-            axis of the collider; ``0`` for a sphere.
+            axis of the collider; ``0`` for a sphere, and in a pair.
         collider: Name of the collider in the URDF file; ``None`` where the link has
             only one of its kind.
     """
@@ -71,6 +71,8 @@ class Robot:
         actuators: ``(joint, gear)`` in the order of the action; gear is the
             torque of a unit action [N m].
         contacts: Spheres that may touch the ground.
+        pairs: Whole colliders, each with ``end`` 0, of two links that may touch each
+            other.
         rest_pose: ``(joint, angle)`` of the default pose [rad]; joints that
             are not named rest at 0.
         rest_height: Height of the root in the default pose [m]; ``None`` puts
@@ -96,3 +98,4 @@ class Robot:
     gravity: float = 9.81
     material: Material = Material()
     original_names: tuple[tuple[str, str], ...] = ()
+    pairs: tuple[tuple[Contact, Contact], ...] = ()

@@ -35,11 +35,12 @@ from .structs import Model, Row, Scratch
 
 
 @wp.func
-def point_weight(sc: Scratch, row: Row, c: int):
-    """3 x 3 weight of a contact: impulse per change of contact velocity [kg]."""
+def point_weight(m: Model, sc: Scratch, row: Row, c: int):
+    """3 x 3 weight of a contact: impulse per change of the body's velocity [kg]."""
     n = load(sc.normal, row.contact + c)
-    wt = load(sc.weight_t, row.solve_contact + c)
-    wn = load(sc.weight_n, row.solve_contact + c)
+    split = constant(m.contact_split, c)
+    wt = split * load(sc.weight_t, row.solve_contact + c)
+    wn = split * load(sc.weight_n, row.solve_contact + c)
     return add_diagonal((wn - wt) * outer(n, n), wt)
 
 
@@ -56,7 +57,7 @@ def gather(m: Model, sc: Scratch, row: Row, i: int):
     f = vec3()
     for c in range(load(m.contact_start, i), load(m.contact_start, i + 1)):
         r = load(sc.point, row.contact + c)
-        weight = point_weight(sc, row, c)
+        weight = point_weight(m, sc, row, c)
         lever = skew(r)
         turned = weight * lever
         p = load(sc.push, row.solve_contact + c)

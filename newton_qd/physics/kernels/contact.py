@@ -1,4 +1,4 @@
-"""Contacts of a robot with static obstacles, linearised for the three solves.
+"""Contacts of a robot, linearised for the three solves.
 
 The predictor solve takes the normal force as linear in the new velocity. Its normal
 impulse may turn negative when a body lifts off, and its friction weight belongs to
@@ -13,22 +13,18 @@ import warp as wp
 from . import real, scalar, stage, vec3
 from .algebra import (
     add,
-    component,
     cross,
     div,
     dot,
     mul,
     neg,
-    rotate,
-    rotate_back,
-    rotation,
     sub,
     transform_point,
-    translation,
 )
 from .memory import constant, load, store
-from .nearest import nearest_share, obstacle_distance, obstacle_normal
+from .nearest import touch_obstacle
 from .numbers import sqrt, uniform
+from .pair import touch_partner
 from .parameters import contact_stiffness, friction, total_mass
 from .smooth import gate, penetration
 from .structs import Model, Row, Scratch
@@ -43,26 +39,27 @@ WEIGHT_STEPS = wp.constant(2)
 @stage
 def contact_predictor(m: Model, sc: Scratch, row: Row, c: int):
     """Geometry, and the contact law linearised about the velocity at the start."""
+    body = row.body + load(m.contact_body, c)
+    partner = load(m.contact_partner, c)
+    if partner < 0:
+        r, normal, gap = touch_obstacle(m, sc, row, c)
+        vc = load(sc.twist_v, body) + cross(load(sc.twist_w, body), r)
+        contact_law(m, sc, row, c, r, normal, gap, vc)
+    else:
+        r, normal, gap = touch_partner(m, sc, row, c)
+        vc = load(sc.twist_v, body) + cross(load(sc.twist_w, body), r)
+        other = row.body + load(m.contact_body, partner)
+        vo = load(sc.twist_v, other) + cross(load(sc.twist_w, other), r)
+        contact_law(m, sc, row, c, r, normal, gap, vc - vo)
+
+
+@stage
+def contact_law(
+    m: Model, sc: Scratch, row: Row, c: int, r: vec3, normal: vec3, gap: real, vc: vec3
+):
+    """The contact law, linearised about the velocity ``vc`` at the start."""
     i = load(m.contact_body, c)
-    o = load(m.contact_obstacle, c)
     x = load(sc.pose, row.body + i)
-    center = transform_point(x, constant(m.contact_position, c))
-    # the world's axes are never turned: only the origin is elsewhere
-    frame = constant(m.obstacle_frame, o)
-    turn = rotation(frame)
-    world = translation(load(sc.pose, row.body))
-    at = rotate_back(turn, center - world - translation(frame))
-    if load(m.obstacle_kind, o) == 1:
-        half = rotate(rotation(x), constant(m.contact_segment, c))
-        along = rotate_back(turn, half)
-        share = nearest_share(m, c, o, at, along)
-        center = center + share * half
-        at = at + share * along
-    radius = constant(m.contact_radius, c)
-    gap = obstacle_distance(m, o, at) - radius
-    normal = rotate(turn, obstacle_normal(m, o, at))
-    r = center - radius * normal
-    vc = load(sc.twist_v, row.body + i) + cross(load(sc.twist_w, row.body + i), r)
     vn = dot(normal, vc)
     vt = vc - vn * normal
     reach = gap + m.h * vn
@@ -87,11 +84,17 @@ def contact_predictor(m: Model, sc: Scratch, row: Row, c: int):
 
 @stage
 def contact_slip(m: Model, sc: Scratch, row: Row, c: int):
-    """Change of a contact point's velocity by the row's solve."""
+    """Change of a contact point's velocity by the row's solve; of a pair, relative."""
     at = row.solve_body + load(m.contact_body, c)
     r = load(sc.point, row.contact + c)
     dv = load(sc.change_v, at) + cross(load(sc.change_w, at), r)
-    store(sc.slip, row.solve_contact + c, dv)
+    partner = load(m.contact_partner, c)
+    if partner < 0:
+        store(sc.slip, row.solve_contact + c, dv)
+    else:
+        other = row.solve_body + load(m.contact_body, partner)
+        vo = load(sc.change_v, other) + cross(load(sc.change_w, other), r)
+        store(sc.slip, row.solve_contact + c, dv - vo)
 
 
 @stage
@@ -105,27 +108,35 @@ def contact_clip(m: Model, sc: Scratch, row: Row, c: int):
 
 
 @stage
-def contact_corrector(m: Model, sc: Scratch, row: Row, c: int):
-    """Clipped normal impulse, and friction at the slip to expect."""
+def contact_corrector(m: Model, sc: Scratch, row: Row, c: int, p: int):
+    """Clipped normal impulse, and friction at the slip to expect, in solve ``p``.
+
+    In the last one a pair's friction is given too, from the slip so far: both sides
+    get the same impulse, and momentum is conserved whatever hangs on them.
+    """
     n = load(sc.normal, row.contact + c)
     vc = load(sc.velocity, row.contact + c)
     v1 = vc + load(sc.slip, row.before + c)
     slip = v1 - dot(n, v1) * n
     normal_impulse = load(sc.normal_impulse, row.report + c)
+    mass = total_mass(m, sc, row)
+    before = load(sc.weight_t, row.before + c)
     wt = friction_weight(
-        total_mass(m, sc, row),
+        mass,
         friction(m, sc, row) * normal_impulse,
-        load(sc.weight_t, row.before + c),
+        before,
         dot(slip, slip),
         m.slip_velocity,
     )
-    store(sc.weight_n, row.solve_contact + c, real())
-    store(sc.weight_t, row.solve_contact + c, wt)
-    store(
-        sc.push,
-        row.solve_contact + c,
-        normal_impulse * n - wt * (vc - dot(n, vc) * n),
-    )
+    at = row.solve_contact + c
+    push = normal_impulse * n
+    store(sc.weight_n, at, real())
+    if load(m.contact_partner, c) < 0 or p < m.passes - 1:
+        store(sc.weight_t, at, wt)
+        store(sc.push, at, push - wt * (vc - dot(n, vc) * n))
+    else:
+        store(sc.weight_t, at, real())
+        store(sc.push, at, push - (wt * (mass + before) / (mass + wt)) * slip)
 
 
 @wp.func

@@ -5,36 +5,74 @@ ends when the segments turn past parallel, and bend where they reach an end. Her
 minimise |distance|^2 + k (share of the segment)^2 with the ends rounded off, which is
 twice differentiable in everything. So the distance comes out too large, by at most 0.3
 of the contact smoothing where the surfaces touch: when the segments are parallel to a
-few degrees, or cross near an end.
+few degrees, or cross near an end. The obstacle is a plane, a capsule or a box.
 """
 
 import warp as wp
 
 from . import real, scalar, vec3
-from .algebra import add, component, div, dot, mul, neg, sub, vector
+from .algebra import (
+    add,
+    component,
+    div,
+    dot,
+    mul,
+    neg,
+    rotate,
+    rotate_back,
+    rotation,
+    sub,
+    transform_point,
+    translation,
+    vector,
+)
+from .box import box_distance, box_normal, box_share
 from .memory import constant, load
-from .numbers import sqrt, uniform
-from .smooth import penetration
-from .structs import Model
+from .numbers import uniform
+from .smooth import bounded, finite_length
+from .structs import Model, Row, Scratch
 
 # A share of a segment is rounded off over this distance from its ends, -1 and 1.
 SHARE_ROUNDING = wp.constant(scalar(0.1))
-# Distances are of vectors no shorter than this [m]: a direction is always finite.
-SHORTEST = wp.constant(scalar(1.0e-5))
 
 
 @wp.func
-def bounded(a: real, bound: real, rounding: real):
-    """Smooth clamp of ``a`` between ``-bound`` and ``bound``."""
-    return a - penetration(bound - a, rounding) + penetration(bound + a, rounding)
+def segment_share(
+    m: Model,
+    reach: real,
+    at: vec3,
+    along: vec3,
+    height: real,
+    slope: real,
+    half: real,
+):
+    """Where on a segment it is nearest to another one, -1 to 1.
+
+    Minimises |at + s along - t axis|^2 + k s^2 over |s| <= 1 and |t| <= half: s for an
+    endless axis, then t at that s, then s at that t.
+
+    Args:
+        m: The model.
+        reach: Distance of the two where their surfaces touch [m].
+        at: Centre of the segment, from the centre of the other one.
+        along: From the centre to an end; zero for a sphere, which gives 0.
+        height: Component of ``at`` along the axis of the other one [m].
+        slope: Component of ``along`` [m].
+        half: Half length of the other one [m].
+    """
+    rounding = uniform(SHARE_ROUNDING)
+    one = uniform(scalar(1.0))
+    k = m.contact_smoothing * reach
+    whole = dot(along, along) + k
+    across = dot(at, along) - height * slope
+    free = bounded(neg(across / (whole - slope * slope)), one, rounding)
+    t = bounded(height + free * slope, half, uniform(m.contact_smoothing))
+    return bounded(neg((dot(at, along) - t * slope) / whole), one, rounding)
 
 
 @wp.func
 def nearest_share(m: Model, c: int, o: int, at: vec3, along: vec3):
-    """Where on its segment contact ``c`` is nearest to capsule ``o``, -1 to 1.
-
-    Minimises |at + s along - t z|^2 + k s^2 over |s| <= 1 and t on the axis of the
-    capsule: s for an endless axis, then t at that s, then s at that t.
+    """Where on its segment contact ``c`` is nearest to capsule or box ``o``, -1 to 1.
 
     Args:
         m: The model.
@@ -43,18 +81,23 @@ def nearest_share(m: Model, c: int, o: int, at: vec3, along: vec3):
         at: Centre of the robot's segment.
         along: From the centre to an end; zero for a sphere, which gives 0.
     """
-    rounding = uniform(SHARE_ROUNDING)
-    one = uniform(scalar(1.0))
     size = constant(m.obstacle_size, o)
-    reach = constant(m.contact_radius, c) + component(size, 0)
-    k = m.contact_smoothing * reach
-    slope = component(along, 2)
-    height = component(at, 2)
-    whole = dot(along, along) + k
-    across = dot(at, along) - height * slope
-    free = bounded(neg(across / (whole - slope * slope)), one, rounding)
-    t = bounded(height + free * slope, component(size, 1), uniform(m.contact_smoothing))
-    return bounded(neg((dot(at, along) - t * slope) / whole), one, rounding)
+    radius = constant(m.contact_radius, c)
+    share = real()
+    if load(m.obstacle_kind, o) == 1:
+        share = segment_share(
+            m,
+            radius + component(size, 0),
+            at,
+            along,
+            component(at, 2),
+            component(along, 2),
+            component(size, 1),
+        )
+    else:
+        free = box_share(m, size, m.contact_smoothing * radius, at, along)
+        share = bounded(free, uniform(scalar(1.0)), uniform(SHARE_ROUNDING))
+    return share
 
 
 @wp.func
@@ -66,18 +109,14 @@ def from_axis(m: Model, o: int, at: vec3):
 
 
 @wp.func
-def finite_length(a: vec3):
-    """Length of a vector; never less than ``SHORTEST``."""
-    return sqrt(SHORTEST * SHORTEST + dot(a, a))
-
-
-@wp.func
 def obstacle_normal(m: Model, o: int, at: vec3):
     """Outward normal at the obstacle point nearest to ``at``."""
     n = vector(real(), real(), uniform(scalar(1.0)))
     if load(m.obstacle_kind, o) == 1:
         away = from_axis(m, o, at)
         n = (scalar(1.0) / finite_length(away)) * away
+    if load(m.obstacle_kind, o) == 2:
+        n = box_normal(m, constant(m.obstacle_size, o), at)
     return n
 
 
@@ -88,4 +127,29 @@ def obstacle_distance(m: Model, o: int, at: vec3):
     if load(m.obstacle_kind, o) == 1:
         radius = component(constant(m.obstacle_size, o), 0)
         d = finite_length(from_axis(m, o, at)) - radius
+    if load(m.obstacle_kind, o) == 2:
+        d = box_distance(m, constant(m.obstacle_size, o), at)
     return d
+
+
+@wp.func
+def touch_obstacle(m: Model, sc: Scratch, row: Row, c: int):
+    """Contact point and outward normal in world axes, and gap, at an obstacle."""
+    o = load(m.contact_obstacle, c)
+    x = load(sc.pose, row.body + load(m.contact_body, c))
+    center = transform_point(x, constant(m.contact_position, c))
+    # the world's axes are never turned: only the origin is elsewhere
+    frame = constant(m.obstacle_frame, o)
+    turn = rotation(frame)
+    world = translation(load(sc.pose, row.body))
+    at = rotate_back(turn, center - world - translation(frame))
+    if load(m.obstacle_kind, o) != 0:
+        half = rotate(rotation(x), constant(m.contact_segment, c))
+        along = rotate_back(turn, half)
+        share = nearest_share(m, c, o, at, along)
+        center = center + share * half
+        at = at + share * along
+    radius = constant(m.contact_radius, c)
+    gap = obstacle_distance(m, o, at) - radius
+    normal = rotate(turn, obstacle_normal(m, o, at))
+    return center - radius * normal, normal, gap

@@ -80,7 +80,7 @@ def simulate(m: Model, sc: Scratch, slot: int, keep: int, lane: int, lanes: int)
                 else:
                     if p == 1:
                         contact_clip(m, sc, row, c)
-                    contact_corrector(m, sc, row, c)
+                    contact_corrector(m, sc, row, c, p)
             sync(lane)
             linear_solve(m, sc, row, lane, lanes)
         last = row_at(m, slot, keep, s, m.passes - 1)

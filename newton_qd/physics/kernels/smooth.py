@@ -6,8 +6,13 @@ of its angle squared.
 
 import warp as wp
 
-from . import quat, real, vec3
+from . import quat, real, scalar, vec3
+from .algebra import add, dot, mul, sub
 from .native import native
+from .numbers import sqrt
+
+# Distances are of vectors no shorter than this [m]: a direction is always finite.
+SHORTEST = wp.constant(scalar(1.0e-5))
 
 # in units of the width: its cube may be too small for a number
 _ZONES = """
@@ -51,6 +56,18 @@ adj_WIDTH += zones(zero, widening) * adj_RET;
 def gate(gap: real, width: real) -> real:
     """Slope ``-d penetration / d gap``, between 0 and 1."""
     ...
+
+
+@wp.func
+def bounded(a: real, bound: real, rounding: real):
+    """Smooth clamp of ``a`` between ``-bound`` and ``bound``."""
+    return a - penetration(bound - a, rounding) + penetration(bound + a, rounding)
+
+
+@wp.func
+def finite_length(a: vec3):
+    """Length of a vector; never less than ``SHORTEST``."""
+    return sqrt(SHORTEST * SHORTEST + dot(a, a))
 
 
 # sin(r) / r and cos(r) of x = r^2: by their series up to r = 1, which is accurate to

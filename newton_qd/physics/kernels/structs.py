@@ -64,6 +64,9 @@ class Model:
     contact_segment: wp.array[_vec3]
     contact_radius: wp.array[scalar]
     contact_obstacle: wp.array[int]
+    contact_partner: wp.array[int]  # row of the other side of a pair, else -1
+    contact_lead: wp.array[int]  # row of the side that a pair is measured from
+    contact_split: wp.array[scalar]  # over the share of a pair's motion; else 1
     obstacle_kind: wp.array[int]
     obstacle_frame: wp.array[_transform]
     obstacle_size: wp.array[_vec3]
