@@ -9,7 +9,7 @@ from typing import Any, Generic, TypeVar
 
 from newton_qd.envs.base import Env
 from newton_qd.errors import UnknownEnvironment
-from newton_qd.robots import Robot
+from newton_qd.robots import Material, Robot
 from newton_qd.tasks import ROWS as _ROWS
 from newton_qd.tasks import EnvironmentRow, Extractor, WrapperRow
 from newton_qd.wrappers import (
@@ -129,6 +129,7 @@ def create(
     eval_metrics: bool = False,
     fixed_init_state: bool = False,
     qdax_wrappers_kwargs: Sequence[Mapping[str, Any]] | None = None,
+    material: Material | None = None,
     **kwargs: Any,
 ) -> Env:
     """Builds an environment by its name.
@@ -144,6 +145,8 @@ def create(
         fixed_init_state: Whether a reset is free of noise.
         qdax_wrappers_kwargs: Keyword arguments for each of the environment's own
             wrappers, replacing those of the registry.
+        material: Softness of contacts and joint limits; ``None``: that of the robot's
+            row, ``env.unwrapped.robot.material``.
         **kwargs: To the environment inside, as ``dtype`` or ``ctrl_cost_weight``.
 
     Returns:
@@ -165,6 +168,8 @@ def create(
         )
     _require_keywords(env_name, row.base, kwargs)
     env = row.base(**kwargs)
+    if material is not None:
+        env = env.with_material(material)
     if fixed_init_state:
         env = FixedInitialStateWrapper(env, row.base_name)
     for wrapper_row, chosen in zip(row.wrappers, options, strict=True):

@@ -13,7 +13,6 @@ import pytest
 from physics_helpers import report
 
 import newton_qd
-from newton_qd.envs.feet import CONTACT_FRACTION
 from newton_qd.envs.state import State
 from newton_qd.extractors import (
     Trajectories,
@@ -38,8 +37,11 @@ def feedback(parameters: Any, obs: jax.Array) -> jax.Array:
     return jnp.tanh(parameters["w"] @ obs + parameters["b"])
 
 
-def feedback_weights(env: Any, count: int, gain: float = 0.01) -> Any:
-    """Weights of ``feedback``; the bias is what moves the robot."""
+def feedback_weights(env: Any, count: int, gain: float = 0.003) -> Any:
+    """Weights of ``feedback``; the bias is what moves the robot.
+
+    Feedback of velocities with a large gain makes robots chaotic: docs/gradients.md.
+    """
     rng = np.random.default_rng(0)
     sizes = (count, env.action_size, env.observation_size)
     return {
@@ -88,19 +90,22 @@ def test_scores_have_the_gradients_of_their_differences(x64: None, name: str) ->
         size = norms(along)
         moved = size > 0
         unit = 1 / np.where(moved, size, 1.0)
-        # far enough for the rounding of values, near enough for their curvature
-        distance = np.minimum(1e-5, 1e-6 * unit)
-        ends = []
-        for sign in (1, -1):
-            step = sign * distance * unit
-            there = [
-                x + y * step.reshape(-1, *[1] * (y.ndim - 1))
-                for x, y in zip(leaves, along, strict=True)
-            ]
-            f, d, _ = score(jax.tree.unflatten(structure, there), key)
-            ends.append(np.asarray(f if row == 0 else d[:, row - 1]))
-        difference = (ends[0] - ends[1]) / (2 * distance)
-        error = np.abs(difference - size)[moved] / size[moved]
+        errors = []
+        # the nearer one where the far one is too far for the curvature there
+        for change in (1e-6, 1e-7):
+            distance = np.minimum(1e-5, change * unit)
+            ends = []
+            for sign in (1, -1):
+                step = sign * distance * unit
+                there = [
+                    x + y * step.reshape(-1, *[1] * (y.ndim - 1))
+                    for x, y in zip(leaves, along, strict=True)
+                ]
+                f, d, _ = score(jax.tree.unflatten(structure, there), key)
+                ends.append(np.asarray(f if row == 0 else d[:, row - 1]))
+            difference = (ends[0] - ends[1]) / (2 * distance)
+            errors.append(np.abs(difference - size)[moved] / size[moved])
+        error = np.minimum(*errors)
         worst = max(worst, error.max(initial=0.0))
         assert row or moved.all()
     report(f"{name}: largest relative error", worst)
@@ -344,7 +349,7 @@ def test_smooth_proportion_goes_to_the_boolean_one() -> None:
     assert 0 < expected[0] < 1
     robot, mass = plain.unwrapped.robot, plain.system.total_mass
     shares = np.asarray(loads) / (mass * robot.gravity * robot.dt)
-    assert np.abs(shares - CONTACT_FRACTION).min() > 1e-3
+    assert np.abs(shares - 0.01).min() > 1e-3
     errors = []
     for width in WIDTHS:
         smooth = with_smooth_descriptor(plain, width)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 import copy
+import dataclasses
 from collections.abc import Callable
 
 import jax
@@ -15,7 +16,7 @@ from newton_qd.envs.inputs import checked_action, require_precision
 from newton_qd.envs.state import State, select
 from newton_qd.envs.views import SystemView
 from newton_qd.physics.system import PhysicsState, System
-from newton_qd.robots import Robot
+from newton_qd.robots import Material, Robot
 from newton_qd.scenes import Scene
 from newton_qd.types import Action, Metrics, Observation, Params, RNGKey
 
@@ -105,6 +106,21 @@ class Env(abc.ABC):
         """
         raise NotImplementedError(
             f"scene={scene!r}: {self.name} is not a simulated robot; allowed: "
+            "environments whose unwrapped is a PhysicsEnv"
+        )
+
+    def with_material(self, material: Material) -> Env:
+        """Returns the same wrappers around the same robot with other softness.
+
+        Args:
+            material: Softness of contacts and joint limits. This environment and its
+                wrappers stay as they are.
+
+        Raises:
+            NotImplementedError: The environment inside is not a simulated robot.
+        """
+        raise NotImplementedError(
+            f"material={material!r}: {self.name} is not a simulated robot; allowed: "
             "environments whose unwrapped is a PhysicsEnv"
         )
 
@@ -201,6 +217,17 @@ class PhysicsEnv(Env):
         moved = copy.copy(self)
         moved._load(scene)
         return moved
+
+    def with_material(self, material: Material) -> PhysicsEnv:
+        """Returns the same environment with other softness; this one stays as it is.
+
+        Args:
+            material: Softness of contacts and joint limits.
+        """
+        changed = copy.copy(self)
+        changed.robot = dataclasses.replace(self.robot, material=material)
+        changed._load(self.system.scene)
+        return changed
 
     @abc.abstractmethod
     def _observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:

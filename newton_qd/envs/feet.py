@@ -41,27 +41,17 @@ def feet_contact(system: System, state: PhysicsState) -> jax.Array:
     return touching.astype(system.dtype)
 
 
-def smooth_feet_contact(
-    system: System, state: PhysicsState, width: float, straight_through: bool = False
-) -> jax.Array:
+def smooth_feet_contact(system: System, state: PhysicsState, width: float) -> jax.Array:
     """How firmly each foot touched the ground; useful for gradients.
 
     Args:
         system: The system.
         state: State after the control step.
-        width: Share of the weight over which the reading rises [-], above 0; as it
-            goes to 0 the reading goes to that of :func:`feet_contact`.
-        straight_through: Whether the value is that of :func:`feet_contact`, and the
-            gradient alone is smooth (Bengio et al. 2013, "Estimating or propagating
-            gradients through stochastic neurons").
+        width: Share of the weight over which the reading rises [-], above 0.
 
     Returns:
         (nf,) between 0 and 1; 0.5 where :func:`feet_contact` switches.
     """
     if not width > 0:
         raise ValueError(f"width={width!r}: allowed: above 0")
-    smooth = jax.nn.sigmoid((load_fraction(system, state) - CONTACT_FRACTION) / width)
-    if not straight_through:
-        return smooth
-    # the difference is exactly 0
-    return feet_contact(system, state) + (smooth - jax.lax.stop_gradient(smooth))
+    return jax.nn.sigmoid((load_fraction(system, state) - CONTACT_FRACTION) / width)

@@ -4,6 +4,7 @@
 - ``make_mixed_gradient``: the same under noise, of first and zeroth order at once
 - ``GradientOptions``: windows, clipping, discounting, memory
 - ``diagnose_gradients``: over how many steps the gradient can be used
+- ``soft_to_stiff``, ``softened``: softer contacts, and the way back
 - ``with_smooth_descriptor``: an environment whose descriptor has a gradient
 
 Importing this package imports none of its parts: each name is loaded when it is
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from newton_qd.gradients.mixed import MixedGradients, make_mixed_gradient
     from newton_qd.gradients.report import GradientReport
     from newton_qd.gradients.smooth import with_smooth_descriptor
+    from newton_qd.gradients.softness import soft_to_stiff, softened
 
 __all__ = [
     "EpisodeGradients",
@@ -34,6 +36,8 @@ __all__ = [
     "make_episode",
     "make_episode_gradient",
     "make_mixed_gradient",
+    "soft_to_stiff",
+    "softened",
     "with_smooth_descriptor",
 ]
 
@@ -47,6 +51,8 @@ _HOME = {
     "make_episode": "episode",
     "make_episode_gradient": "exact",
     "make_mixed_gradient": "mixed",
+    "soft_to_stiff": "softness",
+    "softened": "softness",
     "with_smooth_descriptor": "smooth",
 }
 

@@ -232,7 +232,7 @@ class GradientReport:
             raise MissingExtra("matplotlib", "viz")
         from matplotlib.figure import Figure
 
-        figure = Figure(figsize=(11, 3.6), layout="constrained")
+        figure = Figure(figsize=(11, 4), layout="constrained")
         left, middle, right = figure.subplots(1, 3)
         steps = [row.steps for row in self.horizons]
         left.plot(steps, [row.norm for row in self.horizons], "o-", label="median")
@@ -263,7 +263,7 @@ class GradientReport:
             "s--",
             label="0th order",
         )
-        right.set_ylabel(f"standard deviation of a sample, noise {self.sigma:g}")
+        right.set_ylabel(f"deviation of a sample, noise {self.sigma:g}")
         for axes in (left, middle, right):
             axes.set_xscale("log", base=2)
             axes.set_yscale("log")

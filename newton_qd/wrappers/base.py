@@ -10,6 +10,7 @@ import numpy as np
 
 from newton_qd.envs.base import Env
 from newton_qd.envs.state import State
+from newton_qd.robots import Material
 from newton_qd.scenes import Scene
 from newton_qd.types import Action, Params, RNGKey
 
@@ -76,6 +77,10 @@ class Wrapper(Env):
     def with_scene(self, scene: Scene | None) -> Env:
         """Returns the same wrappers around the same robot in another scene."""
         return self.with_base(lambda base: base.with_scene(scene))
+
+    def with_material(self, material: Material) -> Env:
+        """Returns the same wrappers around the same robot with other softness."""
+        return self.with_base(lambda base: base.with_material(material))
 
     def __getattr__(self, name: str) -> Any:
         """Looks in the environment inside: ``batch_size``, descriptors, ``system``."""

@@ -74,14 +74,17 @@ class FeetContactWrapper(Wrapper, QDEnv):
 
     def _read(self, state: State) -> Descriptor:
         system, width = self._robot.system, self._smooth_width
+        plain = per_world(lambda physics: feet_contact(system, physics), state)
         if width is None:
-            return per_world(lambda physics: feet_contact(system, physics), state)
-        return per_world(
-            lambda physics: smooth_feet_contact(
-                system, physics, width, self._straight_through
-            ),
-            state,
+            return plain
+        smooth = per_world(
+            lambda physics: smooth_feet_contact(system, physics, width), state
         )
+        if not self._straight_through:
+            return smooth
+        # Bengio et al. 2013, "Estimating or propagating gradients through stochastic
+        # neurons"; the difference is exactly 0
+        return plain + (smooth - jax.lax.stop_gradient(smooth))
 
     @property
     def _robot(self) -> PhysicsEnv:

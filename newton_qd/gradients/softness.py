@@ -1,0 +1,58 @@
+"""Soft contacts for gradients, and the way back to stiff ones."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from newton_qd.envs.base import PhysicsEnv
+from newton_qd.robots import Material
+
+_LENGTHS = ("static_penetration", "smoothing", "slip_velocity")
+_ANGLES = ("limit_overshoot", "limit_smoothing")
+
+
+def softened(material: Material, factor: float) -> Material:
+    """Returns a material with all its scales of softness multiplied.
+
+    Penetration at rest, the widths over which contacts and limits switch on, the slip
+    velocity and the overshoot past limits; friction and dissipation stay.
+
+    Args:
+        material: Softness of contacts and joint limits.
+        factor: Above 1: softer, with gradients that stay small over more steps; below:
+            stiffer, and nearer to rigid bodies.
+
+    Raises:
+        ValueError: ``factor`` is not finite and above 0.
+    """
+    if not 0 < factor < math.inf:
+        raise ValueError(f"factor={factor!r}: allowed: finite, above 0")
+    changes = {name: factor * getattr(material, name) for name in _LENGTHS + _ANGLES}
+    return dataclasses.replace(material, **changes)
+
+
+def soft_to_stiff(env: Any, factors: Sequence[float] = (4, 2, 1)) -> tuple[Any, ...]:
+    """Returns the environment with its softness multiplied, for a continuation.
+
+    Optimize in the first one, go on from there in the next, and end with the one that
+    counts.
+
+    Args:
+        env: A simulated robot, in any wrappers; it stays as it is.
+        factors: One for each environment that is returned.
+
+    Raises:
+        ValueError: A factor is not finite and above 0.
+        NotImplementedError: The environment inside is not a simulated robot.
+    """
+    base = env.unwrapped
+    if not isinstance(base, PhysicsEnv):
+        raise NotImplementedError(
+            f"env: {env.name} is not a simulated robot; allowed: environments whose "
+            "unwrapped is a PhysicsEnv"
+        )
+    material = base.robot.material
+    return tuple(env.with_material(softened(material, factor)) for factor in factors)
