@@ -129,3 +129,16 @@ def test_final_position_has_a_gradient() -> None:
 
     found = jax.grad(first)(jnp.zeros((1, 3, 2), np.float32))
     assert found[0].tolist() == [[0, 0], [1, 0], [0, 0]]
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_foot_that_always_touches_has_proportion_one(compiled: bool) -> None:
+    steps = 128
+    mask = jnp.asarray(np.arange(steps) > np.arange(steps)[:, None], np.float32)
+
+    def proportion(described: jax.Array) -> jax.Array:
+        return get_feet_contact_proportion(Transitions(described), mask)
+
+    touching = jnp.ones((steps, steps, 3), np.float32)
+    found = (jax.jit(proportion) if compiled else proportion)(touching)
+    assert np.array_equal(found, np.ones((steps, 3)))
