@@ -2,16 +2,16 @@
 
 from newton_qd.physics.bridge import from_jax, to_jax
 from newton_qd.physics.inspection import (
-    Kinematics,
     bias_forces,
     forward_kinematics,
     lowest_contact,
     mass_matrix,
+    seen_bodies,
 )
 from newton_qd.physics.model import load_system
 from newton_qd.physics.rest import raising_coordinate
 from newton_qd.physics.step import initial_state, step
-from newton_qd.physics.system import PhysicsState, System
+from newton_qd.physics.system import Kinematics, PhysicsState, System
 
 __all__ = [
     "Kinematics",
@@ -25,6 +25,7 @@ __all__ = [
     "lowest_contact",
     "mass_matrix",
     "raising_coordinate",
+    "seen_bodies",
     "step",
     "to_jax",
 ]

@@ -18,9 +18,9 @@ from jax.core import Tracer
 from warp._src.jax.ffi import FfiCallable
 
 from newton_qd.physics import interrupts
-from newton_qd.physics.launch import Launcher, thread_count
+from newton_qd.physics.launch import BODY_SIZE, Launcher, output_size, thread_count
 from newton_qd.physics.precision import SCALARS
-from newton_qd.physics.system import System
+from newton_qd.physics.system import Kinematics, System
 
 
 @functools.cache
@@ -139,34 +139,45 @@ def control_step(system: System) -> Any:
 
     Returns:
         A function of ``q`` (nq,), ``v`` (nv,), ``control`` (nu,) that returns
-        ``q`` (nq,), ``v`` (nv,), ``impulse`` (nb, 6), ``normal_impulse`` (nb,) and
-        ``fault`` () as in :class:`~newton_qd.physics.system.PhysicsState`; reverse
-        mode once, no forward mode. Under ``vmap`` the worlds share one launch.
+        ``q`` (nq,), ``v`` (nv,), ``impulse`` (nb, 6), ``normal_impulse`` (nb,),
+        ``fault`` (), ``feet_contact`` (nf,), ``smooth_feet_contact`` (nf,),
+        ``torso_xy`` (2,) and ``bodies`` as in
+        :class:`~newton_qd.physics.system.PhysicsState`; reverse mode once, no forward
+        mode. Under ``vmap`` the worlds share one launch.
     """
     interrupts.install()
-    nq, nv, nb = system.nq, system.nv, system.nb
-    size, output_size = nq + nv + system.nu, nq + nv + 7 * nb + 1
-    step = _differentiable(system, "step", size, output_size)
-    ends = np.cumsum([nq, nv, 6 * nb, nb])
+    nq, nv, nb, nf = system.nq, system.nv, system.nb, len(system.feet)
+    size = nq + nv + system.nu
+    step = _differentiable(system, "step", size, output_size(system))
+    ends = np.cumsum([nq, nv, 6 * nb, nb, 1, nf, nf, 2])
 
-    def run(q: jax.Array, v: jax.Array, control: jax.Array) -> tuple[jax.Array, ...]:
+    def run(q: jax.Array, v: jax.Array, control: jax.Array) -> tuple[Any, ...]:
         thread_count()  # a bad setting is an error here, not inside a compiled call
         y = step(_row(system, q=(q, nq), v=(v, nv), control=(control, system.nu)))
-        q, v, impulse, normal_impulse, fault = jnp.split(y, ends)
-        return q, v, impulse.reshape(nb, 6), normal_impulse, fault[0]
+        q, v, impulse, normal, fault, *read, last = jnp.split(y, ends)
+        bodies = _bodies(last) if system.reports_bodies else None
+        return q, v, impulse.reshape(nb, 6), normal, fault[0], *read, bodies
 
     return run
 
 
+def _bodies(row: jax.Array) -> Kinematics:
+    """The bodies of one world, which a kernel wrote field by field."""
+    sizes = (3, 4, 3, 3, 3)
+    nb = row.shape[0] // sum(sizes)
+    fields = jnp.split(row, nb * np.cumsum(sizes[:-1]))
+    parts = zip(fields, sizes, strict=True)
+    return Kinematics(*(field.reshape(nb, size) for field, size in parts))
+
+
 @functools.cache
 def kinematics(system: System) -> Any:
-    """Differentiable poses (nb, 7) and twists (nb, 6) about O of one world."""
-    size, output_size = system.nq + system.nv, 13 * system.nb
-    views = _differentiable(system, "kinematics", size, output_size)
+    """Differentiable bodies of one world, as a function of ``q`` and ``v``."""
+    size = system.nq + system.nv
+    views = _differentiable(system, "kinematics", size, BODY_SIZE * system.nb)
 
-    def run(q: jax.Array, v: jax.Array) -> tuple[jax.Array, jax.Array]:
-        y = views(jnp.concatenate([q, v])).reshape(system.nb, 13)
-        return y[:, :7], y[:, 7:]
+    def run(q: jax.Array, v: jax.Array) -> Kinematics:
+        return _bodies(views(_row(system, q=(q, system.nq), v=(v, system.nv))))
 
     return run
 
