@@ -1,6 +1,11 @@
 """The differentiable physics: systems, the control step, and views of it."""
 
-from newton_qd.physics.bridge import from_jax, to_jax
+from newton_qd.physics.bridge import (
+    episode_final,
+    episode_proportion,
+    from_jax,
+    to_jax,
+)
 from newton_qd.physics.inspection import (
     bias_forces,
     forward_kinematics,
@@ -18,6 +23,8 @@ __all__ = [
     "PhysicsState",
     "System",
     "bias_forces",
+    "episode_final",
+    "episode_proportion",
     "forward_kinematics",
     "from_jax",
     "initial_state",

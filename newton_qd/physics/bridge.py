@@ -19,7 +19,7 @@ from warp._src.jax.ffi import FfiCallable
 
 from newton_qd.physics import interrupts
 from newton_qd.physics.launch import BODY_SIZE, Launcher, output_size, thread_count
-from newton_qd.physics.precision import SCALARS
+from newton_qd.physics.precision import SCALARS, kernels
 from newton_qd.physics.system import Kinematics, System
 
 
@@ -188,6 +188,110 @@ def dynamics(system: System, q: jax.Array, v: jax.Array) -> tuple[jax.Array, jax
     call = _kernel_call(system, "dynamics_forward", system.nq + nv)
     y = call(jnp.concatenate([q, v]), output_dims=nv * (nv + 1))[0]
     return y[: nv * nv].reshape(nv, nv), y[nv * nv :]
+
+
+@functools.cache
+def _episode_call(name: str, dtype: str, steps: int, nd: int) -> Any:
+    """A kernel of ``kernels.episodes`` as a function of one episode's row."""
+    real = SCALARS[dtype]
+    kernel = getattr(kernels(dtype, 1).episodes, name)
+
+    def launch(x: Any, *arrays: Any) -> None:
+        with _errors_contained():
+            episodes = x.shape[0] // (steps * (nd + 1))
+            inputs = [steps, nd, x, *arrays]
+            wp.launch(kernel, dim=episodes * nd, inputs=inputs, device=x.device)
+
+    def forward(x: wp.array(dtype=real), y: wp.array(dtype=real)):
+        launch(x, y)
+
+    def backward(
+        x: wp.array(dtype=real),
+        y_bar: wp.array(dtype=real),
+        x_bar: wp.array(dtype=real),
+    ):
+        launch(x, y_bar, x_bar)
+
+    function = backward if name.endswith("_backward") else forward
+    function.__name__ = function.__qualname__ = name
+    kernel.module.load(wp.device_from_jax(jax.devices()[0]))
+    function.__module__ = kernel.module.name
+    call = wp.jax_callable(
+        function,
+        num_outputs=1,
+        vmap_method="broadcast_all",
+        graph_mode=wp.JaxCallableGraphMode.NONE,
+    )
+    return jax.jit(call, static_argnames="output_dims", inline=True)
+
+
+@functools.cache
+def _episode_reduction(name: str, dtype: str, steps: int, nd: int, size: int) -> Any:
+    """Reverse-mode function of one episode's row; the mask has no gradient."""
+
+    @jax.custom_vjp
+    def run(x: jax.Array) -> jax.Array:
+        forward = _episode_call(f"{name}_forward", dtype, steps, nd)
+        return forward(x, output_dims=size)[0]
+
+    def run_forward(x: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return run(x), x
+
+    def run_backward(x: jax.Array, y_bar: jax.Array) -> tuple[jax.Array]:
+        backward = _episode_call(f"{name}_backward", dtype, steps, nd)
+        return (backward(x, y_bar, output_dims=x.shape[0])[0],)
+
+    run.defvjp(run_forward, run_backward)
+    return run
+
+
+def _episode_row(state_desc: jax.Array, mask: jax.Array) -> jax.Array:
+    if state_desc.ndim != 2 or mask.shape != state_desc.shape[:1] or not mask.size:
+        raise ValueError(
+            f"state_desc, mask: shapes {state_desc.shape}, {mask.shape} given; "
+            "allowed: (t, nd) and (t,), t of 1 or more"
+        )
+    if state_desc.dtype.name not in SCALARS:
+        raise TypeError(
+            f"state_desc: dtype {state_desc.dtype} given; allowed: {', '.join(SCALARS)}"
+        )
+    return jnp.concatenate([state_desc.ravel(), mask.astype(state_desc.dtype)])
+
+
+def episode_proportion(state_desc: jax.Array, mask: jax.Array) -> jax.Array:
+    """Proportion of the valid steps of one episode; under ``vmap`` one launch.
+
+    Bitwise :func:`newton_qd.extractors.get_feet_contact_proportion`.
+
+    Args:
+        state_desc: (t, nd) state descriptors before each step.
+        mask: (t,) 1 where a step comes after the end of the episode, else 0.
+
+    Returns:
+        (nd,) proportions [-]; differentiable in reverse mode in ``state_desc``.
+    """
+    row = _episode_row(state_desc, mask)
+    steps, nd = state_desc.shape
+    dtype, size = state_desc.dtype.name, steps * nd
+    run = _episode_reduction("proportion", dtype, steps, nd, size)
+    return run(row).reshape(nd, steps)[:, 0]
+
+
+def episode_final(state_desc: jax.Array, mask: jax.Array) -> jax.Array:
+    """State descriptor before the last valid step; under ``vmap`` one launch.
+
+    Bitwise :func:`newton_qd.extractors.get_final_xy_position`.
+
+    Args:
+        state_desc: (t, nd) state descriptors before each step.
+        mask: (t,) 1 where a step comes after the end of the episode, else 0.
+
+    Returns:
+        (nd,) descriptor; differentiable in reverse mode in ``state_desc``.
+    """
+    row = _episode_row(state_desc, mask)
+    steps, nd = state_desc.shape
+    return _episode_reduction("final", state_desc.dtype.name, steps, nd, nd)(row)
 
 
 interrupts.protect(FfiCallable.ffi_callback)

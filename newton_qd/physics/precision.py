@@ -39,7 +39,7 @@ def kernels(dtype: str, width: int) -> SimpleNamespace:
     package.width = width  # type: ignore[attr-defined]
     sys.modules[name] = package
     spec.loader.exec_module(package)
-    modules = ("structs", "world", "forward", "backward", "inspect")
+    modules = ("structs", "world", "forward", "backward", "inspect", "episodes")
     loaded = {
         module: importlib.import_module(f"{name}.{module}")
         for module in modules
