@@ -6,8 +6,8 @@ The facade:
 - ``registered_envs()``, ``register(name, base, ...)``: the names; a new one
 - ``Env``, ``State``: what ``create`` returns; what ``reset`` and ``step`` return
 - ``check(state)``: raises ``FaultError`` where a world was frozen
-- ``behavior_descriptor_extractor``, ``descriptor_extractor``, ``reward_offset``:
-  tables by environment name
+- ``behavior_descriptor_extractor``, ``descriptor_extractor``, ``reward_offset``,
+  ``original_reward_offset``: tables by environment name
 - ``FEET_NAMES``, ``COG_NAMES``, ``FORWARD_REWARD_NAMES``: read-only tables of links
   and metrics by the name of the environment inside; ``register`` extends them
 
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
         create,
         create_fn,
         descriptor_extractor,
+        original_reward_offset,
         register,
         registered_envs,
         reward_offset,
@@ -53,6 +54,7 @@ __all__ = [
     "create",
     "create_fn",
     "descriptor_extractor",
+    "original_reward_offset",
     "register",
     "registered_envs",
     "reward_offset",
@@ -72,6 +74,7 @@ _HOME = {
     "create": "newton_qd.registry",
     "create_fn": "newton_qd.registry",
     "descriptor_extractor": "newton_qd.registry",
+    "original_reward_offset": "newton_qd.registry",
     "register": "newton_qd.registry",
     "registered_envs": "newton_qd.registry",
     "reward_offset": "newton_qd.registry",
