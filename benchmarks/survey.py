@@ -1,82 +1,114 @@
-"""Look at every QD task: spread of untrained policies, lowest reward, speed.
+"""Measure every QD task: spread of untrained policies, lowest reward of a step.
 
-    python benchmarks/survey.py [--out survey.md] [--names ant_uni pointmaze]
+    python benchmarks/survey.py [--names ant_uni pointmaze] [--out docs/survey.md]
 
-*Coverage*: 1,000 policies with random weights (perceptrons of two hidden layers of 64,
-tanh) from one start, one episode each; the share of 1,024 cells of the descriptor space
-that they reach: a line, a grid of 32 x 32, or, beyond two dimensions, the cells of a
-centroidal Voronoi tessellation. *Lowest reward*: of a step of these episodes; minus it
-is the offset that would keep every QD score positive, beside the original's. *Speed*:
-`env.step` in a jitted scan, random actions, relative to ant_uni per degree of freedom
-and contact.
+Writes the page docs/survey.md, or only the rows of the names given; the page says how
+each column is measured. ``reward_offset`` in newton_qd/tasks.py is its last column.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from throughput import measure
 
 import newton_qd
-from newton_qd.envs.base import PhysicsEnv
 from newton_qd.qd import EvolveConfig, make_policy, make_task
 from newton_qd.qd.rollout import Trajectories
+from newton_qd.qd.task import Task
 
-POLICIES, STEPS, CELLS, HIDDEN = 1000, 1000, 1024, (64, 64)
-HEAD = """# Survey of the tasks
+WORLDS, STEPS, CELLS, HIDDEN = 1000, 1000, 1024, (64, 64)
+HEAD = f"""# Survey of the tasks
 
-Written by `benchmarks/survey.py`, whose head says how each column is measured ({cores}
-cores of a CPU).
+Written by `python benchmarks/survey.py --out docs/survey.md` ({os.cpu_count()} cores of
+a CPU): {WORLDS:,} untrained policies, perceptrons with two hidden layers of
+{HIDDEN[0]} and tanh, run one episode of {STEPS:,} steps each from one start.
 
-| task | coverage [%] | lowest reward of a step | original's reward offset | \
-thousand steps/s, batch 256 | speed per (dof + contact), ant_uni = 1 |
+- *Coverage*: share of {CELLS:,} cells of the descriptor space that they reach: of a
+  line, of a grid of 32 x 32, or, beyond two dimensions, of a centroidal Voronoi
+  tessellation. {WORLDS:,} points spread evenly at random would reach 62 %.
+- *5 % to 95 %*: quantiles of each component of the descriptors, and its limits.
+- *Lowest reward*: of a step of these episodes, and of {WORLDS:,} more with uniform
+  random actions. Minus it, rounded up, is `newton_qd.reward_offset`, which keeps QD
+  scores positive; `newton_qd.original_reward_offset` has the original's.
+
+| task | coverage [%] | 5 % to 95 % (limits) | lowest reward | original | offset |
 |---|---|---|---|---|---|
 """
+TAIL = """
+The limits are the original's. Those of the position tasks are wide for robots that run:
+an untrained one that falls near its start reaches few cells, of 1.9 m, but does so in
+every direction.
+"""
+
+Act = Callable[[jax.Array, jax.Array], jax.Array]
 
 
-def roll_out(name: str) -> tuple[np.ndarray, float]:
-    """Descriptors (n, nd) of random policies, and the lowest reward of a step."""
-    task = make_task(EvolveConfig(env_name=name, episode_length=STEPS))
-    policy = make_policy(task.env, HIDDEN)
-    weights = jax.vmap(policy.init)(jax.random.split(jax.random.key(0), POLICIES))
+def roll_out(task: Task, act: Act) -> tuple[np.ndarray, float]:
+    """Runs one episode in every world.
+
+    Args:
+        task: The task.
+        act: Maps the step's number () and observations (n, no) to actions (n, nu).
+
+    Returns:
+        Descriptors (n, nd), and the lowest reward of a step.
+    """
 
     @jax.jit
-    def run(weights: jax.Array) -> tuple[jax.Array, jax.Array]:
-        parameters = jax.vmap(policy.unravel)(weights)
-        start = jax.vmap(task.env.reset, in_axes=None, axis_size=POLICIES)(
+    def run() -> tuple[jax.Array, jax.Array]:
+        start = jax.vmap(task.env.reset, in_axes=None, axis_size=WORLDS)(
             jax.random.key(1)
         )
 
-        def advance(carry: Any, _: None) -> Any:
+        def advance(carry: Any, step: jax.Array) -> Any:
             state, over = carry
             seen = state.info["state_descriptor"], over
-            action = jax.vmap(policy.apply)(parameters, state.obs)
-            state = jax.vmap(task.env.step)(state, action)
+            state = jax.vmap(task.env.step)(state, act(step, state.obs))
             reward = jnp.where(over, jnp.inf, state.reward)
             return (state, over | (state.done > 0)), (*seen, reward)
 
-        over = jnp.zeros((POLICIES,), bool)
+        over = jnp.zeros((WORLDS,), bool)
         _, (described, over, rewards) = jax.lax.scan(
-            advance, (start, over), None, length=STEPS
+            advance, (start, over), jnp.arange(STEPS)
         )
         data = Trajectories(state_desc=jnp.swapaxes(described, 0, 1))
         mask = jnp.swapaxes(over, 0, 1).astype(described.dtype)
         return task.descriptor_extractor(data, mask), jnp.min(rewards)
 
-    descriptors, lowest = run(weights)
+    descriptors, lowest = run()
     return np.asarray(descriptors), float(lowest)
 
 
-def coverage(name: str, descriptors: np.ndarray) -> float:
-    """Share of the cells that hold a descriptor [-]."""
-    qd: Any = newton_qd.create(name)
-    low, high = (np.asarray(limit) for limit in qd.descriptor_limits)
+def untrained(task: Task) -> Act:
+    """Policies with random weights, one a world."""
+    policy = make_policy(task.env, HIDDEN)
+    weights = jax.vmap(policy.init)(jax.random.split(jax.random.key(0), WORLDS))
+    parameters = jax.vmap(policy.unravel)(weights)
+    return lambda step, obs: jax.vmap(policy.apply)(parameters, obs)
+
+
+def random_actions(task: Task) -> Act:
+    """Uniform random actions."""
+    shape = (WORLDS, task.env.action_size)
+
+    def act(step: jax.Array, obs: jax.Array) -> jax.Array:
+        key = jax.random.fold_in(jax.random.key(2), step)
+        return jax.random.uniform(key, shape, obs.dtype, -1, 1)
+
+    return act
+
+
+def coverage(limits: tuple[np.ndarray, np.ndarray], descriptors: np.ndarray) -> float:
+    """Share of the cells within the limits that hold a descriptor [-]."""
+    low, high = limits
     unit = np.clip((descriptors - low) / (high - low), 0.0, 1.0)
     if unit.shape[1] <= 2:
         side = round(CELLS ** (1 / unit.shape[1]))
@@ -91,34 +123,37 @@ def coverage(name: str, descriptors: np.ndarray) -> float:
     return len(np.unique(apart.argmin(axis=1))) / CELLS
 
 
-def speed(name: str) -> tuple[float, int]:
-    """Environment steps per second, and the robot's degrees of freedom and contacts."""
-    base = newton_qd.create(name).unwrapped
-    size = 0
-    if isinstance(base, PhysicsEnv):
-        size = base.system.nv + len(base.system.contact_body)
-    return measure(name, 256, 100, 2, 3)[0], size
+def survey(name: str) -> str:
+    """Row of the page."""
+    task = make_task(EvolveConfig(env_name=name, episode_length=STEPS))
+    descriptors, lowest = roll_out(task, untrained(task))
+    lowest = min(lowest, roll_out(task, random_actions(task))[1])
+    quantiles = np.quantile(descriptors, [0.05, 0.95], axis=0).T
+    spread = ", ".join(
+        f"{found[0]:.2f} to {found[1]:.2f} ({low:g} to {high:g})"
+        for found, low, high in zip(quantiles, *task.limits, strict=True)
+    )
+    # in hundredths; a task that is never punished needs none
+    offset = max(0, math.ceil(-100 * lowest)) / 100
+    return (
+        f"| `{name}` | {100 * coverage(task.limits, descriptors):.1f} | {spread} | "
+        f"{lowest:.4f} | {newton_qd.original_reward_offset[name]:g} | {offset:g} |"
+    )
 
 
 def main() -> None:
-    """Writes the table."""
+    """Writes the page."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path)
     parser.add_argument("--names", nargs="+", default=list(newton_qd.reward_offset))
     options = parser.parse_args()
-    rate, size = speed("ant_uni")
-    text = HEAD.format(cores=os.cpu_count())
+    text = HEAD
     for name in options.names:
-        descriptors, lowest = roll_out(name)
-        found = speed(name)
-        relative = f"{found[0] * found[1] / (rate * size):.2f}" if found[1] else "-"
-        text += (
-            f"| `{name}` | {100 * coverage(name, descriptors):.1f} | {lowest:.2f} | "
-            f"{newton_qd.reward_offset[name]:g} | {found[0] / 1e3:.0f} | {relative} |\n"
-        )
-        print(text.splitlines()[-1], flush=True)
+        row = survey(name)
+        print(row, flush=True)
+        text += row + "\n"
     if options.out:
-        options.out.write_text(text, encoding="utf-8")
+        options.out.write_text(text + TAIL, encoding="utf-8")
 
 
 if __name__ == "__main__":

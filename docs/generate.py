@@ -79,10 +79,11 @@ def _descriptor(name: str, env: QDEnv) -> str:
     low, high = env.state_descriptor_limits
     extractor = newton_qd.descriptor_extractor[name].__name__
     offset = newton_qd.reward_offset[name]
+    original = newton_qd.original_reward_offset[name]
     return (
         f"\nState descriptor: `{env.state_descriptor_name}`, from ({_numbers(low)}) to "
         f"({_numbers(high)}). Descriptor of an episode: `{extractor}`. Reward offset: "
-        f"{offset:g}.\n"
+        f"{offset:g} (the original's: {original:g}).\n"
     )
 
 

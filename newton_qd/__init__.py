@@ -8,8 +8,8 @@ The facade:
 - ``check(state)``: raises ``FaultError`` where a world was frozen
 - ``diagnose_gradients(env)``: over how many steps gradients can be used, and why;
   ``newton_qd.gradients`` has the gradients of whole episodes
-- ``behavior_descriptor_extractor``, ``descriptor_extractor``, ``reward_offset``:
-  tables by environment name
+- ``behavior_descriptor_extractor``, ``descriptor_extractor``, ``reward_offset``,
+  ``original_reward_offset``: tables by environment name
 - ``FEET_NAMES``, ``COG_NAMES``, ``FORWARD_REWARD_NAMES``: read-only tables of links
   and metrics by the name of the environment inside; ``register`` extends them
 
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
         create,
         create_fn,
         descriptor_extractor,
+        original_reward_offset,
         register,
         registered_envs,
         reward_offset,
@@ -57,6 +58,7 @@ __all__ = [
     "create_fn",
     "descriptor_extractor",
     "diagnose_gradients",
+    "original_reward_offset",
     "register",
     "registered_envs",
     "reward_offset",
@@ -77,6 +79,7 @@ _HOME = {
     "create_fn": "newton_qd.registry",
     "descriptor_extractor": "newton_qd.registry",
     "diagnose_gradients": "newton_qd.gradients.doctor",
+    "original_reward_offset": "newton_qd.registry",
     "register": "newton_qd.registry",
     "registered_envs": "newton_qd.registry",
     "reward_offset": "newton_qd.registry",

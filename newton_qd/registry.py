@@ -68,6 +68,7 @@ class _BaseColumn(_Column[Value]):
 descriptor_extractor: Mapping[str, Extractor] = _Column("descriptor_extractor")
 behavior_descriptor_extractor: Mapping[str, Extractor] = descriptor_extractor
 reward_offset: Mapping[str, float] = _Column("reward_offset")
+original_reward_offset: Mapping[str, float] = _Column("original_reward_offset")
 FEET_NAMES: Mapping[str, tuple[str, ...]] = _BaseColumn("feet")
 COG_NAMES: Mapping[str, str] = _BaseColumn("torso")
 FORWARD_REWARD_NAMES: Mapping[str, str] = _BaseColumn("forward_reward")
@@ -116,7 +117,7 @@ def register(
         tuple(wrappers),
         descriptor_extractor,
         reward_offset,
-        robot,
+        robot=robot,
     )
 
 

@@ -52,7 +52,9 @@ class EnvironmentRow:
         base_name: Name that wrappers receive.
         wrappers: From the inside to the outside.
         descriptor_extractor: Reads the descriptor of an episode, for QD tasks.
-        reward_offset: Added to each step's reward to keep QD scores positive.
+        reward_offset: Added to each step's reward to keep QD scores positive; for the
+            tasks of the original measured by ``benchmarks/survey.py``.
+        original_reward_offset: That of the original, on its physics.
         robot: Row of the robot inside; ``None``: that of ``ROBOTS`` called
             ``base_name``, if there is one.
     """
@@ -62,6 +64,7 @@ class EnvironmentRow:
     wrappers: tuple[WrapperRow, ...] = ()
     descriptor_extractor: Extractor | None = None
     reward_offset: float | None = None
+    original_reward_offset: float | None = None
     robot: Robot | None = None
 
     @property
@@ -85,26 +88,44 @@ class EnvironmentRow:
         return self.robot or ROBOTS.get(self.base_name)
 
 
-def _uni(base: Callable[..., Env], base_name: str, offset: float) -> EnvironmentRow:
-    """Returns the task of running forward, described by the feet's contacts."""
+def _uni(
+    base: Callable[..., Env], base_name: str, offsets: tuple[float, float]
+) -> EnvironmentRow:
+    """Returns the task of running forward, described by the feet's contacts.
+
+    Args:
+        base: Makes the environment.
+        base_name: Name that wrappers receive.
+        offsets: Reward offset, and that of the original.
+    """
     return EnvironmentRow(
         base,
         base_name,
         wrappers=(WrapperRow(FeetContactWrapper),),
         descriptor_extractor=get_feet_contact_proportion,
-        reward_offset=offset,
+        reward_offset=offsets[0],
+        original_reward_offset=offsets[1],
     )
 
 
 def _position(
     base: Callable[..., Env],
     base_name: str,
-    offset: float,
+    offsets: tuple[float, float],
     limits: tuple[tuple[float, float], tuple[float, float]],
     *wrappers: Callable[..., Env],
     robot: Robot | None = None,
 ) -> EnvironmentRow:
-    """Returns a task described by the last position within limits [m]."""
+    """Returns a task described by the last position within limits [m].
+
+    Args:
+        base: Makes the environment.
+        base_name: Name that wrappers receive.
+        offsets: Reward offset, and that of the original.
+        limits: Lowest and highest x and y.
+        *wrappers: Wrappers around the one that describes.
+        robot: Row of the robot inside.
+    """
     options = {"minval": limits[0], "maxval": limits[1]}
     return EnvironmentRow(
         base,
@@ -114,7 +135,8 @@ def _position(
             *(WrapperRow(wrapper) for wrapper in wrappers),
         ),
         descriptor_extractor=get_final_xy_position,
-        reward_offset=offset,
+        reward_offset=offsets[0],
+        original_reward_offset=offsets[1],
         robot=robot,
     )
 
@@ -123,30 +145,39 @@ _ANYWHERE = ((-30.0, -30.0), (30.0, 30.0))
 
 ROWS: dict[str, EnvironmentRow] = {
     "ant": EnvironmentRow(Ant, "ant"),
-    "ant_uni": _uni(Ant, "ant", 3.24),
-    "ant_omni": _position(Ant, "ant", 3.0, _ANYWHERE, NoForwardRewardWrapper),
-    "antnotrap": _position(Ant, "ant", 3.38, ((0.0, -8.0), (70.0, 8.0))),
-    "anttrap": _position(Ant, "ant", 3.38, ((0.0, -8.0), (30.0, 8.0)), TrapWrapper),
-    "antmaze": _position(Ant, "ant", 40.32, ((-5.0, -5.0), (40.0, 40.0)), MazeWrapper),
+    "ant_uni": _uni(Ant, "ant", (4.35, 3.24)),
+    "ant_omni": _position(Ant, "ant", (2.83, 3.0), _ANYWHERE, NoForwardRewardWrapper),
+    "antnotrap": _position(Ant, "ant", (4.35, 3.38), ((0.0, -8.0), (70.0, 8.0))),
+    "anttrap": _position(
+        Ant, "ant", (4.35, 3.38), ((0.0, -8.0), (30.0, 8.0)), TrapWrapper
+    ),
+    "antmaze": _position(
+        Ant, "ant", (39.53, 40.32), ((-5.0, -5.0), (40.0, 40.0)), MazeWrapper
+    ),
     "halfcheetah": EnvironmentRow(HalfCheetah, "halfcheetah"),
-    "halfcheetah_uni": _uni(HalfCheetah, "halfcheetah", 9.231),
+    "halfcheetah_uni": _uni(HalfCheetah, "halfcheetah", (5.96, 9.231)),
     "hopper": EnvironmentRow(Hopper, "hopper"),
-    "hopper_uni": _uni(Hopper, "hopper", 0.9),
+    "hopper_uni": _uni(Hopper, "hopper", (0.9, 0.9)),
     "humanoid": EnvironmentRow(Humanoid, "humanoid"),
-    "humanoid_uni": _uni(Humanoid, "humanoid", 0.0),
+    "humanoid_uni": _uni(Humanoid, "humanoid", (0.0, 0.0)),
     "humanoid_omni": _position(
-        Humanoid, "humanoid", 0.0, _ANYWHERE, NoForwardRewardWrapper
+        Humanoid, "humanoid", (0.0, 0.0), _ANYWHERE, NoForwardRewardWrapper
     ),
     "humanoid_w_trap": EnvironmentRow(HumanoidTrap, "humanoid_w_trap", robot=HUMANOID),
     "humanoidtrap": _position(
-        HumanoidTrap, "humanoid_w_trap", 0.0, ((0.0, -8.0), (30.0, 8.0)), robot=HUMANOID
+        HumanoidTrap,
+        "humanoid_w_trap",
+        (0.0, 0.0),
+        ((0.0, -8.0), (30.0, 8.0)),
+        robot=HUMANOID,
     ),
     "walker2d": EnvironmentRow(Walker2d, "walker2d"),
-    "walker2d_uni": _uni(Walker2d, "walker2d", 1.413),
+    "walker2d_uni": _uni(Walker2d, "walker2d", (1.33, 1.413)),
     "pointmaze": EnvironmentRow(
         PointMaze,
         "pointmaze",
         descriptor_extractor=get_final_xy_position,
-        reward_offset=2.3431,
+        reward_offset=2.35,
+        original_reward_offset=2.3431,
     ),
 }

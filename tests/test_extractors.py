@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from newton_qd import physics
 from newton_qd.extractors import (
     AuroraExtraInfo,
     AuroraExtraInfoNormalization,
@@ -129,3 +130,56 @@ def test_final_position_has_a_gradient() -> None:
 
     found = jax.grad(first)(jnp.zeros((1, 3, 2), np.float32))
     assert found[0].tolist() == [[0, 0], [1, 0], [0, 0]]
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_foot_that_always_touches_has_proportion_one(compiled: bool) -> None:
+    steps = 128
+    mask = jnp.asarray(np.arange(steps) > np.arange(steps)[:, None], np.float32)
+
+    def proportion(described: jax.Array) -> jax.Array:
+        return get_feet_contact_proportion(Transitions(described), mask)
+
+    touching = jnp.ones((steps, steps, 3), np.float32)
+    found = (jax.jit(proportion) if compiled else proportion)(touching)
+    assert np.array_equal(found, np.ones((steps, 3)))
+
+
+@pytest.mark.parametrize("steps", [1, 2, 7, 1000])
+@pytest.mark.parametrize(
+    ("extractor", "kernel"),
+    [
+        (get_feet_contact_proportion, physics.episode_proportion),
+        (get_final_xy_position, physics.episode_final),
+    ],
+)
+def test_kernels_reduce_as_the_extractors_do(
+    extractor: Any, kernel: Any, steps: int
+) -> None:
+    """Bitwise, with their gradients; one episode in a batch and by itself."""
+    rng = np.random.default_rng(steps)
+    described = jnp.asarray(rng.uniform(size=(5, steps, 3)), np.float32)
+    ends = rng.integers(1, steps + 1, 5)
+    mask = jnp.asarray(np.arange(steps) >= ends[:, None], np.float32)
+    weights = jnp.asarray(rng.normal(size=(5, 3)), np.float32)
+    reduce = jax.jit(jax.vmap(kernel))
+
+    def extract(described: jax.Array) -> jax.Array:
+        return extractor(Transitions(described), mask)
+
+    found = reduce(described, mask)
+    np.testing.assert_array_equal(found, jax.jit(extract)(described))
+    np.testing.assert_array_equal(found[3], kernel(described[3], mask[3]))
+    gradients = (
+        jax.jit(jax.grad(lambda x, f=function: (weights * f(x)).sum()))(described)
+        for function in (extract, lambda x: reduce(x, mask))
+    )
+    np.testing.assert_allclose(*gradients, rtol=1e-6)
+
+
+def test_kernels_refuse_what_is_no_episode() -> None:
+    described = jnp.zeros((4, 2), np.float32)
+    with pytest.raises(ValueError, match=r"\(4, 2\), \(3,\) given; allowed: \(t, nd\)"):
+        physics.episode_final(described, jnp.zeros(3, np.float32))
+    with pytest.raises(TypeError, match="int32 given; allowed: float32, float64"):
+        physics.episode_proportion(jnp.zeros((4, 2), np.int32), jnp.zeros(4, np.int32))

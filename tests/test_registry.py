@@ -205,7 +205,8 @@ def test_tables_are_columns_of_the_rows() -> None:
     assert dict(extractors) == {n: read[task.descriptor] for n, task in TASKS.items()}
     assert newton_qd.descriptor_extractor is extractors
     offsets = {name: task.offset for name, task in TASKS.items()}
-    assert dict(newton_qd.reward_offset) == offsets
+    assert dict(newton_qd.original_reward_offset) == offsets
+    assert list(newton_qd.reward_offset) == list(offsets)
     assert len(newton_qd.reward_offset) == 12 and "ant" not in newton_qd.reward_offset
     assert "ant_uni" in repr(newton_qd.reward_offset)
     with pytest.raises(

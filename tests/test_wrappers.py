@@ -14,10 +14,8 @@ import pytest
 
 import newton_qd
 from newton_qd.envs.ant import Ant
-from newton_qd.envs.base import Env, PhysicsEnv
-from newton_qd.envs.feet import feet_contact, load_fraction, smooth_feet_contact
+from newton_qd.envs.base import Env
 from newton_qd.envs.state import State
-from newton_qd.physics.system import PhysicsState
 from newton_qd.types import Params
 from newton_qd.wrappers import (
     AutoResetWrapper,
@@ -316,33 +314,6 @@ def test_with_base_keeps_the_wrappers() -> None:
     assert changed.unwrapped is env.unwrapped and env.env.env is env.unwrapped
 
 
-def physics_with(env: PhysicsEnv, fraction: float) -> PhysicsState:
-    """A state whose feet carried a share of the weight each."""
-    system = env.system
-    weight = system.total_mass * system.robot.gravity * system.robot.dt
-    rest = env.fixed_state().pipeline_state
-    loads = np.zeros(system.nb, np.float32)
-    loads[system.feet] = fraction * weight
-    return PhysicsState(rest.q, rest.v, rest.impulse, jnp.asarray(loads))
-
-
-@pytest.mark.parametrize(
-    ("fraction", "touching"), [(0.0, 0.0), (0.0099, 0.0), (0.0101, 1.0), (3.0, 1.0)]
-)
-def test_feet_touch_above_one_percent_of_the_weight(
-    fraction: float, touching: float
-) -> None:
-    ant = Ant()
-    state = physics_with(ant, fraction)
-    np.testing.assert_allclose(load_fraction(ant.system, state), fraction, rtol=1e-5)
-    contact = feet_contact(ant.system, state)
-    assert contact.tolist() == [touching] * 4
-    assert contact.dtype == np.float32
-    smooth = smooth_feet_contact(ant.system, state, 0.002)
-    expected = 1 / (1 + np.exp(-(fraction - 0.01) / 0.002))
-    np.testing.assert_allclose(smooth, expected, rtol=1e-4)
-
-
 def test_feet_contact_is_a_state_descriptor() -> None:
     env = FeetContactWrapper(Ant(), "ant")
     assert (env.state_descriptor_length, env.descriptor_length) == (4, 4)
@@ -366,9 +337,8 @@ def test_feet_contact_can_be_smooth() -> None:
     )
     with pytest.raises(ValueError, match=r"smooth_width=0.*above 0"):
         FeetContactWrapper(Ant(), "ant", smooth_width=0.0)
-    ant = Ant()
-    with pytest.raises(ValueError, match=r"width=-1.*above 0"):
-        smooth_feet_contact(ant.system, ant.fixed_state().pipeline_state, -1.0)
+    with pytest.raises(ValueError, match=r"feet_width=-1.*above 0"):
+        Ant().with_feet_width(-1.0)
 
 
 def test_feet_contact_needs_feet() -> None:

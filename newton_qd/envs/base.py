@@ -172,6 +172,8 @@ class PhysicsEnv(Env):
 
     forward_reward_name: str | None = None
     """Metric that is the forward part of the reward; ``None``: there is none."""
+    reads_bodies: bool = False
+    """Whether a step is to report where the bodies are, for ``seen_bodies``."""
 
     def __init__(
         self,
@@ -193,10 +195,17 @@ class PhysicsEnv(Env):
         self.robot = robot
         self._dtype = np.dtype(dtype)
         self._noise_scale = reset_noise_scale
+        self._feet_width: float | None = None
         self._load(scene)
 
     def _load(self, scene: Scene | None) -> None:
-        system = physics.load_system(self.robot, self._dtype.name, scene)
+        system = physics.load_system(
+            self.robot,
+            self._dtype.name,
+            scene,
+            feet_width=self._feet_width,
+            reports_bodies=self.reads_bodies,
+        )
         self.system: System = system
         joints = np.flatnonzero(np.isin(system.v_start, system.control_dof))
         self._joint_q = system.q_start[joints].astype(np.int32)
@@ -226,6 +235,17 @@ class PhysicsEnv(Env):
         """
         changed = copy.copy(self)
         changed.robot = dataclasses.replace(self.robot, material=material)
+        changed._load(self.system.scene)
+        return changed
+
+    def with_feet_width(self, width: float) -> PhysicsEnv:
+        """Returns the same environment with another smooth contact of the feet.
+
+        Args:
+            width: Share of the robot's weight over which it rises [-], above 0.
+        """
+        changed = copy.copy(self)
+        changed._feet_width = width
         changed._load(self.system.scene)
         return changed
 

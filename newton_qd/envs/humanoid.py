@@ -10,8 +10,7 @@ from newton_qd import physics
 from newton_qd.envs.base import PhysicsEnv
 from newton_qd.envs.contacts import isotropic_inertia
 from newton_qd.envs.vectors import cross, length, ordered_sum, rounded
-from newton_qd.physics.inspection import Kinematics
-from newton_qd.physics.system import PhysicsState
+from newton_qd.physics.system import Kinematics, PhysicsState
 from newton_qd.robots import HUMANOID
 from newton_qd.types import Action, Metrics
 
@@ -35,6 +34,7 @@ class Humanoid(PhysicsEnv):
     """
 
     forward_reward_name = "reward_linvel"
+    reads_bodies = True
 
     def __init__(
         self,
@@ -93,7 +93,7 @@ class Humanoid(PhysicsEnv):
     def _observe_bodies(self, state: PhysicsState) -> dict[str, jax.Array]:
         """Returns what each body adds to the motion about the centre of mass."""
         bodies = self._bodies
-        seen = physics.forward_kinematics(self.system, state.q, state.v)
+        seen = physics.seen_bodies(self.system, state)
         mass = jnp.asarray(self.system.mass[bodies], self.dtype)[:, None]
         velocity = seen.linear_velocity[bodies]
         arm = seen.com[bodies] - self._centre_of_mass(seen)
@@ -137,8 +137,8 @@ class Humanoid(PhysicsEnv):
     ) -> tuple[jax.Array, jax.Array, Metrics]:
         """Returns reward, done and metrics of a step."""
         start, position = (
-            self._centre_of_mass(physics.forward_kinematics(self.system, s.q, s.v))
-            for s in (before, after)
+            self._centre_of_mass(physics.seen_bodies(self.system, state))
+            for state in (before, after)
         )
         velocity = (position[:2] - start[:2]) / self.dt
         low, high = self._healthy_z_range

@@ -240,11 +240,11 @@ def shown_bodies(system: System) -> np.ndarray:
 def qp_view(system: System, state: PhysicsState) -> QP:
     """Returns where the bodies of a state are; every batch axis stays in front."""
 
-    def read(q: jax.Array, v: jax.Array) -> tuple[jax.Array, ...]:
-        found = physics.forward_kinematics(system, q, v)
+    def read(state: PhysicsState) -> tuple[jax.Array, ...]:
+        found = physics.seen_bodies(system, state)
         bodies = shown_bodies(system)
         rotation = found.rotation[bodies]
-        frames = np.array([frame for _, frame in _still_bodies(system)], q.dtype)
+        frames = np.array([frame for _, frame in _still_bodies(system)], state.q.dtype)
         rot = jnp.concatenate([rotation[:, 3:], rotation[:, :3]], axis=1)
         return (
             jnp.concatenate([found.com[bodies], frames[:, :3]]),
@@ -255,7 +255,7 @@ def qp_view(system: System, state: PhysicsState) -> QP:
 
     for _ in range(state.q.ndim - 1):
         read = jax.vmap(read)
-    return QP(*read(state.q, state.v), physics=state)
+    return QP(*read(state), physics=state)
 
 
 def _joint_chains(system: System) -> list[list[int]]:

@@ -1,18 +1,23 @@
 """The differentiable physics: systems, the control step, and views of it."""
 
-from newton_qd.physics.bridge import from_jax, to_jax
+from newton_qd.physics.bridge import (
+    episode_final,
+    episode_proportion,
+    from_jax,
+    to_jax,
+)
 from newton_qd.physics.inspection import (
-    Kinematics,
     bias_forces,
     forward_kinematics,
     lowest_contact,
     mass_matrix,
+    seen_bodies,
 )
 from newton_qd.physics.model import load_system
 from newton_qd.physics.parameters import PhysicsParams, default_params
 from newton_qd.physics.rest import raising_coordinate
 from newton_qd.physics.step import initial_state, step
-from newton_qd.physics.system import PhysicsState, System
+from newton_qd.physics.system import Kinematics, PhysicsState, System
 
 __all__ = [
     "Kinematics",
@@ -21,6 +26,8 @@ __all__ = [
     "System",
     "bias_forces",
     "default_params",
+    "episode_final",
+    "episode_proportion",
     "forward_kinematics",
     "from_jax",
     "initial_state",
@@ -28,6 +35,7 @@ __all__ = [
     "lowest_contact",
     "mass_matrix",
     "raising_coordinate",
+    "seen_bodies",
     "step",
     "to_jax",
 ]

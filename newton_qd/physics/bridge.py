@@ -18,10 +18,10 @@ from jax.core import Tracer
 from warp._src.jax.ffi import FfiCallable
 
 from newton_qd.physics import interrupts
-from newton_qd.physics.launch import Launcher, thread_count
+from newton_qd.physics.launch import BODY_SIZE, Launcher, output_size, thread_count
 from newton_qd.physics.parameters import parameter_count
-from newton_qd.physics.precision import SCALARS
-from newton_qd.physics.system import System
+from newton_qd.physics.precision import SCALARS, kernels
+from newton_qd.physics.system import Kinematics, System
 
 
 @functools.cache
@@ -147,42 +147,53 @@ def control_step(system: System) -> Any:
         A function of ``q`` (nq,), ``v`` (nv,), ``control`` (nu,) and, where the
         world has its own, ``params``
         (:func:`~newton_qd.physics.parameters.parameter_count`,) that returns
-        ``q`` (nq,), ``v`` (nv,), ``impulse`` (nb, 6), ``normal_impulse`` (nb,) and
-        ``fault`` () as in :class:`~newton_qd.physics.system.PhysicsState`; reverse
-        mode once, no forward mode. Under ``vmap`` the worlds share one launch.
+        ``q`` (nq,), ``v`` (nv,), ``impulse`` (nb, 6), ``normal_impulse`` (nb,),
+        ``fault`` (), ``feet_contact`` (nf,), ``smooth_feet_contact`` (nf,),
+        ``torso_xy`` (2,) and ``bodies`` as in
+        :class:`~newton_qd.physics.system.PhysicsState`; reverse mode once, no forward
+        mode. Under ``vmap`` the worlds share one launch.
     """
     interrupts.install()
-    nq, nv, nb = system.nq, system.nv, system.nb
-    size, output_size = nq + nv + system.nu, nq + nv + 7 * nb + 1
+    nq, nv, nb, nf = system.nq, system.nv, system.nb, len(system.feet)
+    size, out = nq + nv + system.nu, output_size(system)
     count = parameter_count(system)
-    step = _differentiable(system, "step", size, output_size)
-    own_step = _differentiable(system, "step", size + count, output_size, True)
-    ends = np.cumsum([nq, nv, 6 * nb, nb])
+    step = _differentiable(system, "step", size, out)
+    own_step = _differentiable(system, "step", size + count, out, True)
+    ends = np.cumsum([nq, nv, 6 * nb, nb, 1, nf, nf, 2])
 
     def run(
         q: jax.Array, v: jax.Array, control: jax.Array, params: jax.Array | None = None
-    ) -> tuple[jax.Array, ...]:
+    ) -> tuple[Any, ...]:
         thread_count()  # a bad setting is an error here, not inside a compiled call
         parts = {"q": (q, nq), "v": (v, nv), "control": (control, system.nu)}
         if params is None:
             y = step(_row(system, **parts))
         else:
             y = own_step(_row(system, **parts, params=(params, count)))
-        q, v, impulse, normal_impulse, fault = jnp.split(y, ends)
-        return q, v, impulse.reshape(nb, 6), normal_impulse, fault[0]
+        q, v, impulse, normal, fault, *read, last = jnp.split(y, ends)
+        bodies = _bodies(last) if system.reports_bodies else None
+        return q, v, impulse.reshape(nb, 6), normal, fault[0], *read, bodies
 
     return run
 
 
+def _bodies(row: jax.Array) -> Kinematics:
+    """The bodies of one world, which a kernel wrote field by field."""
+    sizes = (3, 4, 3, 3, 3)
+    nb = row.shape[0] // sum(sizes)
+    fields = jnp.split(row, nb * np.cumsum(sizes[:-1]))
+    parts = zip(fields, sizes, strict=True)
+    return Kinematics(*(field.reshape(nb, size) for field, size in parts))
+
+
 @functools.cache
 def kinematics(system: System) -> Any:
-    """Differentiable poses (nb, 7) and twists (nb, 6) about O of one world."""
-    size, output_size = system.nq + system.nv, 13 * system.nb
-    views = _differentiable(system, "kinematics", size, output_size)
+    """Differentiable bodies of one world, as a function of ``q`` and ``v``."""
+    size = system.nq + system.nv
+    views = _differentiable(system, "kinematics", size, BODY_SIZE * system.nb)
 
-    def run(q: jax.Array, v: jax.Array) -> tuple[jax.Array, jax.Array]:
-        y = views(jnp.concatenate([q, v])).reshape(system.nb, 13)
-        return y[:, :7], y[:, 7:]
+    def run(q: jax.Array, v: jax.Array) -> Kinematics:
+        return _bodies(views(_row(system, q=(q, system.nq), v=(v, system.nv))))
 
     return run
 
@@ -193,6 +204,110 @@ def dynamics(system: System, q: jax.Array, v: jax.Array) -> tuple[jax.Array, jax
     call = _kernel_call(system, "dynamics_forward", system.nq + nv)
     y = call(jnp.concatenate([q, v]), output_dims=nv * (nv + 1))[0]
     return y[: nv * nv].reshape(nv, nv), y[nv * nv :]
+
+
+@functools.cache
+def _episode_call(name: str, dtype: str, steps: int, nd: int) -> Any:
+    """A kernel of ``kernels.episodes`` as a function of one episode's row."""
+    real = SCALARS[dtype]
+    kernel = getattr(kernels(dtype, 1).episodes, name)
+
+    def launch(x: Any, *arrays: Any) -> None:
+        with _errors_contained():
+            episodes = x.shape[0] // (steps * (nd + 1))
+            inputs = [steps, nd, x, *arrays]
+            wp.launch(kernel, dim=episodes * nd, inputs=inputs, device=x.device)
+
+    def forward(x: wp.array(dtype=real), y: wp.array(dtype=real)):
+        launch(x, y)
+
+    def backward(
+        x: wp.array(dtype=real),
+        y_bar: wp.array(dtype=real),
+        x_bar: wp.array(dtype=real),
+    ):
+        launch(x, y_bar, x_bar)
+
+    function = backward if name.endswith("_backward") else forward
+    function.__name__ = function.__qualname__ = name
+    kernel.module.load(wp.device_from_jax(jax.devices()[0]))
+    function.__module__ = kernel.module.name
+    call = wp.jax_callable(
+        function,
+        num_outputs=1,
+        vmap_method="broadcast_all",
+        graph_mode=wp.JaxCallableGraphMode.NONE,
+    )
+    return jax.jit(call, static_argnames="output_dims", inline=True)
+
+
+@functools.cache
+def _episode_reduction(name: str, dtype: str, steps: int, nd: int, size: int) -> Any:
+    """Reverse-mode function of one episode's row; the mask has no gradient."""
+
+    @jax.custom_vjp
+    def run(x: jax.Array) -> jax.Array:
+        forward = _episode_call(f"{name}_forward", dtype, steps, nd)
+        return forward(x, output_dims=size)[0]
+
+    def run_forward(x: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return run(x), x
+
+    def run_backward(x: jax.Array, y_bar: jax.Array) -> tuple[jax.Array]:
+        backward = _episode_call(f"{name}_backward", dtype, steps, nd)
+        return (backward(x, y_bar, output_dims=x.shape[0])[0],)
+
+    run.defvjp(run_forward, run_backward)
+    return run
+
+
+def _episode_row(state_desc: jax.Array, mask: jax.Array) -> jax.Array:
+    if state_desc.ndim != 2 or mask.shape != state_desc.shape[:1] or not mask.size:
+        raise ValueError(
+            f"state_desc, mask: shapes {state_desc.shape}, {mask.shape} given; "
+            "allowed: (t, nd) and (t,), t of 1 or more"
+        )
+    if state_desc.dtype.name not in SCALARS:
+        raise TypeError(
+            f"state_desc: dtype {state_desc.dtype} given; allowed: {', '.join(SCALARS)}"
+        )
+    return jnp.concatenate([state_desc.ravel(), mask.astype(state_desc.dtype)])
+
+
+def episode_proportion(state_desc: jax.Array, mask: jax.Array) -> jax.Array:
+    """Proportion of the valid steps of one episode; under ``vmap`` one launch.
+
+    Bitwise :func:`newton_qd.extractors.get_feet_contact_proportion`.
+
+    Args:
+        state_desc: (t, nd) state descriptors before each step.
+        mask: (t,) 1 where a step comes after the end of the episode, else 0.
+
+    Returns:
+        (nd,) proportions [-]; differentiable in reverse mode in ``state_desc``.
+    """
+    row = _episode_row(state_desc, mask)
+    steps, nd = state_desc.shape
+    dtype, size = state_desc.dtype.name, steps * nd
+    run = _episode_reduction("proportion", dtype, steps, nd, size)
+    return run(row).reshape(nd, steps)[:, 0]
+
+
+def episode_final(state_desc: jax.Array, mask: jax.Array) -> jax.Array:
+    """State descriptor before the last valid step; under ``vmap`` one launch.
+
+    Bitwise :func:`newton_qd.extractors.get_final_xy_position`.
+
+    Args:
+        state_desc: (t, nd) state descriptors before each step.
+        mask: (t,) 1 where a step comes after the end of the episode, else 0.
+
+    Returns:
+        (nd,) descriptor; differentiable in reverse mode in ``state_desc``.
+    """
+    row = _episode_row(state_desc, mask)
+    steps, nd = state_desc.shape
+    return _episode_reduction("final", state_desc.dtype.name, steps, nd, nd)(row)
 
 
 interrupts.protect(FfiCallable.ffi_callback)

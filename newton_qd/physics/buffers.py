@@ -10,7 +10,7 @@ import warp as wp
 
 from newton_qd.physics import reference
 from newton_qd.physics.precision import kernels, pack_width
-from newton_qd.physics.system import System
+from newton_qd.physics.system import CONTACT_FRACTION, System
 from newton_qd.physics.tree import Tree, build_tree, origin_axes
 
 # Solves of a substep: the predictor and two correctors.
@@ -23,6 +23,8 @@ _PER_SOLVE_CONTACT = ("push", "weight_n", "weight_t", "slip")
 _PER_SOLVE_BODY = ("total_ww", "total_wv", "total_vv", "total_w", "total_v")
 _PER_SOLVE_BODY += ("passed_ww", "passed_wv", "passed_vv", "passed_w", "passed_v")
 _PER_SOLVE_BODY += ("lever_w", "lever_v", "effort", "change_w", "change_v")
+_PER_READING = ("body_impulse", "body_angular_impulse", "body_normal_impulse")
+_PER_READING += ("position", "com", "com_velocity")
 _REPORTED = ("impulse", "angular_impulse", "normal_impulse")
 
 
@@ -69,6 +71,15 @@ def build_model(system: System, device: Any, parametric: bool = False) -> Any:
     model.friction = material.friction
     model.slip_velocity = material.slip_velocity
     model.dissipation = material.dissipation
+    model.reports_bodies = int(system.reports_bodies)
+    floats = system.torso_floats
+    model.torso = system.torso + 1
+    model.torso_q = int(system.q_start[system.torso]) if floats else -1
+    model.nf = len(system.feet)
+    put("foot", [int(body) + 1 for body in system.feet] or [0])
+    model.foot_weight = system.total_mass * robot.gravity * robot.dt
+    model.foot_fraction = CONTACT_FRACTION
+    model.foot_width = system.feet_width
     return model
 
 
@@ -165,11 +176,14 @@ def build_scratch(
     space = kernels(system.dtype, pack_width(system.dtype, device), parametric)
     values, adjoints = space.structs.Scratch(), space.structs.Scratch()
     n, nc = system.robot.substeps, max(len(system.contact_body), 1)
-    steps, solves = (n, _SOLVES * n) if adjoint else (1, 1)
+    nf = len(system.feet)
+    # the state after the last substep has kinematics too
+    steps, solves = (n + 1, _SOLVES * n) if adjoint else (1, 1)
     counts = {
         "fault": 1,
-        "q": (n + 1) * system.nq,
-        "v": (n + 1) * system.nv,
+        "lost": 1,
+        "q": (n + 2) * system.nq,
+        "v": (n + 2) * system.nv,
         "ctrl": max(system.nu, 1),
         "parameter": 4 + 2 * system.nb + system.nv,
         **dict.fromkeys(_PER_BODY, steps * (system.nb + 1)),
@@ -179,6 +193,9 @@ def build_scratch(
         **dict.fromkeys(_PER_SOLVE_CONTACT, solves * nc),
         **dict.fromkeys(_PER_SOLVE_BODY, solves * (system.nb + 1)),
         "dv": solves * system.nv,
+        **dict.fromkeys(_PER_READING, system.nb + 1),
+        "torso_xy": 2,
+        **dict.fromkeys(("foot_contact", "smooth_foot_contact"), max(nf, 1)),
     }
     size = 0
     for name, count in counts.items():

@@ -2,34 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 
 from newton_qd.physics import bridge
-from newton_qd.physics.system import System
-from newton_qd.physics.tree import origin_axes
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class Kinematics:
-    """Where the bodies are and how they move, world axes.
-
-    Attributes:
-        position: (nb, 3) origin of the link frame [m].
-        rotation: (nb, 4) quaternion xyzw of the link frame.
-        com: (nb, 3) centre of mass [m].
-        linear_velocity: (nb, 3) of the centre of mass [m/s].
-        angular_velocity: (nb, 3) [rad/s].
-    """
-
-    position: jax.Array
-    rotation: jax.Array
-    com: jax.Array
-    linear_velocity: jax.Array
-    angular_velocity: jax.Array
+from newton_qd.physics.system import Kinematics, PhysicsState, System
 
 
 def _rotate(quaternion: jax.Array, vector: jax.Array) -> jax.Array:
@@ -62,22 +39,22 @@ def forward_kinematics(system: System, q: jax.Array, v: jax.Array) -> Kinematics
     """
     q = _checked(system, "q", q, system.nq)
     v = _checked(system, "v", v, system.nv)
-    pose, twist = bridge.kinematics(system)(q, v)
-    at, rotation = pose[:, :3], pose[:, 3:]
-    local = jnp.asarray(system.com, q.dtype)
-    com = at + _rotate(rotation, local)
-    angular = twist[:, :3]
-    # the kernels work about O
-    axes = origin_axes(system).astype(system.dtype)[: system.nq]
-    moves = (q[i] * axis for i, axis in enumerate(axes))
-    origin = sum(moves, jnp.zeros((3,), q.dtype))
-    return Kinematics(
-        position=at + origin,
-        rotation=rotation,
-        com=com + origin,
-        linear_velocity=twist[:, 3:] + jnp.cross(angular, com),
-        angular_velocity=angular,
-    )
+    return bridge.kinematics(system)(q, v)
+
+
+def seen_bodies(system: System, state: PhysicsState) -> Kinematics:
+    """Poses and velocities of every body: as the step reported, or computed now.
+
+    Args:
+        system: The system.
+        state: State of one world.
+
+    Returns:
+        The kinematics; differentiable in reverse mode.
+    """
+    if state.bodies is not None:
+        return state.bodies
+    return forward_kinematics(system, state.q, state.v)
 
 
 def mass_matrix(system: System, q: jax.Array) -> jax.Array:

@@ -14,6 +14,7 @@ from newton_qd.physics.system import System
 from newton_qd.physics.workers import Worker
 
 LANES = (1, 2, 4, 8, 16, 32)
+BODY_SIZE = 16  # entries of a body: the fields of Kinematics
 # Kernel modules other than ``inspect``, whose kernels are written for one lane; each is
 # compiled as a whole.
 _MODULES = {"step_forward": "forward", "step_backward": "backward"}
@@ -55,6 +56,12 @@ def lane_count() -> int:
     if not text.isdecimal() or int(text) not in LANES:
         raise ValueError(f"NEWTON_QD_LANES={text!r}: expected one of {LANES}")
     return int(text)
+
+
+def output_size(system: System) -> int:
+    """Length of a row that a step writes."""
+    size = system.nq + system.nv + 7 * system.nb + 1 + 2 * len(system.feet) + 2
+    return size + (BODY_SIZE * system.nb if system.reports_bodies else 0)
 
 
 class Launcher:

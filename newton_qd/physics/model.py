@@ -260,6 +260,8 @@ def build_system(robot: Robot, dtype: str, scene: Scene | None = None) -> System
         ),
         torso=body_of(robot, "torso", robot.torso, bodies),
         rest_q=np.zeros(int(model.joint_coord_count)),
+        feet_width=0.02,
+        reports_bodies=False,
         **_body_arrays(bodies),
         **_dof_arrays(robot, built, bodies, control),
         **control,
@@ -287,20 +289,42 @@ def _cached_system(robot: Robot, dtype: str, scene: Scene | None) -> System:
     return build_system(robot, dtype, scene)
 
 
-def load_system(
-    robot: Robot, dtype: str = "float32", scene: Scene | None = None
+@functools.cache
+def _cached_variant(
+    system: System, feet_width: float | None, reports_bodies: bool
 ) -> System:
-    """Returns the system of a robot, built once per process, precision and scene.
+    width = system.feet_width if feet_width is None else feet_width
+    if (width, reports_bodies) == (system.feet_width, system.reports_bodies):
+        return system
+    return dataclasses.replace(system, feet_width=width, reports_bodies=reports_bodies)
+
+
+def load_system(
+    robot: Robot,
+    dtype: str = "float32",
+    scene: Scene | None = None,
+    *,
+    feet_width: float | None = None,
+    reports_bodies: bool = False,
+) -> System:
+    """Returns the system of a robot, built once per process and arguments.
 
     Args:
         robot: The robot's row.
         dtype: ``"float32"`` or ``"float64"``, which needs JAX's 64-bit mode.
         scene: What stands on the flat ground; ``None``: nothing.
+        feet_width: Share of the robot's weight over which the smooth contact of a
+            foot rises [-], above 0; ``None``: 0.02.
+        reports_bodies: Whether a step reports where the bodies are.
 
     Raises:
         AssetNotFoundError: A row's URDF file does not exist.
         RobotDescriptionError: A file or a row is not one that physics can run.
-        ValueError: ``dtype`` is not allowed, or needs JAX's 64-bit mode.
+        ValueError: ``dtype`` is not allowed, or needs JAX's 64-bit mode; or
+            ``feet_width`` is not above 0.
     """
     _check_dtype(dtype)
-    return _cached_system(robot, dtype, scene)
+    if feet_width is not None and not feet_width > 0:
+        raise ValueError(f"feet_width={feet_width!r}: allowed: None, or above 0")
+    system = _cached_system(robot, dtype, scene)
+    return _cached_variant(system, feet_width, reports_bodies)

@@ -46,7 +46,7 @@ def _load(dtype: str, width: int, parametric: bool) -> SimpleNamespace:
     package.parametric = parametric  # type: ignore[attr-defined]
     sys.modules[name] = package
     spec.loader.exec_module(package)
-    modules = ("structs", "world", "forward", "backward", "inspect")
+    modules = ("structs", "world", "forward", "backward", "inspect", "episodes")
     loaded = {
         module: importlib.import_module(f"{name}.{module}")
         for module in modules

@@ -17,7 +17,7 @@ from warp._src import context
 from newton_qd.assets import find_urdf
 from newton_qd.physics.description import read_description
 from newton_qd.physics.kernels.conventions import pack, unpack
-from newton_qd.physics.launch import Launcher
+from newton_qd.physics.launch import Launcher, output_size
 from newton_qd.physics.model import load_system, newton_builder
 from newton_qd.physics.system import JointKind, System
 from newton_qd.robots import Robot
@@ -109,7 +109,7 @@ class NewtonQDSolver(SolverBase):
         nq, nv, nb = self._system.nq, self._system.nv, self._system.nb
         with wp.ScopedDevice(model.device):
             self._inputs = self._zeros(nq + 2 * nv)
-            self._outputs = self._zeros(nq + nv + 7 * nb + 1)
+            self._outputs = self._zeros(output_size(self._system))
             self.impulse = self._zeros(nb, 6)
             self.normal_impulse = self._zeros(nb)
             self.fault = self._zeros()

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from newton_qd.physics import bridge
+from newton_qd.physics.inspection import forward_kinematics
 from newton_qd.physics.parameters import PhysicsParams, parameter_row
-from newton_qd.physics.system import PhysicsState, System
+from newton_qd.physics.system import CONTACT_FRACTION, PhysicsState, System
 
 
 def initial_state(system: System, q: jax.Array, v: jax.Array) -> PhysicsState:
-    """A state at rest with its contacts: impulses are zero before the first step.
+    """A state before its first step: nothing has touched the ground yet.
 
     Args:
         system: The system.
@@ -22,11 +24,23 @@ def initial_state(system: System, q: jax.Array, v: jax.Array) -> PhysicsState:
         The state.
     """
     dtype = jnp.dtype(system.dtype)
+    q, v = jnp.asarray(q, dtype), jnp.asarray(v, dtype)
+    bodies = forward_kinematics(system, q, v) if system.reports_bodies else None
+    start = int(system.q_start[system.torso])
+    torso_xy = q[start : start + 2]
+    if not system.torso_floats:
+        seen = bodies or forward_kinematics(system, q, v)
+        torso_xy = seen.position[system.torso, :2]
+    feet, excess = system.feet.shape, CONTACT_FRACTION / system.feet_width
     return PhysicsState(
-        q=jnp.asarray(q, dtype),
-        v=jnp.asarray(v, dtype),
+        q=q,
+        v=v,
         impulse=jnp.zeros((system.nb, 6), dtype),
         normal_impulse=jnp.zeros((system.nb,), dtype),
+        feet_contact=jnp.zeros(feet, dtype),
+        smooth_feet_contact=jnp.full(feet, 1 / (1 + np.exp(excess)), dtype),
+        torso_xy=torso_xy,
+        bodies=bodies,
     )
 
 
@@ -59,7 +73,7 @@ def step(
             is wrong.
     """
     own = None if params is None else parameter_row(system, params)
-    q, v, impulse, normal_impulse, fault = bridge.control_step(system)(
-        state.q, state.v, control, own
-    )
-    return PhysicsState(q, v, impulse, normal_impulse), fault.astype(jnp.int32)
+    found = bridge.control_step(system)(state.q, state.v, control, own)
+    q, v, impulse, normal_impulse, fault, *readings = found
+    after = PhysicsState(q, v, impulse, normal_impulse, *readings)
+    return after, fault.astype(jnp.int32)

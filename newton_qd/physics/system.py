@@ -11,6 +11,9 @@ import numpy as np
 from newton_qd.robots import Robot
 from newton_qd.scenes import Scene
 
+CONTACT_FRACTION = 0.01
+"""Share of the robot's weight above which a foot touches the ground [-]."""
+
 
 class JointKind(enum.IntEnum):
     """Joint types that the kernels know; the values are read by the kernels."""
@@ -84,6 +87,9 @@ class System:
         scene_frames: (ns, 7) their frames in the world.
         contact_stiffness: [N/m].
         feet: (nf,) body index of each foot.
+        feet_width: Share of the robot's weight over which the smooth contact of a
+            foot rises [-].
+        reports_bodies: Whether a step reports where the bodies are.
         torso: Body index of the torso.
         rest_q: (nq,) coordinates of the default pose, ``v`` being 0.
     """
@@ -128,6 +134,8 @@ class System:
     feet: np.ndarray
     torso: int
     rest_q: np.ndarray
+    feet_width: float
+    reports_bodies: bool
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
@@ -164,6 +172,11 @@ class System:
         return len(self.gear)
 
     @property
+    def torso_floats(self) -> bool:
+        """Whether the torso moves freely, so that its position is in ``q``."""
+        return self.joint_kind[self.torso] == JointKind.FREE
+
+    @property
     def ground_contacts(self) -> np.ndarray:
         """Rows of the contact tables that touch the ground, obstacle 0."""
         return np.flatnonzero(self.contact_obstacle == 0)
@@ -176,8 +189,31 @@ class System:
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
+class Kinematics:
+    """Where the bodies are and how they move, world axes.
+
+    Attributes:
+        position: (nb, 3) origin of the link frame [m].
+        rotation: (nb, 4) quaternion xyzw of the link frame.
+        com: (nb, 3) centre of mass [m].
+        linear_velocity: (nb, 3) of the centre of mass [m/s].
+        angular_velocity: (nb, 3) [rad/s].
+    """
+
+    position: jax.Array
+    rotation: jax.Array
+    com: jax.Array
+    linear_velocity: jax.Array
+    angular_velocity: jax.Array
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
 class PhysicsState:
-    """State of a world, and what the last control step reported.
+    """State of a world, and what is read from it.
+
+    A step starts from ``q`` and ``v`` alone and writes all the rest: for a state of
+    other coordinates call :func:`~newton_qd.physics.initial_state`.
 
     A free root has coordinates (position of the root origin, quaternion xyzw)
     and velocities (linear velocity of the root origin, angular velocity), all
@@ -191,9 +227,20 @@ class PhysicsState:
             centre of mass [N m s], world axes.
         normal_impulse: (nb,) sum of the normal contact impulses on each body
             over the control step [N s]; never negative.
+        feet_contact: (nf,) 1 where a foot carried more than 1 % of the robot's
+            weight over the control step, else 0; its gradient is 0.
+        smooth_feet_contact: (nf,) the same as a smooth step of the system's
+            ``feet_width``, 0.5 where the other switches.
+        torso_xy: (2,) x and y of the torso's link frame [m].
+        bodies: Where the bodies are and how they move; ``None`` where the system does
+            not report it.
     """
 
     q: jax.Array
     v: jax.Array
     impulse: jax.Array
     normal_impulse: jax.Array
+    feet_contact: jax.Array
+    smooth_feet_contact: jax.Array
+    torso_xy: jax.Array
+    bodies: Kinematics | None = None

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 
 from newton_qd.envs.base import Env, PhysicsEnv, QDEnv
-from newton_qd.envs.feet import feet_contact, smooth_feet_contact
-from newton_qd.envs.state import State, per_world
+from newton_qd.envs.state import State
+from newton_qd.physics.system import PhysicsState
 from newton_qd.types import Action, Descriptor, Params, RNGKey
 from newton_qd.wrappers.base import Wrapper
 
@@ -31,8 +31,8 @@ class FeetContactWrapper(Wrapper, QDEnv):
         Args:
             env: The environment.
             env_name: Its name, for the error.
-            smooth_width: ``None``: 0 or 1 without a gradient; else the width of
-                :func:`~newton_qd.envs.feet.smooth_feet_contact`, above 0.
+            smooth_width: ``None``: 0 or 1 without a gradient; else between them,
+                rising over this share of the robot's weight, above 0.
             straight_through: Whether the reading stays 0 or 1 and has the gradient
                 of the smooth one.
 
@@ -56,8 +56,10 @@ class FeetContactWrapper(Wrapper, QDEnv):
                 "straight_through=True, smooth_width=None: allowed: a width above 0, "
                 "over which the gradient is smooth"
             )
+        if smooth_width is not None:
+            env = env.with_base(lambda base: _with_feet_width(base, smooth_width))
         super().__init__(env)
-        self._smooth_width = smooth_width
+        self._smooth = smooth_width is not None
         self._straight_through = straight_through
 
     def reset(self, rng: RNGKey) -> State:
@@ -73,18 +75,15 @@ class FeetContactWrapper(Wrapper, QDEnv):
         return state.replace(info={**state.info, "state_descriptor": descriptor})
 
     def _read(self, state: State) -> Descriptor:
-        system, width = self._robot.system, self._smooth_width
-        plain = per_world(lambda physics: feet_contact(system, physics), state)
-        if width is None:
-            return plain
-        smooth = per_world(
-            lambda physics: smooth_feet_contact(system, physics, width), state
-        )
+        physics: PhysicsState = state.pipeline_state
+        if not self._smooth:
+            return physics.feet_contact
+        smooth = physics.smooth_feet_contact
         if not self._straight_through:
             return smooth
         # Bengio et al. 2013, "Estimating or propagating gradients through stochastic
         # neurons"; the difference is exactly 0
-        return plain + (smooth - jax.lax.stop_gradient(smooth))
+        return physics.feet_contact + (smooth - jax.lax.stop_gradient(smooth))
 
     @property
     def _robot(self) -> PhysicsEnv:
@@ -107,3 +106,8 @@ class FeetContactWrapper(Wrapper, QDEnv):
         """Lower and upper limits, (nf,) each."""
         size = (self.state_descriptor_length,)
         return jnp.zeros(size, self.dtype), jnp.ones(size, self.dtype)
+
+
+def _with_feet_width(env: Env, width: float) -> Env:
+    assert isinstance(env, PhysicsEnv)
+    return env.with_feet_width(width)

@@ -9,8 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from newton_qd.envs.base import Env, PhysicsEnv, QDEnv
-from newton_qd.envs.position import torso_xy
-from newton_qd.envs.state import State, per_world
+from newton_qd.envs.state import State
 from newton_qd.types import Action, Params, RNGKey
 from newton_qd.wrappers.base import Wrapper
 
@@ -62,10 +61,7 @@ class XYPositionWrapper(Wrapper, QDEnv):
         return self._described(self.env.step(state, action, params))
 
     def _described(self, state: State) -> State:
-        base = self.unwrapped
-        assert isinstance(base, PhysicsEnv)
-        system = base.system
-        position = per_world(lambda physics: torso_xy(system, physics), state)
+        position = state.pipeline_state.torso_xy
         low, high = self.state_descriptor_limits
         described = {
             "state_descriptor": jnp.clip(position, low, high),

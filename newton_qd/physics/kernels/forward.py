@@ -3,9 +3,9 @@
 import warp as wp
 
 from . import scalar
-from .simulate import simulate
-from .structs import Model, Scratch, row_at
-from .world import detect_fault, load_world, pack_at, store_impulses, store_state
+from .simulate import conclude, simulate
+from .structs import Model, Scratch, row_after, row_at
+from .world import detect_fault, load_world, pack_at, store_world
 
 wp.set_module_options({"enable_backward": False})
 
@@ -31,6 +31,6 @@ def step_forward(
     pack = pack_at(n, first, worlds, slot_stride)
     load_world(m, sc, sc, row_at(m, pack.slot, 0, 0, 0), pack, x, x, lane, lanes)
     simulate(m, sc, pack.slot, 0, lane, lanes)
-    detect_fault(m, sc, pack.slot, lane)
-    store_state(m, sc, pack, x, y, lane, lanes)
-    store_impulses(m, sc, pack, y, lane, lanes)
+    detect_fault(m, sc, pack, x, lane)
+    conclude(m, sc, pack, x, 0, lane, lanes)
+    store_world(m, sc, row_after(m, pack.slot, 0), pack, y, lane, lanes)

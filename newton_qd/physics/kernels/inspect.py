@@ -1,7 +1,7 @@
-"""Kernels that show a system from inside: poses, twists, mass matrix, bias forces.
+"""Kernels that show a system from inside: bodies, mass matrix, bias forces.
 
-Inputs: q and v of each world. Outputs: for each body pose (7) and twist (6, angular
-first), both about O; or the mass matrix, row by row, and the bias forces.
+Inputs: q and v of each world. Outputs: the bodies as in :mod:`.readings`; or the mass
+matrix, row by row, and the bias forces.
 """
 
 import warp as wp
@@ -10,12 +10,9 @@ from . import mat33, real, scalar, sync, vec3
 from .algebra import (
     add,
     add_diagonal,
-    component,
     cross,
     dot,
     mul,
-    quaternion,
-    rigid,
     skew,
     translation,
     vector,
@@ -23,6 +20,7 @@ from .algebra import (
 from .inertia import rigid_inertia
 from .memory import constant, gather, load, scatter, store
 from .numbers import uniform
+from .readings import BODY_SIZE, body_reading, seed_bodies, store_bodies
 from .simulate import kinematics
 from .structs import Model, Row, Scratch, row_at
 from .world import Pack, pack_at
@@ -69,59 +67,23 @@ def adj_load_views(
 
 
 @wp.func
-def run_kinematics(m: Model, sc: Scratch, row: Row):
+def read_bodies(m: Model, sc: Scratch, row: Row):
     """Kinematics of substep 0 with one lane; replayed by the adjoint kernel."""
     kinematics(m, sc, row, 0, 1)
+    for i in range(1, m.nb + 1):
+        body_reading(m, sc, row, i)
 
 
 @wp.func
-def store_poses(m: Model, sc: Scratch, row: Row, y: wp.array[scalar], pack: Pack):
-    """Write poses and twists of a pack."""
-    size = 13 * m.nb
-    for i in range(m.nb):
-        at = pack.first * size + 13 * i
-        pose = load(sc.pose, row.body + i + 1)
-        for j in range(7):
-            scatter(y, at + j, size, pack.count, component(pose, j))
-        angular = load(sc.twist_w, row.body + i + 1)
-        linear = load(sc.twist_v, row.body + i + 1)
-        for j in range(3):
-            scatter(y, at + 7 + j, size, pack.count, component(angular, j))
-            scatter(y, at + 10 + j, size, pack.count, component(linear, j))
+def seed_views(m: Model, g: Scratch, row: Row, y_bar: wp.array[scalar], pack: Pack):
+    """Start the reverse pass with the caller's adjoints of the bodies."""
+    size = BODY_SIZE * m.nb
+    at = pack.first * size
+    seed_bodies(m, g, row, real(), y_bar, at, size, pack.count, 0, 1)
 
 
-@wp.func
-def seed_vector(y_bar: wp.array[scalar], at: int, size: int, count: int) -> vec3:
-    """Three entries from ``at`` on of each row."""
-    return vector(
-        gather(y_bar, at, size, count),
-        gather(y_bar, at + 1, size, count),
-        gather(y_bar, at + 2, size, count),
-    )
-
-
-@wp.func
-def seed_poses(m: Model, g: Scratch, row: Row, y_bar: wp.array[scalar], pack: Pack):
-    """Start the reverse pass with the caller's adjoints of poses and twists."""
-    size = 13 * m.nb
-    for i in range(m.nb):
-        at = pack.first * size + 13 * i
-        p = seed_vector(y_bar, at, size, pack.count)
-        r = quaternion(
-            gather(y_bar, at + 3, size, pack.count),
-            gather(y_bar, at + 4, size, pack.count),
-            gather(y_bar, at + 5, size, pack.count),
-            gather(y_bar, at + 6, size, pack.count),
-        )
-        store(g.pose, row.body + i + 1, rigid(p, r))
-        angular = seed_vector(y_bar, at + 7, size, pack.count)
-        linear = seed_vector(y_bar, at + 10, size, pack.count)
-        store(g.twist_w, row.body + i + 1, angular)
-        store(g.twist_v, row.body + i + 1, linear)
-
-
-@wp.func_grad(seed_poses)
-def adj_seed_poses(m: Model, g: Scratch, row: Row, y_bar: wp.array[scalar], pack: Pack):
+@wp.func_grad(seed_views)
+def adj_seed_views(m: Model, g: Scratch, row: Row, y_bar: wp.array[scalar], pack: Pack):
     """Nothing: seeding is not part of the kinematics."""
     sync(0)
 
@@ -257,12 +219,13 @@ def kinematics_forward(
     x: wp.array[scalar],
     y: wp.array[scalar],
 ):
-    """Poses and twists."""
+    """Where the bodies are and how they move."""
     pack = pack_at(wp.tid(), first, worlds, slot_stride)
     row = row_at(m, pack.slot, 0, 0, 0)
     load_views(m, sc, sc, row, x, x, pack)
-    kinematics(m, sc, row, 0, 1)
-    store_poses(m, sc, row, y, pack)
+    read_bodies(m, sc, row)
+    size = BODY_SIZE * m.nb
+    store_bodies(m, sc, row, y, pack.first * size, size, pack.count, 0, 1)
 
 
 @wp.kernel
@@ -282,5 +245,5 @@ def kinematics_backward(
     pack = pack_at(wp.tid(), first, worlds, slot_stride)
     row = row_at(m, pack.slot, 1, 0, 0)
     load_views(m, sc, g, row, x, x_bar, pack)
-    run_kinematics(m, sc, row)
-    seed_poses(m, g, row, y_bar, pack)
+    read_bodies(m, sc, row)
+    seed_views(m, g, row, y_bar, pack)

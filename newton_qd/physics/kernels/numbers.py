@@ -53,7 +53,27 @@ def beyond(a: real, s: scalar) -> real:
     ...
 
 
-@wp.func_native(*native("C != Real(0) ? A : B"))
+@wp.func_native(
+    *native(
+        "A > bound ? one : zero",
+        before="Real zero = Real(0), one = Real(1), bound = Real(s);",
+    )
+)
+def above(a: real, s: scalar) -> real:
+    """1 where a number is above ``s``, else 0; without adjoint."""
+    ...
+
+
+@wp.func_native(
+    *native(
+        "C != zero ? A : B",
+        """
+adj_A += C != zero ? adj_RET : zero;
+adj_B += C != zero ? zero : adj_RET;
+""",
+        "Real zero = Real(0);",
+    )
+)
 def choose(c: real, a: real, b: real) -> real:
-    """``a`` where ``c`` is not 0, else ``b``; without adjoint."""
+    """``a`` where ``c`` is not 0, else ``b``."""
     ...

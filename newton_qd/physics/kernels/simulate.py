@@ -1,8 +1,8 @@
-"""The substeps of one control step: the order of the stages, and nothing else."""
+"""One control step: the order of the stages, and nothing else."""
 
 import warp as wp
 
-from . import stage, sync
+from . import scalar, stage, sync
 from .articulation import change_free, change_hinge, eliminate_hinge, gather, rest_world
 from .contact import (
     contact_clip,
@@ -15,7 +15,9 @@ from .inertia import rigid_inertia
 from .integration import new_coordinates, new_velocity
 from .kinematics import free_joint, hinge_joint, world_frame
 from .memory import load
-from .structs import Model, Row, Scratch, row_at
+from .readings import body_impulse, body_reading, foot_contact, torso_position
+from .structs import Model, Row, Scratch, row_after, row_at
+from .world import Pack, settle
 
 
 @stage
@@ -92,3 +94,33 @@ def simulate(m: Model, sc: Scratch, slot: int, keep: int, lane: int, lanes: int)
         for i in range(1 + lane, m.nb + 1, lanes):
             new_coordinates(m, sc, last, i)
         sync(lane)
+
+
+@wp.func
+def conclude(
+    m: Model,
+    sc: Scratch,
+    pack: Pack,
+    x: wp.array[scalar],
+    keep: int,
+    lane: int,
+    lanes: int,
+):
+    """The returned state, and what is read from it, after :func:`detect_fault`."""
+    slot = pack.slot
+    end = row_at(m, slot, keep, m.substeps, 0)
+    row = row_after(m, slot, keep)
+    settle(m, sc, pack, x, end, row, lane, lanes)
+    for i in range(1 + lane, m.nb + 1, lanes):
+        body_impulse(m, sc, slot, row, i)
+    sync(lane)
+    for f in range(lane, m.nf, lanes):
+        foot_contact(m, sc, slot, row, f)
+    if m.reports_bodies == 1 or m.torso_q < 0:
+        kinematics(m, sc, row, lane, lanes)
+        for i in range(1 + lane, m.nb + 1, lanes):
+            body_reading(m, sc, row, i)
+        sync(lane)
+    if lane == 0:
+        torso_position(m, sc, slot, row)
+    sync(lane)

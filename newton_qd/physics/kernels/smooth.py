@@ -70,6 +70,28 @@ def finite_length(a: vec3):
     return sqrt(SHORTEST * SHORTEST + dot(a, a))
 
 
+_EXPONENTIAL = """
+#if defined(__CUDA_ARCH__)
+Real power = wp::exp(-A);
+#else
+Real power;
+for (int i = 0; i < sizeof(Real) / sizeof(Number); ++i) power[i] = wp::exp(-A[i]);
+#endif
+"""
+
+
+@wp.func_native(
+    *native(
+        "Real(1) / (Real(1) + power)",
+        "adj_A += RET * (Real(1) - RET) * adj_RET;",
+        _EXPONENTIAL,
+    )
+)
+def logistic(a: real) -> real:
+    """Smooth step from 0 to 1."""
+    ...
+
+
 # sin(r) / r and cos(r) of x = r^2: by their series up to r = 1, which is accurate to
 # 1e-16 there, and world by world beyond
 _TRIGONOMETRY = """

@@ -75,6 +75,16 @@ class Model:
     friction: scalar
     slip_velocity: scalar
     dissipation: scalar
+    # readings
+    reports_bodies: int  # 1: a step reports where the bodies are
+    torso: int  # body
+    torso_q: int  # its first coordinate where it moves freely, else -1
+    # feet, (nf)
+    nf: int
+    foot: wp.array[int]  # body
+    foot_weight: scalar  # impulse of the robot's weight over a control step [N s]
+    foot_fraction: scalar  # share of it above which a foot touches the ground
+    foot_width: scalar  # share of it over which the smooth contact rises
 
 
 @wp.struct
@@ -89,7 +99,9 @@ class Scratch:
     v: wp.array[real]
     ctrl: wp.array[real]
     parameter: wp.array[real]  # see the module of that name
-    fault: wp.array[real]  # (slots,), 0 or 1
+    # (slots,), 0 or 1: the step failed; its inputs were not finite
+    fault: wp.array[real]
+    lost: wp.array[real]
     # bodies; world axes, spatial vectors about O
     pose: wp.array[transform]
     twist_w: wp.array[vec3]
@@ -100,6 +112,17 @@ class Scratch:
     moment: wp.array[vec3]
     wrench_w: wp.array[vec3]
     wrench_v: wp.array[vec3]
+    # bodies over the control step, and in the returned state in the world
+    body_impulse: wp.array[vec3]
+    body_angular_impulse: wp.array[vec3]
+    body_normal_impulse: wp.array[real]
+    position: wp.array[vec3]
+    com: wp.array[vec3]
+    com_velocity: wp.array[vec3]
+    # readings
+    torso_xy: wp.array[real]  # (2 slots,)
+    foot_contact: wp.array[real]
+    smooth_foot_contact: wp.array[real]
     # degrees of freedom
     axis_w: wp.array[vec3]
     axis_v: wp.array[vec3]
@@ -156,6 +179,7 @@ class Row:
     solve_body: int
     solve_dof: int
     solve_contact: int
+    reading: int  # bodies of the slot
 
 
 @wp.func
@@ -169,13 +193,13 @@ def row_at(m: Model, slot: int, keep: int, s: int, p: int):
     solve = slot
     before = slot
     if keep == 1:
-        step = slot * m.substeps + s
-        solve = m.passes * step + p
+        step = slot * (m.substeps + 1) + s
+        solve = m.passes * (slot * m.substeps + s) + p
         before = solve - 1
     r = Row()
-    r.q = (slot * (m.substeps + 1) + s) * m.nq
+    r.q = (slot * (m.substeps + 2) + s) * m.nq
     r.q_next = r.q + m.nq
-    r.v = (slot * (m.substeps + 1) + s) * m.nv
+    r.v = (slot * (m.substeps + 2) + s) * m.nv
     r.v_next = r.v + m.nv
     r.ctrl = slot * m.nu
     r.parameter = slot * (4 + 2 * m.nb + m.nv)
@@ -187,4 +211,14 @@ def row_at(m: Model, slot: int, keep: int, s: int, p: int):
     r.solve_body = solve * (m.nb + 1)
     r.solve_dof = solve * m.nv
     r.solve_contact = solve * m.nc
+    r.reading = slot * (m.nb + 1)
+    return r
+
+
+@wp.func
+def row_after(m: Model, slot: int, keep: int):
+    """Row of the returned state, one after the end of the last substep."""
+    r = row_at(m, slot, keep, m.substeps, 0)
+    r.q = r.q_next
+    r.v = r.v_next
     return r

@@ -2,13 +2,14 @@
 
 The arrays hold one contiguous row per world. Inputs: q, v, ctrl, and its parameters
 where it has its own. Outputs: q, v, the contact impulse of each body (6), the normal
-impulse of each body, the fault.
+impulse of each body, the fault, contact and smooth contact of each foot, x and y of the
+torso, and, where the model reports them, the bodies as in :mod:`.readings`.
 """
 
 import warp as wp
 
-from . import real, scalar, sync, vec3, width
-from .algebra import add, component, mul, vector
+from . import real, scalar, stage, sync, width
+from .algebra import add, component, mul
 from .memory import constant, gather, load, scatter, store
 from .numbers import beyond, choose
 from .parameters import (
@@ -17,6 +18,7 @@ from .parameters import (
     parameter_inputs,
     return_parameters,
 )
+from .readings import BODY_SIZE, seed, seed_bodies, seed_vector, store_bodies
 from .structs import Model, Row, Scratch, row_at
 
 WIDTH = wp.constant(width)
@@ -52,7 +54,10 @@ def input_size(m: Model):
 @wp.func
 def output_size(m: Model):
     """Length of a row of outputs."""
-    return m.nq + m.nv + 7 * m.nb + 1
+    size = m.nq + m.nv + 7 * m.nb + 1 + 2 * m.nf + 2
+    if m.reports_bodies == 1:
+        size += BODY_SIZE * m.nb
+    return size
 
 
 @wp.func
@@ -123,19 +128,23 @@ def adj_load_world(
 
 
 @wp.func
-def detect_fault(m: Model, sc: Scratch, slot: int, lane: int):
-    """Record whether a number is not finite, or a speed out of bounds."""
+def detect_fault(m: Model, sc: Scratch, pack: Pack, x: wp.array[scalar], lane: int):
+    """Record where a number is not finite, or a speed out of bounds."""
     if lane == 0:
         # zero times a finite number is zero, anything else is not a number
         zero = scalar(0.0)
         total = real()
-        end = row_at(m, slot, 0, m.substeps, 0)
+        size = input_size(m)
+        for k in range(m.nq + m.nv):
+            total = total + zero * gather(x, pack.first * size + k, size, pack.count)
+        store(sc.lost, pack.slot, beyond(total, scalar(1.0)))
+        end = row_at(m, pack.slot, 0, m.substeps, 0)
         for k in range(m.nq):
             total = total + zero * load(sc.q, end.q + k)
         for k in range(m.nv):
             total = total + zero * load(sc.v, end.v + k)
         for s in range(m.substeps):
-            report = row_at(m, slot, 0, s, 0).report
+            report = row_at(m, pack.slot, 0, s, 0).report
             for c in range(m.nc):
                 impulse = load(sc.impulse, report + c)
                 angular = load(sc.angular_impulse, report + c)
@@ -146,69 +155,66 @@ def detect_fault(m: Model, sc: Scratch, slot: int, lane: int):
         fault = beyond(total, scalar(1.0))
         for k in range(m.nv):
             fault = fault + beyond(load(sc.v, end.v + k), MAX_SPEED)
-        store(sc.fault, slot, beyond(fault, scalar(0.5)))
+        store(sc.fault, pack.slot, beyond(fault, scalar(0.5)))
     sync(lane)
 
 
-@wp.func
-def store_state(
+@wp.func_grad(detect_fault)
+def adj_detect_fault(m: Model, sc: Scratch, pack: Pack, x: wp.array[scalar], lane: int):
+    """Nothing: a fault has no gradient."""
+    sync(lane)
+
+
+@stage
+def settle(
     m: Model,
     sc: Scratch,
     pack: Pack,
     x: wp.array[scalar],
-    y: wp.array[scalar],
+    end: Row,
+    row: Row,
     lane: int,
     lanes: int,
 ):
-    """Write q and v of a pack: a faulty world stays where it was, or at rest."""
+    """The returned state: a faulty world stays where it was, or at rest."""
     fault = load(sc.fault, pack.slot)
-    end = row_at(m, pack.slot, 0, m.substeps, 0)
-    inputs = input_size(m)
-    outputs = output_size(m)
-    start = pack.first * inputs
-    at = pack.first * outputs
-    total = real()
-    for k in range(m.nq + m.nv):
-        total = total + scalar(0.0) * gather(x, start + k, inputs, pack.count)
-    lost = beyond(total, scalar(1.0))
+    lost = load(sc.lost, pack.slot)
+    size = input_size(m)
+    at = pack.first * size
     for k in range(lane, m.nq, lanes):
-        stay = choose(
-            lost, constant(m.rest_q, k), gather(x, start + k, inputs, pack.count)
-        )
-        value = choose(fault, stay, load(sc.q, end.q + k))
-        scatter(y, at + k, outputs, pack.count, value)
-    start += m.nq
+        before = gather(x, at + k, size, pack.count)
+        stay = choose(lost, constant(m.rest_q, k), before)
+        store(sc.q, row.q + k, choose(fault, stay, load(sc.q, end.q + k)))
     at += m.nq
     for k in range(lane, m.nv, lanes):
-        stay = choose(lost, real(), gather(x, start + k, inputs, pack.count))
-        value = choose(fault, stay, load(sc.v, end.v + k))
-        scatter(y, at + k, outputs, pack.count, value)
+        stay = choose(lost, real(), gather(x, at + k, size, pack.count))
+        store(sc.v, row.v + k, choose(fault, stay, load(sc.v, end.v + k)))
 
 
 @wp.func
-def store_impulses(
+def store_world(
     m: Model,
     sc: Scratch,
+    row: Row,
     pack: Pack,
     y: wp.array[scalar],
     lane: int,
     lanes: int,
 ):
-    """Write the contact impulses of a pack, zero at a fault, and the fault."""
+    """Write the outputs of a pack; impulses are zero at a fault."""
     fault = load(sc.fault, pack.slot)
     size = output_size(m)
-    at = pack.first * size + m.nq + m.nv
+    at = pack.first * size
+    for k in range(lane, m.nq, lanes):
+        scatter(y, at + k, size, pack.count, load(sc.q, row.q + k))
+    at += m.nq
+    for k in range(lane, m.nv, lanes):
+        scatter(y, at + k, size, pack.count, load(sc.v, row.v + k))
+    at += m.nv
     for i in range(lane, m.nb, lanes):
-        linear = vec3()
-        angular = vec3()
-        normal = real()
-        for s in range(m.substeps):
-            report = row_at(m, pack.slot, 0, s, 0).report
-            start = load(m.contact_start, i + 1)
-            for c in range(start, load(m.contact_start, i + 2)):
-                linear = linear + load(sc.impulse, report + c)
-                angular = angular + load(sc.angular_impulse, report + c)
-                normal = normal + load(sc.normal_impulse, report + c)
+        linear = load(sc.body_impulse, row.reading + i + 1)
+        angular = load(sc.body_angular_impulse, row.reading + i + 1)
+        normal = load(sc.body_normal_impulse, row.reading + i + 1)
         for j in range(3):
             value = choose(fault, real(), component(linear, j))
             scatter(y, at + 6 * i + j, size, pack.count, value)
@@ -216,8 +222,19 @@ def store_impulses(
             scatter(y, at + 6 * i + 3 + j, size, pack.count, value)
         value = choose(fault, real(), normal)
         scatter(y, at + 6 * m.nb + i, size, pack.count, value)
+    at += 7 * m.nb
     if lane == 0:
-        scatter(y, at + 7 * m.nb, size, pack.count, fault)
+        scatter(y, at, size, pack.count, fault)
+    for f in range(lane, m.nf, lanes):
+        value = load(sc.foot_contact, pack.slot * m.nf + f)
+        scatter(y, at + 1 + f, size, pack.count, value)
+        value = load(sc.smooth_foot_contact, pack.slot * m.nf + f)
+        scatter(y, at + 1 + m.nf + f, size, pack.count, value)
+    at += 1 + 2 * m.nf
+    for k in range(lane, 2, lanes):
+        scatter(y, at + k, size, pack.count, load(sc.torso_xy, 2 * pack.slot + k))
+    if m.reports_bodies == 1:
+        store_bodies(m, sc, row, y, at + 2, size, pack.count, lane, lanes)
 
 
 @wp.func
@@ -225,48 +242,41 @@ def seed_world(
     m: Model,
     sc: Scratch,
     g: Scratch,
+    row: Row,
     pack: Pack,
     y_bar: wp.array[scalar],
     lane: int,
     lanes: int,
 ):
-    """Start the reverse pass: the caller's adjoints of the outputs."""
+    """Start the reverse pass: the caller's adjoints of the outputs; 0 at a fault."""
     fault = load(sc.fault, pack.slot)
-    end = row_at(m, pack.slot, 0, m.substeps, 0)
     size = output_size(m)
     at = pack.first * size
     for k in range(lane, m.nq, lanes):
-        value = gather(y_bar, at + k, size, pack.count)
-        store(g.q, end.q + k, choose(fault, real(), value))
+        store(g.q, row.q + k, seed(fault, y_bar, at + k, size, pack.count))
     at += m.nq
     for k in range(lane, m.nv, lanes):
-        value = gather(y_bar, at + k, size, pack.count)
-        store(g.v, end.v + k, choose(fault, real(), value))
+        store(g.v, row.v + k, seed(fault, y_bar, at + k, size, pack.count))
     at += m.nv
-    for c in range(lane, m.nc, lanes):
-        i = load(m.contact_body, c) - 1
+    for i in range(lane, m.nb, lanes):
         linear = seed_vector(fault, y_bar, at + 6 * i, size, pack.count)
         angular = seed_vector(fault, y_bar, at + 6 * i + 3, size, pack.count)
-        value = gather(y_bar, at + 6 * m.nb + i, size, pack.count)
-        normal = choose(fault, real(), value)
-        for s in range(m.substeps):
-            report = row_at(m, pack.slot, 0, s, 0).report
-            store(g.impulse, report + c, linear)
-            store(g.angular_impulse, report + c, angular)
-            store(g.normal_impulse, report + c, normal)
+        normal = seed(fault, y_bar, at + 6 * m.nb + i, size, pack.count)
+        store(g.body_impulse, row.reading + i + 1, linear)
+        store(g.body_angular_impulse, row.reading + i + 1, angular)
+        store(g.body_normal_impulse, row.reading + i + 1, normal)
+    at += 7 * m.nb + 1
+    for f in range(lane, m.nf, lanes):
+        # the contact itself is a step: its gradient is 0
+        value = seed(fault, y_bar, at + m.nf + f, size, pack.count)
+        store(g.smooth_foot_contact, pack.slot * m.nf + f, value)
+    at += 2 * m.nf
+    for k in range(lane, 2, lanes):
+        value = seed(fault, y_bar, at + k, size, pack.count)
+        store(g.torso_xy, 2 * pack.slot + k, value)
+    if m.reports_bodies == 1:
+        seed_bodies(m, g, row, fault, y_bar, at + 2, size, pack.count, lane, lanes)
     sync(lane)
-
-
-@wp.func
-def seed_vector(
-    fault: real, y_bar: wp.array[scalar], at: int, size: int, count: int
-) -> vec3:
-    """Three entries from ``at`` on of each row; 0 for a faulty world."""
-    return vector(
-        choose(fault, real(), gather(y_bar, at, size, count)),
-        choose(fault, real(), gather(y_bar, at + 1, size, count)),
-        choose(fault, real(), gather(y_bar, at + 2, size, count)),
-    )
 
 
 @wp.func_grad(seed_world)
@@ -274,16 +284,11 @@ def adj_seed_world(
     m: Model,
     sc: Scratch,
     g: Scratch,
+    row: Row,
     pack: Pack,
     y_bar: wp.array[scalar],
     lane: int,
     lanes: int,
 ):
     """Nothing: seeding is not part of the step."""
-    sync(lane)
-
-
-@wp.func_grad(detect_fault)
-def adj_detect_fault(m: Model, sc: Scratch, slot: int, lane: int):
-    """Nothing: a fault has no gradient."""
     sync(lane)

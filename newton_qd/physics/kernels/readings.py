@@ -1,0 +1,168 @@
+"""What is read from a state: where its bodies are, and which feet touch the ground.
+
+Bodies are seen from the origin of the world, each row field by field: position of the
+link frame (3), its rotation (4), then of the centre of mass position (3), velocity (3),
+and the angular velocity (3).
+"""
+
+import warp as wp
+
+from . import real, scalar, stage, vec3
+from .algebra import (
+    add,
+    component,
+    cross,
+    div,
+    mul,
+    quaternion,
+    rigid,
+    sub,
+    transform_point,
+    translation,
+    vector,
+)
+from .memory import constant, gather, load, scatter, store
+from .numbers import above, choose, uniform
+from .smooth import logistic
+from .structs import Model, Row, Scratch, row_at
+
+BODY_SIZE = wp.constant(16)
+
+
+@stage
+def body_reading(m: Model, sc: Scratch, row: Row, i: int):
+    """Position of body ``i``, and position and velocity of its centre of mass."""
+    x = load(sc.pose, row.body + i)
+    # the kernels work about O
+    world = translation(load(sc.pose, row.body))
+    com = transform_point(x, constant(m.com, i))
+    velocity = load(sc.twist_v, row.body + i) + cross(
+        load(sc.twist_w, row.body + i), com
+    )
+    store(sc.position, row.reading + i, translation(x) - world)
+    store(sc.com, row.reading + i, com - world)
+    store(sc.com_velocity, row.reading + i, velocity)
+
+
+@wp.func
+def store_bodies(
+    m: Model,
+    sc: Scratch,
+    row: Row,
+    y: wp.array[scalar],
+    at: int,
+    size: int,
+    count: int,
+    lane: int,
+    lanes: int,
+):
+    """Write the bodies of a pack to entries from ``at`` on of rows of ``size``."""
+    n = m.nb
+    for i in range(lane, n, lanes):
+        position = load(sc.position, row.reading + i + 1)
+        pose = load(sc.pose, row.body + i + 1)
+        com = load(sc.com, row.reading + i + 1)
+        linear = load(sc.com_velocity, row.reading + i + 1)
+        angular = load(sc.twist_w, row.body + i + 1)
+        for j in range(4):
+            scatter(y, at + 3 * n + 4 * i + j, size, count, component(pose, 3 + j))
+        for j in range(3):
+            k = at + 3 * i + j
+            scatter(y, k, size, count, component(position, j))
+            scatter(y, k + 7 * n, size, count, component(com, j))
+            scatter(y, k + 10 * n, size, count, component(linear, j))
+            scatter(y, k + 13 * n, size, count, component(angular, j))
+
+
+@wp.func
+def seed_bodies(
+    m: Model,
+    g: Scratch,
+    row: Row,
+    fault: real,
+    y_bar: wp.array[scalar],
+    at: int,
+    size: int,
+    count: int,
+    lane: int,
+    lanes: int,
+):
+    """Start the reverse pass of the bodies; 0 for a faulty world."""
+    n = m.nb
+    for i in range(lane, n, lanes):
+        k = at + 3 * i
+        r = at + 3 * n + 4 * i
+        turn = quaternion(
+            seed(fault, y_bar, r, size, count),
+            seed(fault, y_bar, r + 1, size, count),
+            seed(fault, y_bar, r + 2, size, count),
+            seed(fault, y_bar, r + 3, size, count),
+        )
+        position = seed_vector(fault, y_bar, k, size, count)
+        com = seed_vector(fault, y_bar, k + 7 * n, size, count)
+        linear = seed_vector(fault, y_bar, k + 10 * n, size, count)
+        angular = seed_vector(fault, y_bar, k + 13 * n, size, count)
+        store(g.position, row.reading + i + 1, position)
+        store(g.pose, row.body + i + 1, rigid(vec3(), turn))
+        store(g.com, row.reading + i + 1, com)
+        store(g.com_velocity, row.reading + i + 1, linear)
+        store(g.twist_w, row.body + i + 1, angular)
+
+
+@wp.func
+def seed(fault: real, y_bar: wp.array[scalar], at: int, size: int, count: int) -> real:
+    """Entry ``at`` of each row; 0 for a faulty world."""
+    return choose(fault, real(), gather(y_bar, at, size, count))
+
+
+@wp.func
+def seed_vector(
+    fault: real, y_bar: wp.array[scalar], at: int, size: int, count: int
+) -> vec3:
+    """Three entries from ``at`` on of each row; 0 for a faulty world."""
+    return vector(
+        seed(fault, y_bar, at, size, count),
+        seed(fault, y_bar, at + 1, size, count),
+        seed(fault, y_bar, at + 2, size, count),
+    )
+
+
+@stage
+def torso_position(m: Model, sc: Scratch, slot: int, row: Row):
+    """Where the torso is on the ground: in the coordinates, if it moves freely."""
+    if m.torso_q >= 0:
+        store(sc.torso_xy, 2 * slot, load(sc.q, row.q + m.torso_q))
+        store(sc.torso_xy, 2 * slot + 1, load(sc.q, row.q + m.torso_q + 1))
+    else:
+        position = load(sc.position, row.reading + m.torso)
+        store(sc.torso_xy, 2 * slot, component(position, 0))
+        store(sc.torso_xy, 2 * slot + 1, component(position, 1))
+
+
+@stage
+def body_impulse(m: Model, sc: Scratch, slot: int, row: Row, i: int):
+    """Contact impulses on body ``i`` over the control step."""
+    linear = vec3()
+    angular = vec3()
+    normal = real()
+    for s in range(m.substeps):
+        report = row_at(m, slot, 0, s, 0).report
+        for c in range(load(m.contact_start, i), load(m.contact_start, i + 1)):
+            linear = linear + load(sc.impulse, report + c)
+            angular = angular + load(sc.angular_impulse, report + c)
+            normal = normal + load(sc.normal_impulse, report + c)
+    store(sc.body_impulse, row.reading + i, linear)
+    store(sc.body_angular_impulse, row.reading + i, angular)
+    store(sc.body_normal_impulse, row.reading + i, normal)
+
+
+@stage
+def foot_contact(m: Model, sc: Scratch, slot: int, row: Row, f: int):
+    """Whether foot ``f`` carries weight, at once and as a smooth step."""
+    impulse = load(sc.body_normal_impulse, row.reading + load(m.foot, f))
+    fault = load(sc.fault, slot)
+    share = choose(fault, real(), impulse) / uniform(m.foot_weight)
+    at = slot * m.nf + f
+    store(sc.foot_contact, at, above(share, m.foot_fraction))
+    excess = (share - m.foot_fraction) / uniform(m.foot_width)
+    store(sc.smooth_foot_contact, at, logistic(excess))
