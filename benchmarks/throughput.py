@@ -1,8 +1,12 @@
 """Speed of one environment on the present device, forward and with gradient.
 
-Run as ``python benchmarks/throughput.py [--env ant_uni] [--batches 1024 4096]``. A
-figure counts only if every state stays finite; times are medians after a warm-up,
-with the result waited for.
+    python benchmarks/throughput.py [--env ant_uni] [--batches 1024 4096]
+    python benchmarks/throughput.py --suite [--batches 1024] [--names humanoid antmaze]
+
+A figure counts only if every state stays finite; times are medians after a warm-up,
+with the result waited for. ``--suite`` compares every environment with the ant: both
+take turns, so that what else the machine does matters little, and the speed is counted
+per degree of freedom and contact.
 """
 
 from __future__ import annotations
@@ -18,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import newton_qd
+from newton_qd.envs.base import PhysicsEnv
 
 
 def seconds(run: Callable[[], Any], repetitions: int) -> float:
@@ -69,6 +74,64 @@ def measure(
     return batch * steps / forward_time, batch * horizon / gradient_time
 
 
+def stopwatch(name: str, batch: int, steps: int) -> Callable[[], float]:
+    """A rollout under random actions, compiled, as a function that times it [s].
+
+    Raises:
+        RuntimeError: A state is not finite.
+    """
+    env = newton_qd.create(name)
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), batch))
+    shape = (steps, batch, env.action_size)
+    actions = jax.random.uniform(jax.random.key(1), shape, jnp.float32, -1, 1)
+
+    @jax.jit
+    def run() -> Any:
+        def step(carry: Any, action: jax.Array) -> tuple[Any, jax.Array]:
+            carry = jax.vmap(env.step)(carry, action)
+            return carry, carry.reward
+
+        return jax.lax.scan(step, state, actions)
+
+    if not np.isfinite(run()[0].obs).all():
+        raise RuntimeError(f"{name}, batch {batch}: a value is not finite")
+
+    def timed() -> float:
+        start = time.perf_counter()
+        jax.block_until_ready(run())
+        return time.perf_counter() - start
+
+    return timed
+
+
+def compare(names: list[str], batch: int, steps: int, repetitions: int) -> None:
+    """Prints the speed of environments per degree of freedom and contact."""
+    ant, ant_size = stopwatch("ant", batch, steps), size("ant")
+    print(f"batch {batch} on {jax.devices()[0]}; thousand environment steps per second")
+    print(
+        "| environment | degrees of freedom | contacts | forward | "
+        "per (dof + contact), ant = 1 |\n|---|---|---|---|---|"
+    )
+    for name in names:
+        run = stopwatch(name, batch, steps)
+        times = [(ant(), run()) for _ in range(repetitions)]
+        rate = batch * steps / statistics.median(own for _, own in times) / 1e3
+        faster = statistics.median(other / own for other, own in times)
+        dofs, contacts = size(name)
+        relative = f"{faster * (dofs + contacts) / sum(ant_size):.2f}" if dofs else "-"
+        print(
+            f"| `{name}` | {dofs} | {contacts} | {rate:.1f} | {relative} |", flush=True
+        )
+
+
+def size(name: str) -> tuple[int, int]:
+    """Degrees of freedom and contacts; zeros without a simulation."""
+    base = newton_qd.create(name).unwrapped
+    if not isinstance(base, PhysicsEnv):
+        return 0, 0
+    return base.system.nv, len(base.system.contact_body)
+
+
 def main() -> None:
     """Print a table of speeds."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -77,7 +140,13 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=100)
     parser.add_argument("--horizon", type=int, default=32)
     parser.add_argument("--repetitions", type=int, default=5)
+    parser.add_argument("--suite", action="store_true")
+    parser.add_argument("--names", nargs="+", default=newton_qd.registered_envs())
     options = parser.parse_args()
+    if options.suite:
+        for batch in options.batches:
+            compare(options.names, batch, options.steps, options.repetitions)
+        return
     print(f"{options.env} on {jax.devices()[0]}, thousand environment steps per second")
     print("| batch | forward | forward + backward |\n|---|---|---|")
     for batch in options.batches:
