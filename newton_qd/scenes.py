@@ -12,7 +12,7 @@ class Scene:
     Attributes:
         name: Name of the scene.
         urdf: File name inside ``urdf/``, or a path: links that are fixed to the
-            world, with capsules or spheres as colliders.
+            world, with capsules, spheres or boxes as colliders.
         links: Links of the robot, all of whose colliders touch the obstacles;
             ``None``: the links that touch the ground.
     """

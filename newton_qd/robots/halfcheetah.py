@@ -21,6 +21,7 @@ HALFCHEETAH = Robot(
         *(Contact("torso", end, name) for name in ("trunk", "head") for end in (1, -1)),
         *(Contact(link, end) for link in _LEG_PARTS for end in (1, -1)),
     ),
+    pairs=((Contact("bfoot"), Contact("ffoot")),),
     # the middle of each joint's range
     rest_pose=(
         ("bthigh", 0.265),

@@ -2,7 +2,7 @@
 
 Outside, the distance is that from the point clamped to the box; inside, it is the
 depth below the nearest face. Clamps and the choice of a face are rounded off over the
-contact smoothing w, so that both are twice differentiable: edges are round, by 0.16 w
+contact smoothing w, so that both are twice differentiable: edges are round, by 0.4 w
 at most, and the middle of the box, where no face is the nearest, is as smooth.
 """
 
