@@ -6,6 +6,8 @@ The facade:
 - ``registered_envs()``, ``register(name, base, ...)``: the names; a new one
 - ``Env``, ``State``: what ``create`` returns; what ``reset`` and ``step`` return
 - ``check(state)``: raises ``FaultError`` where a world was frozen
+- ``PhysicsParams``, ``randomize_params``: physical parameters of each world, which
+  ``step`` takes and ``env.default_params`` has; drawn at random
 - ``behavior_descriptor_extractor``, ``descriptor_extractor``, ``reward_offset``:
   tables by environment name
 - ``FEET_NAMES``, ``COG_NAMES``, ``FORWARD_REWARD_NAMES``: read-only tables of links
@@ -22,8 +24,10 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from newton_qd.envs.base import Env
+    from newton_qd.envs.randomization import randomize_params
     from newton_qd.envs.state import State, check
     from newton_qd.errors import FaultError, MissingExtra, UnknownEnvironment
+    from newton_qd.physics.parameters import PhysicsParams
     from newton_qd.registry import (
         COG_NAMES,
         FEET_NAMES,
@@ -46,6 +50,7 @@ __all__ = [
     "Env",
     "FaultError",
     "MissingExtra",
+    "PhysicsParams",
     "State",
     "UnknownEnvironment",
     "behavior_descriptor_extractor",
@@ -53,6 +58,7 @@ __all__ = [
     "create",
     "create_fn",
     "descriptor_extractor",
+    "randomize_params",
     "register",
     "registered_envs",
     "reward_offset",
@@ -65,6 +71,7 @@ _HOME = {
     "Env": "newton_qd.envs.base",
     "FaultError": "newton_qd.errors",
     "MissingExtra": "newton_qd.errors",
+    "PhysicsParams": "newton_qd.physics.parameters",
     "State": "newton_qd.envs.state",
     "UnknownEnvironment": "newton_qd.errors",
     "behavior_descriptor_extractor": "newton_qd.registry",
@@ -72,6 +79,7 @@ _HOME = {
     "create": "newton_qd.registry",
     "create_fn": "newton_qd.registry",
     "descriptor_extractor": "newton_qd.registry",
+    "randomize_params": "newton_qd.envs.randomization",
     "register": "newton_qd.registry",
     "registered_envs": "newton_qd.registry",
     "reward_offset": "newton_qd.registry",
