@@ -8,6 +8,8 @@ The facade:
 - ``check(state)``: raises ``FaultError`` where a world was frozen
 - ``diagnose_gradients(env)``: over how many steps gradients can be used, and why;
   ``newton_qd.gradients`` has the gradients of whole episodes
+- ``PhysicsParams``, ``randomize_params``: physical parameters of each world, which
+  ``step`` takes and ``env.default_params`` has; drawn at random
 - ``behavior_descriptor_extractor``, ``descriptor_extractor``, ``reward_offset``,
   ``original_reward_offset``: tables by environment name
 - ``FEET_NAMES``, ``COG_NAMES``, ``FORWARD_REWARD_NAMES``: read-only tables of links
@@ -24,9 +26,11 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from newton_qd.envs.base import Env
+    from newton_qd.envs.randomization import randomize_params
     from newton_qd.envs.state import State, check
     from newton_qd.errors import FaultError, MissingExtra, UnknownEnvironment
     from newton_qd.gradients.doctor import diagnose_gradients
+    from newton_qd.physics.parameters import PhysicsParams
     from newton_qd.registry import (
         COG_NAMES,
         FEET_NAMES,
@@ -50,6 +54,7 @@ __all__ = [
     "Env",
     "FaultError",
     "MissingExtra",
+    "PhysicsParams",
     "State",
     "UnknownEnvironment",
     "behavior_descriptor_extractor",
@@ -59,6 +64,7 @@ __all__ = [
     "descriptor_extractor",
     "diagnose_gradients",
     "original_reward_offset",
+    "randomize_params",
     "register",
     "registered_envs",
     "reward_offset",
@@ -71,6 +77,7 @@ _HOME = {
     "Env": "newton_qd.envs.base",
     "FaultError": "newton_qd.errors",
     "MissingExtra": "newton_qd.errors",
+    "PhysicsParams": "newton_qd.physics.parameters",
     "State": "newton_qd.envs.state",
     "UnknownEnvironment": "newton_qd.errors",
     "behavior_descriptor_extractor": "newton_qd.registry",
@@ -80,6 +87,7 @@ _HOME = {
     "descriptor_extractor": "newton_qd.registry",
     "diagnose_gradients": "newton_qd.gradients.doctor",
     "original_reward_offset": "newton_qd.registry",
+    "randomize_params": "newton_qd.envs.randomization",
     "register": "newton_qd.registry",
     "registered_envs": "newton_qd.registry",
     "reward_offset": "newton_qd.registry",

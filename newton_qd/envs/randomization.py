@@ -1,0 +1,112 @@
+"""Domain randomization: physical parameters drawn at random for every world."""
+
+from __future__ import annotations
+
+from typing import Any, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from newton_qd.envs.base import Env
+from newton_qd.physics.parameters import FIELDS, PhysicsParams, check_bounds
+from newton_qd.types import RNGKey
+
+Range: TypeAlias = tuple[Any, Any]
+
+
+def randomize_params(
+    key: RNGKey,
+    env: Env,
+    worlds: int | None = None,
+    *,
+    gravity: Range | None = None,
+    friction: Range | None = None,
+    contact_stiffness_scale: Range | None = None,
+    mass_scale: Range | None = None,
+    inertia_scale: Range | None = None,
+    damping_scale: Range | None = None,
+    gear_scale: Range | None = None,
+) -> PhysicsParams:
+    """Draws physical parameters, each entry uniformly and independently.
+
+    A world's parameters depend on the key and its index, not on the number of worlds.
+
+    Args:
+        key: One key.
+        env: A simulated robot, with or without wrappers.
+        worlds: Length of the batch axis; ``None``: that of ``env``, none if it is not
+            batched.
+        gravity: Lowest and highest value, two numbers or two arrays of the shape of
+            one world's parameter; ``None``: as in the files. So are the others, which
+            :class:`~newton_qd.physics.parameters.PhysicsParams` explains.
+        friction: As above.
+        contact_stiffness_scale: As above.
+        mass_scale: As above.
+        inertia_scale: As above.
+        damping_scale: As above.
+        gear_scale: As above.
+
+    Returns:
+        Parameters for ``env.step``, or where ``worlds`` is given for its ``vmap``.
+
+    Raises:
+        ValueError: The environment has no physical parameters, or a range is not one;
+            names it and what is allowed.
+    """
+    default = env.unwrapped.default_params
+    if not isinstance(default, PhysicsParams):
+        raise ValueError(
+            f"env: {env.name} has no physical parameters; allowed: simulated robots"
+        )
+    if worlds is not None and (isinstance(worlds, bool) or worlds < 1):
+        raise ValueError(f"worlds={worlds!r}; allowed: None, or integers from 1")
+    given = {
+        "gravity": gravity,
+        "friction": friction,
+        "contact_stiffness_scale": contact_stiffness_scale,
+        "mass_scale": mass_scale,
+        "inertia_scale": inertia_scale,
+        "damping_scale": damping_scale,
+        "gear_scale": gear_scale,
+    }
+    bounds = {
+        name: _bounds(name, limits, getattr(default, name))
+        for name, limits in given.items()
+        if limits is not None
+    }
+    batch = jnp.shape(env.default_params.gravity) if worlds is None else (worlds,)
+    if not batch:
+        return _draw(key, default, bounds)
+    keys = jax.random.split(key, batch)
+    return jax.vmap(_draw, (0, None, None))(keys, default, bounds)
+
+
+def _bounds(name: str, limits: Any, default: jax.Array) -> tuple[np.ndarray, ...]:
+    """Returns the checked ends of a range, in the type of the parameter."""
+    allowed = f"allowed: (low, high), numbers or arrays of shape {default.shape}"
+    try:
+        low, high = (
+            np.broadcast_to(np.asarray(end, default.dtype), default.shape)
+            for end in limits
+        )
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name}={limits!r}; {allowed}") from error
+    check_bounds(name, np.stack([low, high]))
+    if np.any(low > high):
+        raise ValueError(f"{name}={limits!r}: low is above high; {allowed}")
+    return low, high
+
+
+@jax.jit
+def _draw(
+    key: RNGKey, default: PhysicsParams, bounds: dict[str, tuple[np.ndarray, ...]]
+) -> PhysicsParams:
+    """Returns the parameters of one world."""
+    drawn = {}
+    for name, (low, high) in bounds.items():
+        # by the place of the field: what one range gives does not depend on the others
+        own = jax.random.fold_in(key, FIELDS.index(name))
+        like = getattr(default, name)
+        drawn[name] = jax.random.uniform(own, like.shape, like.dtype, low, high)
+    return default.replace(**drawn)
