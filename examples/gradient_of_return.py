@@ -16,6 +16,7 @@ import jax.numpy as jnp
 
 import newton_qd
 from newton_qd.gradients import (
+    EpisodeGradients,
     GradientOptions,
     make_episode_gradient,
     with_smooth_descriptor,
@@ -49,14 +50,19 @@ def main(argv: Sequence[str] | None = None) -> None:
         size = jnp.sqrt(jnp.sum(jnp.square(uphill), axis=(1, 2), keepdims=True))
         return jnp.clip(plans + 0.3 * uphill / (size + 1e-6), -1.0, 1.0), result
 
-    for iteration in range(arguments.iterations + 1):
+    def report(iteration: int, result: EpisodeGradients) -> None:
+        fitness, faulty = result.fitnesses, int(result.faulty.sum())
+        print(
+            f"iteration {iteration:3d}: mean return {fitness.mean():6.1f}, "
+            f"best {fitness.max():6.1f}, faulty {faulty}"
+        )
+
+    for iteration in range(arguments.iterations):
         plans, result = climb(plans)
         if iteration % max(arguments.iterations // 5, 1) == 0:
-            fitness = result.fitnesses
-            print(
-                f"iteration {iteration:3d}: mean return {fitness.mean():6.1f}, "
-                f"best {fitness.max():6.1f}, faulty {int(result.faulty.sum())}"
-            )
+            report(iteration, result)
+    _, result = climb(plans)
+    report(arguments.iterations, result)
     best = int(result.fitnesses.argmax())
     print(
         f"the best one's feet touch the ground {result.descriptors[best]} of the time"

@@ -107,8 +107,9 @@ def test_policies_are_diagnosed_too() -> None:
     ],
 )
 def test_bad_settings(options: dict[str, Any], message: str) -> None:
+    env: Any = Growing(1.0)
     with pytest.raises(ValueError, match=message):
-        diagnose_gradients(Growing(1.0), **options)
+        diagnose_gradients(env, **options)
 
 
 def test_single_precision_is_refused() -> None:

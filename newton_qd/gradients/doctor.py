@@ -65,7 +65,7 @@ class _Subject:
         """Sums (rows,) of the rewards up to the ends (rows,) of several horizons."""
         rewards, _ = self.rewards(genotype)
         rows = np.arange(self.steps)[None] < ends[:, None]
-        return rows.astype(rewards.dtype) @ rewards
+        return jnp.asarray(rows, rewards.dtype) @ rewards
 
     def gradients(self, genotype: Any, ends: np.ndarray) -> tuple[jax.Array, Any]:
         """Returns up to the ends and their gradients, leaves (rows, ...)."""
@@ -131,9 +131,11 @@ def diagnose_gradients(
         if genotypes is None:
             shape = (worlds, steps, made.action_size)
             genotypes = jax.random.uniform(keys[1], shape, made.dtype, -1, 1)
-        difference = _differences(subject, genotypes, keys[2], directions)
-        mixed, slopes = _sampled(subject, genotypes, keys[3], samples, sigma, ends)
-        rows = _rows(ends, made.dt, difference, mixed, np.asarray(slopes))
+        difference, gradients = _differences(subject, genotypes, keys[2], directions)
+        centre = jax.tree.map(lambda x: x[:, ends - 1], gradients)
+        noise = jax.tree.map(lambda x: sigma * x, _normal(keys[3], genotypes, samples))
+        mixed, slopes = _sampled(subject, genotypes, centre, noise, sigma, ends)
+        rows = _rows(ends, made.dt, difference, mixed, slopes)
         return GradientReport(
             name=env if isinstance(env, str) else made.name,
             dt=made.dt,
@@ -186,7 +188,7 @@ class _Differences:
     Attributes:
         norms: (worlds, steps) norm of the gradient of the return up to each step.
         exact: (worlds, directions, steps) its component along each direction.
-        central: (distances, worlds, directions, steps) central differences over
+        central: (worlds, directions, distances, steps) central differences over
             ``DISTANCES``, then over ``REACH``.
         alive: (worlds, steps) whether the episode goes on before each step.
         switched: (worlds, directions, steps, nb) whether a body touches on one side of
@@ -202,53 +204,46 @@ class _Differences:
 
 def _differences(
     subject: _Subject, genotypes: Any, key: jax.Array, directions: int
-) -> _Differences:
+) -> tuple[_Differences, Any]:
+    """The derivatives, and the gradients, leaves (worlds, steps, ...)."""
     every = np.arange(1, subject.steps + 1, dtype=np.int32)
-    both = jax.jit(jax.vmap(functools.partial(subject.gradients, ends=every)))
-    rewards = jax.jit(jax.vmap(subject.rewards))
-    gradients = both(genotypes)[1]
-    along = _directions(key, genotypes, directions)
-    inner = jax.vmap(
-        jax.vmap(jax.vmap(_inner, (0, None)), (None, 0))  # directions, then steps
-    )
-    norms = jax.vmap(jax.vmap(tree_norm))(gradients)
-    central, switched = [], None
-    for distance in (*DISTANCES, REACH):
-        sides = []
-        for sign in (1, -1):
-            there = jax.tree.map(
-                lambda x, u, d=sign * distance: (x[:, None] + d * u).reshape(
-                    -1, *x.shape[1:]
-                ),
-                genotypes,
-                along,
-            )
-            value, (_, touching) = rewards(there)
-            sides.append((np.asarray(value), np.asarray(touching)))
-        change = (sides[0][0] - sides[1][0]) / (2 * distance)
-        count = change.shape[0] // directions
-        central.append(np.cumsum(change, axis=1).reshape(count, directions, -1))
-        switched = sides[0][1] != sides[1][1]
-        switched = switched.reshape(count, directions, *switched.shape[1:])
-    assert switched is not None
-    return _Differences(
-        norms=np.asarray(norms),
-        exact=np.asarray(inner(gradients, along)),
-        central=np.array(central),
-        alive=np.asarray(rewards(genotypes)[1][0]),
-        switched=switched,
-    )
+    sides = np.array([[d, -d] for d in (*DISTANCES, REACH)])
+
+    def one(genotype: Any, drawn: Any) -> tuple[dict[str, jax.Array], Any]:
+        along = jax.vmap(_unit)(drawn)
+        gradients = subject.gradients(genotype, every)[1]
+        components = jax.vmap(jax.vmap(_inner, (0, None)), (None, 0))
+
+        def at(direction: Any, distance: jax.Array) -> Any:
+            there = jax.tree.map(lambda x, u: x + distance * u, genotype, direction)
+            return subject.rewards(there)
+
+        moved = jax.vmap(jax.vmap(jax.vmap(at, (None, 0)), (None, 0)), (0, None))
+        rewards, (alive, touching) = moved(along, jnp.asarray(sides))
+        returns = jnp.cumsum(rewards, axis=-1)
+        central = (returns[:, :, 0] - returns[:, :, 1]) / (2 * sides[:, :1])
+        return {
+            "norms": jax.vmap(tree_norm)(gradients),
+            "exact": components(gradients, along),
+            "central": central,
+            "alive": alive[0, 0, 0],
+            "switched": touching[:, -1, 0] != touching[:, -1, 1],
+        }, gradients
+
+    drawn = _normal(key, genotypes, directions)
+    found, gradients = jax.jit(jax.vmap(one))(genotypes, drawn)
+    return _Differences(**jax.tree.map(np.asarray, found)), gradients
 
 
-def _directions(key: jax.Array, genotypes: Any, count: int) -> Any:
-    """Random directions of norm 1, leaves (worlds, count, ...)."""
+def _normal(key: jax.Array, genotypes: Any, count: int) -> Any:
+    """Normal numbers, leaves (worlds, count, ...)."""
     leaves, structure = jax.tree.flatten(genotypes)
     keys = jax.random.split(key, len(leaves))
     drawn = [
         jax.random.normal(k, (len(x), count, *x.shape[1:]), x.dtype)
         for k, x in zip(keys, leaves, strict=True)
     ]
-    return jax.vmap(jax.vmap(_unit))(jax.tree.unflatten(structure, drawn))
+    return jax.tree.unflatten(structure, drawn)
 
 
 def _unit(tree: Any) -> Any:
@@ -268,28 +263,27 @@ def _inner(a: Any, b: Any) -> jax.Array:
 def _sampled(
     subject: _Subject,
     genotypes: Any,
-    key: jax.Array,
-    samples: int,
+    centre: Any,
+    noise: Any,
     sigma: float,
     ends: np.ndarray,
-) -> tuple[Mixture, jax.Array]:
+) -> tuple[Mixture, np.ndarray]:
     """First- and zeroth-order estimates (worlds, horizons) under noise.
+
+    Args:
+        subject: The rewards of an episode.
+        genotypes: Leaves (worlds, ...).
+        centre: Leaves (worlds, horizons, ...): the gradients without noise.
+        noise: Leaves (worlds, samples, ...), normal with deviation ``sigma``.
+        sigma: That deviation.
+        ends: (horizons,) control steps.
 
     Returns:
         The estimates, and the components (worlds, 2, horizons) of their means along
         the gradient without noise, which few samples tell apart.
     """
-    leaves, structure = jax.tree.flatten(genotypes)
-    keys = jax.random.split(key, len(leaves))
-    noise = jax.tree.unflatten(
-        structure,
-        [
-            sigma * jax.random.normal(k, (len(x), samples, *x.shape[1:]), x.dtype)
-            for k, x in zip(keys, leaves, strict=True)
-        ],
-    )
 
-    def one(genotype: Any, noise: Any) -> tuple[Mixture, jax.Array]:
+    def one(genotype: Any, centre: Any, noise: Any) -> tuple[Mixture, jax.Array]:
         pairs = jax.tree.map(
             lambda x, w: jnp.stack([x + w, x - w], axis=1), genotype, noise
         )
@@ -298,12 +292,13 @@ def _sampled(
         sound = jnp.isfinite(values).all(axis=(1, 2))
         lost = ~jax.vmap(jax.vmap(finite_rows))(gradients).all(axis=(0, 1))
         mixed = mixture(values, gradients, noise, sound, lost, sigma=sigma)
-        centre = jax.vmap(_unit)(subject.gradients(genotype, ends)[1])
+        uphill = jax.vmap(_unit)(centre)
         inner = jax.vmap(_inner)
-        slopes = [inner(mean, centre) for mean in (mixed.first, mixed.zeroth)]
+        slopes = [inner(mean, uphill) for mean in (mixed.first, mixed.zeroth)]
         return mixed, jnp.stack(slopes)
 
-    return jax.jit(jax.vmap(one))(genotypes, noise)
+    mixed, slopes = jax.jit(jax.vmap(one))(genotypes, centre, noise)
+    return mixed, np.asarray(slopes)
 
 
 def _rows(
@@ -350,17 +345,17 @@ def _root(variance: jax.Array, index: int) -> float:
 def _cosines(difference: _Differences, step: int) -> np.ndarray:
     """Cosine (worlds,) of exact and central derivatives over all directions."""
     exact = difference.exact[:, :, step]
-    central = difference.central[:-1, :, :, step]
-    scale = np.linalg.norm(exact, axis=1) * np.linalg.norm(central, axis=2)
-    inner = (exact * central).sum(axis=2)
+    central = difference.central[:, :, :-1, step]
+    scale = np.linalg.norm(exact, axis=1)[:, None] * np.linalg.norm(central, axis=1)
+    inner = (exact[:, :, None] * central).sum(axis=1)
     zero = scale == 0
-    return np.where(zero, 1.0, inner / np.where(zero, 1.0, scale)).max(axis=0)
+    return np.where(zero, 1.0, inner / np.where(zero, 1.0, scale)).max(axis=1)
 
 
 def _contacts(env: Any, difference: _Differences) -> tuple[ContactRow, ...]:
     """Where finite changes leave the gradient: the first broken step of each pair."""
     exact = np.diff(difference.exact, axis=2, prepend=0.0)
-    finite = np.diff(difference.central[-1], axis=2, prepend=0.0)
+    finite = np.diff(difference.central[:, :, -1], axis=2, prepend=0.0)
     scale = np.sqrt(np.mean(exact**2, axis=1, keepdims=True))
     broken = np.abs(finite - exact) > _BREAK * np.maximum(scale, 1e-12)
     rows: dict[str, list[int]] = {}
