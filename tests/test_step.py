@@ -153,8 +153,10 @@ def test_full_gear_overshoots_a_limit_as_stated(
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ROBOTS)
 def test_ten_thousand_steps_are_finite(name: str) -> None:
-    """64 worlds, uniformly random actions, no auto-reset."""
-    env = newton_qd.create(f"{name}_uni", episode_length=20_000, auto_reset=False)
+    """64 worlds, uniformly random actions; only pendulums that fall start again."""
+    task = f"{name}_uni" if f"{name}_uni" in newton_qd.descriptor_extractor else name
+    again = name.startswith("inverted")
+    env = newton_qd.create(task, episode_length=20_000, auto_reset=again)
     worlds, steps, chunk = 64, 10_000, 1_000
 
     @jax.jit
@@ -166,6 +168,7 @@ def test_ten_thousand_steps_are_finite(name: str) -> None:
             state = jax.vmap(env.step)(state, action)
             for leaf in jax.tree.leaves(state):
                 finite &= jnp.isfinite(leaf).all()
+            finite &= (state.info["fault"] == 0).all()
             return (state, finite), None
 
         keys = jax.random.split(key, chunk)
@@ -175,8 +178,7 @@ def test_ten_thousand_steps_are_finite(name: str) -> None:
     for key in jax.random.split(jax.random.key(1), steps // chunk):
         state, finite = play(state, key)
         assert finite
-    assert not state.info["fault"].any()
-    assert (state.info["steps"] == steps).all()
+    assert again or (state.info["steps"] == steps).all()
     newton_qd.check(state)
     fastest = jnp.abs(state.pipeline_state.v).max()
     report("largest velocity at the end", float(fastest))
