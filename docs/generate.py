@@ -19,6 +19,7 @@ import numpy as np
 
 import newton_qd
 from newton_qd.envs.base import Env, PhysicsEnv, QDEnv
+from newton_qd.physics.system import JointKind
 
 PAGE = Path(__file__).with_name("environments.md")
 
@@ -87,16 +88,28 @@ def _descriptor(name: str, env: QDEnv) -> str:
     )
 
 
+def _drive(env: PhysicsEnv, joint: str, gear: float) -> str:
+    """What an action of 1 does to a joint: a servo goes to the end of its range."""
+    system = env.system
+    body = system.joint_names.index(joint)
+    if joint in env.robot.servos:
+        end = system.limit_upper[system.v_start[body]]
+        return f"an angle of {end:g} rad, held with {gear:g} N m/rad"
+    slides = system.joint_kind[body] == JointKind.PRISMATIC
+    return f"a force of {gear:g} N" if slides else f"a torque of {gear:g} N m"
+
+
 def _robot(env: PhysicsEnv) -> str:
     """What all environments of one base share."""
     text = "\n" + _table(("entries of the observation", "meaning"), _observation(env))
+    driven = env.robot.actuators[: env.action_size]
     drives = [
-        (index, f"`{joint}`", f"{gear:g}")
-        for index, (joint, gear) in enumerate(env.robot.actuators)
+        (index, f"`{joint}`", _drive(env, joint, gear))
+        for index, (joint, gear) in enumerate(driven)
     ]
-    text += "\n" + _table(("action", "joint", "torque of 1 [N m]"), drives)
+    text += "\n" + _table(("action", "joint", "an action of 1 is"), drives)
     state = jax.eval_shape(env.reset, jax.random.key(0))
-    named = ", ".join(f"`{key}`" for key in state.metrics)
+    named = ", ".join(f"`{key}`" for key in state.metrics) or "none"
     text += f"\nMetrics, the terms of the reward among them: {named}.\n"
     return text + "\n" + _table(("option", "default", "meaning"), _options(type(env)))
 

@@ -9,13 +9,18 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from newton_qd.envs.acrobot import Acrobot
 from newton_qd.envs.ant import Ant
 from newton_qd.envs.base import Env
 from newton_qd.envs.halfcheetah import HalfCheetah
 from newton_qd.envs.hopper import Hopper
 from newton_qd.envs.humanoid import Humanoid
+from newton_qd.envs.humanoid_standup import HumanoidStandup
 from newton_qd.envs.humanoid_trap import HumanoidTrap
+from newton_qd.envs.inverted_pendulum import InvertedDoublePendulum, InvertedPendulum
 from newton_qd.envs.pointmaze import PointMaze
+from newton_qd.envs.reacher import Reacher, ReacherAngle
+from newton_qd.envs.swimmer import Swimmer
 from newton_qd.envs.walker2d import Walker2d
 from newton_qd.extractors import get_feet_contact_proportion, get_final_xy_position
 from newton_qd.robots import HUMANOID, ROBOTS, Robot
@@ -180,4 +185,13 @@ ROWS: dict[str, EnvironmentRow] = {
         reward_offset=2.35,
         original_reward_offset=2.3431,
     ),
+    "acrobot": EnvironmentRow(Acrobot, "acrobot"),
+    "humanoidstandup": EnvironmentRow(HumanoidStandup, "humanoidstandup"),
+    "inverted_double_pendulum": EnvironmentRow(
+        InvertedDoublePendulum, "inverted_double_pendulum"
+    ),
+    "inverted_pendulum": EnvironmentRow(InvertedPendulum, "inverted_pendulum"),
+    "reacher": EnvironmentRow(Reacher, "reacher"),
+    "reacherangle": EnvironmentRow(ReacherAngle, "reacherangle"),
+    "swimmer": EnvironmentRow(Swimmer, "swimmer"),
 }

@@ -18,9 +18,14 @@ from newton_qd.physics import reference
 from newton_qd.physics.model import build_system
 from newton_qd.physics.rest import raising_coordinate
 from newton_qd.physics.system import JointKind, PhysicsState, System
-from newton_qd.robots import Contact, Material, Robot
+from newton_qd.robots import ROBOTS, Contact, Material, Robot
 
 Arrays = tuple[np.ndarray, ...]
+
+# One robot of each URDF file, and those of them that touch the ground.
+DISTINCT = list({row.urdf: name for name, row in reversed(ROBOTS.items())}.values())
+DISTINCT.reverse()
+TOUCHING = [name for name in DISTINCT if ROBOTS[name].contacts]
 
 
 def variant(robot: Robot, dtype: str, **changes: Any) -> System:

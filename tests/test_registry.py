@@ -88,6 +88,13 @@ ROBOTS = {
     "humanoid": (227, 17),
     "humanoid_w_trap": (305, 17),
     "walker2d": (17, 6),
+    "acrobot": (4, 1),
+    "humanoidstandup": (227, 17),
+    "inverted_double_pendulum": (8, 1),
+    "inverted_pendulum": (4, 1),
+    "reacher": (11, 2),
+    "reacherangle": (11, 2),
+    "swimmer": (8, 2),
 }
 
 

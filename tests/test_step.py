@@ -150,14 +150,18 @@ def test_full_gear_overshoots_a_limit_as_stated(
 # Finite
 
 
+TASKS = [
+    f"{name}_uni" if f"{name}_uni" in newton_qd.descriptor_extractor else name
+    for name in ROBOTS
+]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name",
-    [*(f"{name}_uni" for name in ROBOTS), "anttrap", "antmaze", "humanoidtrap"],
-)
+@pytest.mark.parametrize("name", [*TASKS, "anttrap", "antmaze", "humanoidtrap"])
 def test_ten_thousand_steps_are_finite(name: str) -> None:
-    """64 worlds, uniformly random actions, no auto-reset."""
-    env = newton_qd.create(name, episode_length=20_000, auto_reset=False)
+    """64 worlds, uniformly random actions; only pendulums that fall start again."""
+    again = name.startswith("inverted")
+    env = newton_qd.create(name, episode_length=20_000, auto_reset=again)
     worlds, steps, chunk = 64, 10_000, 1_000
 
     @jax.jit
@@ -169,6 +173,7 @@ def test_ten_thousand_steps_are_finite(name: str) -> None:
             state = jax.vmap(env.step)(state, action)
             for leaf in jax.tree.leaves(state):
                 finite &= jnp.isfinite(leaf).all()
+            finite &= (state.info["fault"] == 0).all()
             return (state, finite), None
 
         keys = jax.random.split(key, chunk)
@@ -178,8 +183,7 @@ def test_ten_thousand_steps_are_finite(name: str) -> None:
     for key in jax.random.split(jax.random.key(1), steps // chunk):
         state, finite = play(state, key)
         assert finite
-    assert not state.info["fault"].any()
-    assert (state.info["steps"] == steps).all()
+    assert again or (state.info["steps"] == steps).all()
     newton_qd.check(state)
     fastest = jnp.abs(state.pipeline_state.v).max()
     report("largest velocity at the end", float(fastest))

@@ -1,28 +1,40 @@
 """Environments: observation, reward and end of an episode over the physics."""
 
+from newton_qd.envs.acrobot import Acrobot
 from newton_qd.envs.ant import Ant
 from newton_qd.envs.base import Env, PhysicsEnv, QDEnv
 from newton_qd.envs.halfcheetah import HalfCheetah
 from newton_qd.envs.hopper import Hopper
 from newton_qd.envs.humanoid import Humanoid
+from newton_qd.envs.humanoid_standup import HumanoidStandup
 from newton_qd.envs.humanoid_trap import HumanoidTrap
+from newton_qd.envs.inverted_pendulum import InvertedDoublePendulum, InvertedPendulum
 from newton_qd.envs.locomotion import Locomotion
 from newton_qd.envs.pointmaze import PointMaze
+from newton_qd.envs.reacher import Reacher, ReacherAngle
 from newton_qd.envs.state import State, check
+from newton_qd.envs.swimmer import Swimmer
 from newton_qd.envs.walker2d import Walker2d
 
 __all__ = [
+    "Acrobot",
     "Ant",
     "Env",
     "HalfCheetah",
     "Hopper",
     "Humanoid",
+    "HumanoidStandup",
     "HumanoidTrap",
+    "InvertedDoublePendulum",
+    "InvertedPendulum",
     "Locomotion",
     "PhysicsEnv",
     "PointMaze",
     "QDEnv",
+    "Reacher",
+    "ReacherAngle",
     "State",
+    "Swimmer",
     "Walker2d",
     "check",
 ]

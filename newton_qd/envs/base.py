@@ -14,7 +14,7 @@ import numpy as np
 from newton_qd import physics
 from newton_qd.envs.inputs import checked_action, require_precision
 from newton_qd.envs.state import State, select
-from newton_qd.envs.views import SystemView
+from newton_qd.envs.views import SystemView, joint_indices
 from newton_qd.physics.system import PhysicsState, System
 from newton_qd.robots import Material, Robot
 from newton_qd.scenes import Scene
@@ -180,6 +180,7 @@ class PhysicsEnv(Env):
         robot: Robot,
         *,
         reset_noise_scale: float,
+        reset_velocity_noise_scale: float | None = None,
         dtype: str = "float32",
         scene: Scene | None = None,
     ) -> None:
@@ -189,12 +190,15 @@ class PhysicsEnv(Env):
             robot: Row of the robot.
             reset_noise_scale: Half width of the uniform noise on joint angles [rad]
                 and joint velocities [rad/s] at a reset.
+            reset_velocity_noise_scale: That of the velocities, where it differs.
             dtype: ``"float32"``, or ``"float64"`` with JAX x64 on.
             scene: What stands on the ground; ``None``: nothing.
         """
         self.robot = robot
         self._dtype = np.dtype(dtype)
-        self._noise_scale = reset_noise_scale
+        self._angle_noise = self._velocity_noise = reset_noise_scale
+        if reset_velocity_noise_scale is not None:
+            self._velocity_noise = reset_velocity_noise_scale
         self._feet_width: float | None = None
         self._load(scene)
 
@@ -207,12 +211,10 @@ class PhysicsEnv(Env):
             reports_bodies=self.reads_bodies,
         )
         self.system: System = system
-        joints = np.flatnonzero(np.isin(system.v_start, system.control_dof))
-        self._joint_q = system.q_start[joints].astype(np.int32)
-        self._joint_v = system.v_start[joints].astype(np.int32)
+        self._joint_q, self._joint_v = joint_indices(system)
         self._raising = physics.raising_coordinate(system)
         rest = jax.eval_shape(self._rest)
-        action = jax.ShapeDtypeStruct((system.nu,), self._dtype)
+        action = jax.ShapeDtypeStruct((self.action_size,), self._dtype)
         self._layout: tuple[tuple[str, int], ...] = ()
         jax.eval_shape(self._record_layout, rest, action)
         self._metrics = tuple(jax.eval_shape(self._outcome, rest, rest, action)[2])
@@ -262,16 +264,28 @@ class PhysicsEnv(Env):
     ) -> tuple[jax.Array, jax.Array, Metrics]:
         """Returns reward (), done () and metrics () of a step."""
 
+    def _control(self, state: PhysicsState, action: Action) -> jax.Array:
+        """Returns what drives the actuators (nu,) in a step: the action."""
+        del state
+        return action
+
+    def _place(self, rng: RNGKey, q: jax.Array) -> jax.Array:
+        """Returns the coordinates (nq,) of a reset with random roots: none here."""
+        del rng
+        return q
+
     def reset(self, rng: RNGKey) -> State:
         """Begins an episode in the default pose with noise on the joints."""
         require_precision(self._dtype)
-        _, angle_key, velocity_key = jax.random.split(rng, 3)
+        root_key, angle_key, velocity_key = jax.random.split(rng, 3)
         rest = self._rest()
-        q = rest.q.at[self._joint_q].add(self._noise(angle_key))
+        q = self._place(root_key, rest.q)
+        q = q.at[self._joint_q].add(self._noise(angle_key, self._angle_noise))
         if self.robot.rest_height is None and self._raising is not None:
             coordinate, sign = self._raising
             q = q.at[coordinate].add(-sign * physics.lowest_contact(self.system, q))
-        v = rest.v.at[self._joint_v].set(self._noise(velocity_key))
+        noise = self._noise(velocity_key, self._velocity_noise)
+        v = rest.v.at[self._joint_v].set(noise)
         return self._first_state(physics.initial_state(self.system, q, v))
 
     def fixed_state(self) -> State:
@@ -288,9 +302,9 @@ class PhysicsEnv(Env):
         # instead, so that its zero gradient is not 0 * nan (double where).
         start: PhysicsState = state.pipeline_state
         sound = jnp.all(jnp.isfinite(action)) & (state.info["fault"] == 0)
-        nan = jnp.full_like(action, jnp.nan)
-        given = jnp.where(sound, action, nan)
-        after, fault = physics.step(self.system, start, given, params)
+        control = self._control(start, action)
+        control = jnp.where(sound, control, jnp.full_like(control, jnp.nan))
+        after, fault = physics.step(self.system, start, control, params)
         fault = jnp.maximum(state.info["fault"], fault)
         faulty = fault != 0
         action = jnp.where(faulty, jnp.zeros_like(action), action)
@@ -360,8 +374,8 @@ class PhysicsEnv(Env):
         blocks = self._observe(state, action).items()
         self._layout = tuple((name, block.shape[0]) for name, block in blocks)
 
-    def _noise(self, rng: RNGKey) -> jax.Array:
-        shape, scale = self._joint_q.shape, self._noise_scale
+    def _noise(self, rng: RNGKey, scale: float) -> jax.Array:
+        shape = self._joint_q.shape
         return jax.random.uniform(rng, shape, self._dtype, -scale, scale)
 
     def _observation(self, state: PhysicsState, action: Action) -> Observation:

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from newton_qd.envs.vectors import ordered_sum
+from newton_qd.envs.vectors import ordered_sum, wrapped
 from newton_qd.physics.system import PhysicsState
 from newton_qd.types import Action, Metrics
 
@@ -53,11 +53,10 @@ def euler_pitch(angle: jax.Array) -> jax.Array:
     That is arcsin(sin(angle)), the reading of the original, by reflections: its
     gradient is 1 or -1 everywhere.
     """
-    turn = np.asarray(2 * np.pi, angle.dtype)
     half = np.asarray(np.pi, angle.dtype)
-    wrapped = angle - turn * jnp.round(angle / turn)
-    folded = jnp.where(wrapped > 0, half - wrapped, -half - wrapped)
-    return jnp.where(jnp.abs(wrapped) > half / 2, folded, wrapped)
+    angle = wrapped(angle)
+    folded = jnp.where(angle > 0, half - angle, -half - angle)
+    return jnp.where(jnp.abs(angle) > half / 2, folded, angle)
 
 
 @dataclasses.dataclass(frozen=True)

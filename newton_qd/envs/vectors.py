@@ -39,8 +39,21 @@ def length(vector: jax.Array) -> jax.Array:
     return jnp.where(zero, jnp.zeros_like(root), root)
 
 
+def wrapped(angle: jax.Array) -> jax.Array:
+    """Returns angles (...) plus whole turns, between -pi and pi [rad]."""
+    turn = np.asarray(2 * np.pi, angle.dtype)
+    return angle - turn * jnp.round(angle / turn)
+
+
 def cross(a: jax.Array, b: jax.Array) -> jax.Array:
     """Returns the cross products (n, 3) of the rows of two arrays (n, 3)."""
     ahead, behind = np.array([1, 2, 0]), np.array([2, 0, 1])
     left, right = a[:, ahead] * b[:, behind], a[:, behind] * b[:, ahead]
     return rounded(left) - rounded(right)
+
+
+def rotated(quaternion: jax.Array, vector: jax.Array) -> jax.Array:
+    """Returns the rows of vectors (n, 3) turned by quaternions xyzw (n, 4)."""
+    axis, w = quaternion[:, :3], quaternion[:, 3:]
+    turned = 2 * cross(axis, vector)
+    return vector + rounded(w * turned) + cross(axis, turned)

@@ -17,7 +17,7 @@ import numpy as np
 
 from newton_qd import physics
 from newton_qd.physics.rest import raising_coordinate
-from newton_qd.physics.system import PhysicsState, System
+from newton_qd.physics.system import JointKind, PhysicsState, System
 
 _LIGHTEST = 1e-5  # [kg]
 _GROUND = ("Ground", "floor")  # names of the last row in the original
@@ -152,9 +152,9 @@ class SystemView:
 
     @property
     def joints(self) -> tuple[Joints, ...]:
-        """The joints between bodies, grouped by their number of axes."""
+        """The joints of the robot, grouped by their number of axes."""
         groups: dict[int, list[list[int]]] = {}
-        for chain in _joint_chains(self._system):
+        for chain in joint_chains(self._system):
             groups.setdefault(len(chain), []).append(chain)
         system = self._system
         return tuple(
@@ -168,7 +168,7 @@ class SystemView:
     @property
     def num_joint_dof(self) -> int:
         """Number of axes of all joints."""
-        return sum(len(chain) for chain in _joint_chains(self._system))
+        return sum(len(chain) for chain in joint_chains(self._system))
 
     @property
     def config(self) -> Config:
@@ -182,7 +182,7 @@ class SystemView:
         They are in the order of the URDF file, joint by joint.
         """
         system = self._system
-        q, _ = self._joint_indices()
+        q, _ = joint_indices(system)
         return jnp.asarray(system.rest_q[q], jnp.dtype(system.dtype))
 
     def default_qp(
@@ -199,7 +199,7 @@ class SystemView:
         system = self._system
         dtype = jnp.dtype(system.dtype)
         q, v = jnp.asarray(system.rest_q, dtype), jnp.zeros((system.nv,), dtype)
-        joint_q, joint_v = self._joint_indices()
+        joint_q, joint_v = joint_indices(system)
         if joint_angle is not None:
             q = q.at[joint_q].set(_checked("joint_angle", joint_angle, joint_q, dtype))
             height = raising_coordinate(system)
@@ -225,11 +225,6 @@ class SystemView:
         turned = jnp.sum(inverse * local[..., None, :], axis=-1)
         changes = impulse[..., :3] / mass, _rotate(rot, turned)
         return Info(Changes(*(_with_still(system, change) for change in changes)))
-
-    def _joint_indices(self) -> tuple[np.ndarray, np.ndarray]:
-        axes = [axis for chain in _joint_chains(self._system) for axis in chain]
-        q, v = self._system.q_start[axes], self._system.v_start[axes]
-        return q.astype(np.int32), v.astype(np.int32)
 
 
 def shown_bodies(system: System) -> np.ndarray:
@@ -258,8 +253,12 @@ def qp_view(system: System, state: PhysicsState) -> QP:
     return QP(*read(state), physics=state)
 
 
-def _joint_chains(system: System) -> list[list[int]]:
-    """Returns, for each joint between shown bodies, its axes from the parent on."""
+def joint_chains(system: System) -> list[list[int]]:
+    """Returns, for each joint of a robot, its axes from the parent on.
+
+    Joints are between shown bodies, or hinges on the world; what slides or floats in
+    the world is a root.
+    """
     shown = set(shown_bodies(system).tolist())
     chains = []
     for body in sorted(shown):
@@ -267,9 +266,17 @@ def _joint_chains(system: System) -> list[list[int]]:
         while parent >= 0 and parent not in shown:
             chain.insert(0, parent)
             parent = int(system.parent[parent])
-        if parent >= 0:
+        hinges = np.all(system.joint_kind[chain] == JointKind.REVOLUTE)
+        if parent >= 0 or hinges:
             chains.append(chain)
     return chains
+
+
+def joint_indices(system: System) -> tuple[np.ndarray, np.ndarray]:
+    """Returns coordinates and degrees of freedom (num_joint_dof,) of all joints."""
+    axes = [axis for chain in joint_chains(system) for axis in chain]
+    q, v = system.q_start[axes], system.v_start[axes]
+    return q.astype(np.int32), v.astype(np.int32)
 
 
 def _checked(

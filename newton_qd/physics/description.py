@@ -102,12 +102,21 @@ class Body:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Description:
-    """A URDF file: its bodies by name, parents first, in depth-first order."""
+    """A URDF file.
+
+    Attributes:
+        path: The file.
+        name: Name of the robot.
+        floating: Whether the root link moves freely.
+        bodies: By name, parents first, in depth-first order.
+        still: Frames (7,) in the world of the links that are fixed to it.
+    """
 
     path: Path
     name: str
     floating: bool
     bodies: dict[str, Body]
+    still: dict[str, np.ndarray]
 
 
 def _read_shape(reader: XmlReader, element: ElementTree.Element, link: str) -> Shape:
@@ -285,14 +294,14 @@ def _merge_fixed(
     root: Link,
     links: dict[str, Link],
     children: dict[str, list[Joint]],
-) -> tuple[tuple[str, ...], tuple[Shape, ...], list[Joint]]:
+) -> tuple[dict[str, np.ndarray], tuple[Shape, ...], list[Joint]]:
     """Gathers what is fixed to a link.
 
     Returns:
-        Names of the links, their colliders, and the moving joints on them, all
-        in the frame of ``root``.
+        Frames (7,) of the links by name, their colliders, and the moving joints on
+        them, all in the frame of ``root``.
     """
-    names, shapes, moving = [root.name], list(root.shapes), []
+    frames, shapes, moving = {root.name: IDENTITY}, list(root.shapes), []
     pending = [(joint, IDENTITY) for joint in children[root.name]]
     while pending:
         joint, outer = pending.pop(0)
@@ -307,13 +316,13 @@ def _merge_fixed(
                 f"{reader.path}: link {link.name!r} has mass and is fixed to "
                 f"{joint.parent!r}; allowed: give the mass of both to {joint.parent!r}"
             )
-        names.append(link.name)
+        frames[link.name] = frame
         shapes += [
             dataclasses.replace(shape, frame=compose(frame, shape.frame))
             for shape in link.shapes
         ]
         pending = [(inner, frame) for inner in children[link.name]] + pending
-    return tuple(names), tuple(shapes), moving
+    return frames, tuple(shapes), moving
 
 
 def _check_masses(path: Path, bodies: dict[str, Body]) -> None:
@@ -346,17 +355,20 @@ def read_description(path: Path) -> Description:
     root = links[find_root(reader, links, children)]
     floating = root.name != WORLD
     bodies: dict[str, Body] = {}
+    still: dict[str, np.ndarray] = {}
 
     def grow(link: Link, joint: Joint | None, parent: str | None) -> None:
-        names, shapes, moving = _merge_fixed(reader, link, links, children)
+        frames, shapes, moving = _merge_fixed(reader, link, links, children)
         fixed = joint is None and not floating
-        if fixed and (shapes or link.mass > 0):
+        if fixed and (link.shapes or link.mass > 0):
             raise reader.error(
                 elements[WORLD],
                 "a robot's world link has a collider or a mass; allowed: neither",
             )
-        if not fixed:
-            bodies[link.name] = Body(link, joint, parent, names, shapes)
+        if fixed:
+            still.update((name, at) for name, at in frames.items() if name != WORLD)
+        else:
+            bodies[link.name] = Body(link, joint, parent, tuple(frames), shapes)
         for next_joint in moving:
             grow(links[next_joint.child], next_joint, None if fixed else link.name)
 
@@ -364,4 +376,4 @@ def read_description(path: Path) -> Description:
     if not bodies:
         raise reader.error(reader.root, "nothing in it moves")
     _check_masses(path, bodies)
-    return Description(path, reader.root.get("name", ""), floating, bodies)
+    return Description(path, reader.root.get("name", ""), floating, bodies, still)

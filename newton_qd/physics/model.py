@@ -201,13 +201,17 @@ def _dof_arrays(
             damping[start] = body.joint.damping
     gear = np.full(nv, control["gear"].max(initial=0.0) or _DEFAULT_GEAR)
     gear[control["control_dof"]] = control["gear"]
+    # A servo is a spring to the angle 0 and the torque of its target: both implicit.
+    servo = [joint in robot.servos for joint, _ in robot.actuators]
+    stiffness = np.zeros(nv)
+    stiffness[control["control_dof"][servo]] = control["gear"][servo]
     limited = np.isfinite(lower) | np.isfinite(upper)
     width, overshoot = robot.material.limit_smoothing, robot.material.limit_overshoot
     compressed = reference.penetration(width - overshoot, width)
     return {
         "armature": np.zeros(nv),
         "damping": damping,
-        "stiffness": np.zeros(nv),
+        "stiffness": stiffness,
         "spring_rest": np.zeros(nv),
         "limit_lower": lower,
         "limit_upper": upper,
@@ -239,6 +243,7 @@ def build_system(robot: Robot, dtype: str, scene: Scene | None = None) -> System
     verify(built, description)
     bodies = [description.bodies[name] for name in built.body_names]
     links = () if scene is None else read_scene(scene)
+    still = description.still | {link.name: link.frame for link in links}
     control, obstacles = _control(robot, built), obstacle_tables(links)
     total_mass = sum(body.link.mass for body in bodies)
     weight = total_mass * (robot.gravity or _EARTH_GRAVITY)
@@ -267,8 +272,8 @@ def build_system(robot: Robot, dtype: str, scene: Scene | None = None) -> System
         **control,
         **contact_tables(robot, scene, bodies, len(obstacles["obstacle_kind"])),
         **obstacles,
-        scene_links=tuple(link.name for link in links),
-        scene_frames=np.array([link.frame for link in links]).reshape(-1, 7),
+        scene_links=tuple(still),
+        scene_frames=np.array(list(still.values())).reshape(-1, 7),
     )
     system = dataclasses.replace(system, rest_q=rest_coordinates(system))
     return dataclasses.replace(system, contact_pair_share=pair_shares(system))

@@ -40,7 +40,14 @@ def rest_coordinates(system: System) -> np.ndarray:
     """Returns the coordinates (nq,) of the row's default pose."""
     robot = system.robot
     q = np.array(system.rest_q)
-    q[[start + 6 for start in system.q_start[system.joint_kind == JointKind.FREE]]] = 1
+    free = system.q_start[system.joint_kind == JointKind.FREE]
+    if not len(free) and any(robot.rest_rotation):
+        raise RobotDescriptionError(
+            f"robot {robot.name!r}, rest_rotation={robot.rest_rotation!r}: the root is "
+            "not free; allowed: zeros"
+        )
+    for start in free:
+        q[start + 3 : start + 7] = reference.rpy_quaternion(*robot.rest_rotation)
     for joint, angle in robot.rest_pose:
         q[system.q_start[index_of(robot, "rest_pose", joint, system.joint_names)]] = (
             angle

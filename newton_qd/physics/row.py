@@ -63,6 +63,15 @@ def check_row(robot: Robot) -> None:
         _check_number(robot, f"actuators: gear of {joint!r}", gear, signed=False)
     for joint, angle in robot.rest_pose:
         _check_number(robot, f"rest_pose: angle of {joint!r}", angle, signed=True)
+    for angle in robot.rest_rotation:
+        _check_number(robot, "rest_rotation: angle", angle, signed=True)
+    driven = tuple(joint for joint, _ in robot.actuators)
+    for joint in robot.servos:
+        if joint not in driven:
+            raise RobotDescriptionError(
+                f"robot {robot.name!r}, servos: {joint!r} is not driven; allowed: "
+                f"{', '.join(driven) or 'none, as actuators is empty'}"
+            )
     if not isinstance(robot.substeps, int) or robot.substeps < 1:
         raise RobotDescriptionError(
             f"robot {robot.name!r}, substeps={robot.substeps!r}; allowed: 1, 2, ..."

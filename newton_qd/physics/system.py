@@ -83,7 +83,8 @@ class System:
             axis are the local z axis.
         obstacle_size: (no, 3) capsule: radius, half length, 0; box: half
             extents [m]; plane: zeros.
-        scene_links: (ns,) names of the scene's links.
+        scene_links: (ns,) names of the links that never move: those of the robot
+            that are fixed to the world, then the scene's.
         scene_frames: (ns, 7) their frames in the world.
         contact_stiffness: [N/m].
         feet: (nf,) body index of each foot.

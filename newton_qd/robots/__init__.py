@@ -1,20 +1,50 @@
 """Robots as data: one file and one row each."""
 
+from newton_qd.robots.acrobot import ACROBOT
 from newton_qd.robots.ant import ANT
 from newton_qd.robots.halfcheetah import HALFCHEETAH
 from newton_qd.robots.hopper import HOPPER
 from newton_qd.robots.humanoid import HUMANOID
+from newton_qd.robots.humanoid_standup import HUMANOID_STANDUP
+from newton_qd.robots.inverted_double_pendulum import INVERTED_DOUBLE_PENDULUM
+from newton_qd.robots.inverted_pendulum import INVERTED_PENDULUM
+from newton_qd.robots.reacher import REACHER
+from newton_qd.robots.reacherangle import REACHERANGLE
 from newton_qd.robots.row import Contact, Material, Robot
+from newton_qd.robots.swimmer import SWIMMER
 from newton_qd.robots.walker2d import WALKER2D
 
-ROBOTS = {robot.name: robot for robot in (ANT, HALFCHEETAH, HOPPER, HUMANOID, WALKER2D)}
+ROBOTS = {
+    robot.name: robot
+    for robot in (
+        ANT,
+        HALFCHEETAH,
+        HOPPER,
+        HUMANOID,
+        WALKER2D,
+        ACROBOT,
+        HUMANOID_STANDUP,
+        INVERTED_DOUBLE_PENDULUM,
+        INVERTED_PENDULUM,
+        REACHER,
+        REACHERANGLE,
+        SWIMMER,
+    )
+}
 
 __all__ = [
+    "ACROBOT",
     "ANT",
     "HALFCHEETAH",
     "HOPPER",
     "HUMANOID",
+    "HUMANOID_STANDUP",
+    "INVERTED_DOUBLE_PENDULUM",
+    "INVERTED_PENDULUM",
+    "REACHER",
+    "REACHERANGLE",
     "ROBOTS",
+    "SWIMMER",
     "WALKER2D",
     "Contact",
     "Material",

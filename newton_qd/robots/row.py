@@ -69,7 +69,7 @@ class Robot:
         torso: Link whose position is the robot's position.
         feet: Links whose contacts make the feet-contact descriptor, in order.
         actuators: ``(joint, gear)`` in the order of the action; gear is the
-            torque of a unit action [N m].
+            torque of a unit action [N m], or the force of a slide [N].
         contacts: Spheres that may touch the ground.
         pairs: Whole colliders, each with ``end`` 0, of two links that may touch each
             other.
@@ -77,6 +77,10 @@ class Robot:
             are not named rest at 0.
         rest_height: Height of the root in the default pose [m]; ``None`` puts
             the lowest contact on the ground.
+        rest_rotation: Roll, pitch and yaw of a free root in the default pose [rad].
+        servos: Those joints of ``actuators`` that hold an angle: the action is the
+            target [rad or m] and gear the torque for each radian off it [N m/rad],
+            or the force for each metre [N/m].
         dt: Duration of a control step [s].
         substeps: Physics steps in a control step [-].
         gravity: Downward acceleration [m/s^2].
@@ -95,6 +99,8 @@ class Robot:
     dt: float
     substeps: int
     rest_height: float | None = None
+    rest_rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    servos: tuple[str, ...] = ()
     gravity: float = 9.81
     material: Material = Material()
     original_names: tuple[tuple[str, str], ...] = ()

@@ -1,0 +1,107 @@
+"""Inverted pendulums: keep one pole, or two, upright on a cart."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from newton_qd import physics
+from newton_qd.envs.base import PhysicsEnv
+from newton_qd.envs.points import point
+from newton_qd.envs.vectors import ordered_sum, wrapped
+from newton_qd.physics.system import PhysicsState
+from newton_qd.robots import INVERTED_DOUBLE_PENDULUM, INVERTED_PENDULUM
+from newton_qd.types import Action, Metrics
+
+_TIP = (0.0, 0.0, 0.6)  # end of the upper pole's axis, in its link [m]
+# Penalties of the squared distances of the tip from x = 0 and from a height of 2 m
+# [1/m^2], and of the squared joint velocities [s^2/rad^2].
+_WEIGHTS = (0.01, 1.0, 1e-3, 5e-3)
+
+
+class InvertedPendulum(PhysicsEnv):
+    """A pole on a cart that is pushed along x, rewarded for each step.
+
+    Observation: ``observation_layout``. Reward: 1. Done when the pole leans more than
+    0.2 rad.
+    """
+
+    def __init__(
+        self, *, reset_noise_scale: float = 0.01, dtype: str = "float32"
+    ) -> None:
+        """Loads the pendulum.
+
+        Args:
+            reset_noise_scale: Half width of the uniform noise on the pole's angle
+                [rad] and angular velocity [rad/s] at a reset.
+            dtype: ``"float32"``, or ``"float64"`` with JAX x64 on.
+        """
+        super().__init__(
+            INVERTED_PENDULUM, reset_noise_scale=reset_noise_scale, dtype=dtype
+        )
+
+    def _observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
+        """Returns the blocks of the observation."""
+        del action
+        q, v = state.q, state.v
+        return {
+            "cart position x [m]": q[:1],
+            "pole angle [rad]": wrapped(q[1:]),
+            "cart velocity x [m/s]": v[:1],
+            "pole angular velocity [rad/s]": v[1:],
+        }
+
+    def _outcome(
+        self, before: PhysicsState, after: PhysicsState, action: Action
+    ) -> tuple[jax.Array, jax.Array, Metrics]:
+        """Returns reward, done and metrics of a step."""
+        del before, action
+        done = (jnp.abs(wrapped(after.q[1])) > 0.2).astype(self.dtype)
+        return jnp.ones_like(done), done, {}
+
+
+class InvertedDoublePendulum(PhysicsEnv):
+    """Two poles, one on the other, on a cart that is pushed along x.
+
+    Observation: ``observation_layout``. Reward: 10, minus penalties for where the tip
+    of the upper pole is and for how fast the joints turn. Done when the tip is no
+    higher than 1 m; upright it is at 1.3 m.
+    """
+
+    def __init__(
+        self, *, reset_noise_scale: float = 0.01, dtype: str = "float32"
+    ) -> None:
+        """Loads the pendulum.
+
+        Args:
+            reset_noise_scale: Half width of the uniform noise on the poles' angles
+                [rad] and angular velocities [rad/s] at a reset.
+            dtype: ``"float32"``, or ``"float64"`` with JAX x64 on.
+        """
+        super().__init__(
+            INVERTED_DOUBLE_PENDULUM, reset_noise_scale=reset_noise_scale, dtype=dtype
+        )
+
+    def _observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
+        """Returns the blocks of the observation."""
+        del action
+        q, v = state.q, state.v
+        return {
+            "cart position x [m]": q[:1],
+            "sines of the joint angles": jnp.sin(q[1:]),
+            "cosines of the joint angles": jnp.cos(q[1:]),
+            "cart velocity x [m/s]": v[:1],
+            "joint velocities [rad/s]": v[1:],
+        }
+
+    def _outcome(
+        self, before: PhysicsState, after: PhysicsState, action: Action
+    ) -> tuple[jax.Array, jax.Array, Metrics]:
+        """Returns reward, done and metrics of a step."""
+        del before, action
+        seen = physics.forward_kinematics(self.system, after.q, after.v)
+        x, _, height = point(seen, self.system.body_names.index("pole2"), _TIP)[0]
+        off = jnp.stack([x, height - 2, after.v[1], after.v[2]])
+        penalty = ordered_sum(np.asarray(_WEIGHTS, self.dtype) * jnp.square(off))
+        return 10 - penalty, (height <= 1).astype(self.dtype), {}

@@ -1,0 +1,141 @@
+"""Reachers: bring the tip of an arm to a target that each reset places anew."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from newton_qd import physics
+from newton_qd.envs.base import PhysicsEnv
+from newton_qd.envs.points import point
+from newton_qd.envs.vectors import length, ordered_sum
+from newton_qd.physics.inspection import Kinematics
+from newton_qd.physics.system import PhysicsState
+from newton_qd.robots import REACHER, REACHERANGLE, Robot
+from newton_qd.types import Action, Metrics, RNGKey
+
+_TIP = (0.11, 0.0, 0.0)  # centre of the tip in its link [m]
+_FARTHEST = 0.2  # of a target from the shoulder [m]
+
+
+class Reacher(PhysicsEnv):
+    """An arm of two links over the ground, driven by torques.
+
+    Observation: ``observation_layout``. Reward: minus the distance of the tip from the
+    target, minus the sum of squared actions. Never done. The target is a body of the
+    simulation that nothing moves.
+    """
+
+    _row: Robot = REACHER
+
+    def __init__(
+        self,
+        *,
+        reset_noise_scale: float = 0.1,
+        reset_velocity_noise_scale: float = 0.005,
+        dtype: str = "float32",
+    ) -> None:
+        """Loads the arm.
+
+        Args:
+            reset_noise_scale: Half width of the uniform noise on joint angles at a
+                reset [rad].
+            reset_velocity_noise_scale: That of joint velocities [rad/s].
+            dtype: ``"float32"``, or ``"float64"`` with JAX x64 on.
+        """
+        super().__init__(
+            self._row,
+            reset_noise_scale=reset_noise_scale,
+            reset_velocity_noise_scale=reset_velocity_noise_scale,
+            dtype=dtype,
+        )
+
+    def _place(self, rng: RNGKey, q: jax.Array) -> jax.Array:
+        """Returns the coordinates (nq,) with the target somewhere within reach."""
+        share, turn = jax.random.uniform(rng, (2,), self.dtype)
+        angle = np.asarray(2 * np.pi, self.dtype) * turn
+        direction = jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+        distance = _FARTHEST * self._share_of_radius(share)
+        return q.at[self._target].set(distance * direction)
+
+    def _share_of_radius(self, share: jax.Array) -> jax.Array:
+        """Returns how far out () a target is, of a uniform number () from 0 to 1."""
+        # as the original: targets are denser near the shoulder
+        return share
+
+    @property
+    def _target(self) -> np.ndarray:
+        """Coordinates x and y of the target (2,)."""
+        names = self.system.joint_names
+        joints = np.array([names.index(name) for name in ("target_x", "target_y")])
+        return self.system.q_start[joints].astype(np.int32)
+
+    def _observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
+        """Returns the blocks of the observation."""
+        del action
+        seen = physics.forward_kinematics(self.system, state.q, state.v)
+        angles = state.q[self._joint_q]
+        return {
+            "cosines of the joint angles": jnp.cos(angles),
+            "sines of the joint angles": jnp.sin(angles),
+            "target position x y [m]": state.q[self._target],
+            "tip velocity x y [m/s]": self._tip(seen)[1][:2],
+            "tip minus target x y z [m]": self._miss(seen),
+        }
+
+    def _tip(self, seen: Kinematics) -> tuple[jax.Array, jax.Array]:
+        """Returns position (3,) [m] and velocity (3,) [m/s] of the tip."""
+        return point(seen, self.system.body_names.index("body1"), _TIP)
+
+    def _miss(self, seen: Kinematics) -> jax.Array:
+        """Returns the way from the target to the tip (3,) [m]."""
+        target = self.system.body_names.index("target")
+        return self._tip(seen)[0] - seen.position[target]
+
+    def _distance(self, state: PhysicsState) -> jax.Array:
+        """Returns the distance () of the tip from the target [m]."""
+        return length(
+            self._miss(physics.forward_kinematics(self.system, state.q, state.v))
+        )
+
+    def _outcome(
+        self, before: PhysicsState, after: PhysicsState, action: Action
+    ) -> tuple[jax.Array, jax.Array, Metrics]:
+        """Returns reward, done and metrics of a step."""
+        del before
+        distance, control = self._distance(after), ordered_sum(jnp.square(action))
+        metrics = {"reward_dist": -distance, "reward_ctrl": -control}
+        return -distance - control, jnp.zeros_like(distance), metrics
+
+
+class ReacherAngle(Reacher):
+    """The arm of the reacher, driven to angles.
+
+    An action from -1 to 1 is the angle that a joint is driven to, from one end of its
+    range to the other; beyond, it is clipped. Reward: minus the distance of the tip
+    from the target. Never done.
+    """
+
+    _row = REACHERANGLE
+
+    def _share_of_radius(self, share: jax.Array) -> jax.Array:
+        """Returns how far out () a target is: uniform over the disk."""
+        return jnp.sqrt(share)
+
+    def _control(self, state: PhysicsState, action: Action) -> jax.Array:
+        """Returns the angles that the joints are driven to (nu,) [rad]."""
+        del state
+        dofs = self.system.control_dof
+        low = np.asarray(self.system.limit_lower[dofs], self.dtype)
+        high = np.asarray(self.system.limit_upper[dofs], self.dtype)
+        return low + (high - low) * (jnp.clip(action, -1, 1) + 1) / 2
+
+    def _outcome(
+        self, before: PhysicsState, after: PhysicsState, action: Action
+    ) -> tuple[jax.Array, jax.Array, Metrics]:
+        """Returns reward, done and metrics of a step."""
+        del before, action
+        distance = self._distance(after)
+        zero = jnp.zeros_like(distance)
+        return -distance, zero, {"rewardDist": -distance, "rewardCtrl": zero}

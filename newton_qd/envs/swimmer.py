@@ -1,0 +1,154 @@
+"""Swimmer: swim along x in a plane, by bending two joints."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from newton_qd import physics
+from newton_qd.envs.base import PhysicsEnv
+from newton_qd.envs.state import select
+from newton_qd.envs.vectors import length, ordered_sum, rounded, wrapped
+from newton_qd.physics.inspection import Kinematics
+from newton_qd.physics.system import PhysicsState
+from newton_qd.robots import SWIMMER
+from newton_qd.types import Action, Metrics
+
+_LINKS = ("torso", "mid", "back")
+_YAW, _JOINTS = 2, 3  # coordinates; x and y of the torso are before them
+
+# The water, and the inertia of the link that the original takes the drag of: a box with
+# the same moments is dragged (MuJoCo's inertia-box model, with sides of a sixth).
+_VISCOSITY, _DENSITY = 0.1, 10.0  # [N s/m^2], [kg/m^3]
+_MASS = 34.557519189487735  # [kg]
+_MOMENTS = np.array([0.1727875959474387, 3.5709436495803999, 3.5709436495803999])
+_SIDES = np.sqrt((_MOMENTS.sum() - 2 * _MOMENTS) / (6 * _MASS))  # [m]
+_LINEAR = 3 * np.pi * _SIDES.mean() * _VISCOSITY  # [N s/m]
+# along and across a link [N s^2/m^2]
+_QUADRATIC = 0.5 * _DENSITY * _SIDES.prod() / _SIDES[:2]
+
+
+class Swimmer(PhysicsEnv):
+    """Three links in a row that float in water, rewarded for velocity along x.
+
+    Observation: ``observation_layout``. Reward: velocity of the centre of mass along x,
+    minus a cost of control. Never done. The water drags each link at its centre of
+    mass: against its velocity, and more across the link than along it; the drag is
+    that of the start of a step.
+    """
+
+    forward_reward_name = "reward_fwd"
+
+    def __init__(
+        self,
+        *,
+        forward_reward_weight: float = 1.0,
+        ctrl_cost_weight: float = 1e-4,
+        reset_noise_scale: float = 0.1,
+        exclude_current_positions_from_observation: bool = True,
+        dtype: str = "float32",
+    ) -> None:
+        """Loads the swimmer.
+
+        Args:
+            forward_reward_weight: Reward of a velocity along x [s/m].
+            ctrl_cost_weight: Cost of the sum of squared actions [-].
+            reset_noise_scale: Half width of the uniform noise on joint angles [rad]
+                and joint velocities [rad/s] at a reset.
+            exclude_current_positions_from_observation: Whether the observation
+                omits x and y of the torso.
+            dtype: ``"float32"``, or ``"float64"`` with JAX x64 on.
+        """
+        self._forward_reward_weight = forward_reward_weight
+        self._ctrl_cost_weight = ctrl_cost_weight
+        self._omit_xy = exclude_current_positions_from_observation
+        super().__init__(SWIMMER, reset_noise_scale=reset_noise_scale, dtype=dtype)
+
+    @property
+    def action_size(self) -> int:
+        """Length of an action: the drag of the water is none."""
+        return self.system.nu - _JOINTS
+
+    def _observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
+        """Returns the blocks of the observation."""
+        del action
+        q, v = state.q, state.v
+        blocks = {} if self._omit_xy else {"torso position x y [m]": q[:_YAW]}
+        return blocks | {
+            "torso heading [rad]": wrapped(q[_YAW:_JOINTS]),
+            "joint angles [rad]": q[_JOINTS:],
+            "torso velocity x y [m/s]": v[:_YAW],
+            "torso angular velocity z [rad/s]": v[_YAW:_JOINTS],
+            "joint velocities [rad/s]": v[_JOINTS:],
+        }
+
+    def _control(self, state: PhysicsState, action: Action) -> jax.Array:
+        """Returns the torques of the action and the drag, on every coordinate (5,)."""
+        finite = jnp.all(jnp.isfinite(state.q)) & jnp.all(jnp.isfinite(state.v))
+        state = select(finite, state, self._rest())  # its gradient too
+        drag = self._drag(state)
+        scale = 1 / np.asarray(self.system.gear[:2], self.dtype)
+        return jnp.concatenate(
+            [action + rounded(scale * drag[_JOINTS:]), drag[:_JOINTS]]
+        )
+
+    def _drag(self, state: PhysicsState) -> jax.Array:
+        """Returns the generalized force (nv,) of the water [N or N m]."""
+        seen = physics.forward_kinematics(self.system, state.q, state.v)
+        bodies = self._bodies
+        force = self._forces(state.q, seen.linear_velocity[bodies, :2])
+        centre, joint = seen.com[bodies, :2], seen.position[bodies, :2]
+        torques = []
+        for first in range(len(_LINKS)):
+            # a joint feels the forces on its own link and on those behind it
+            arm, push = centre[first:] - joint[first], force[first:]
+            left, right = arm[:, 0] * push[:, 1], arm[:, 1] * push[:, 0]
+            torques.append(ordered_sum(rounded(left) - rounded(right)))
+        return jnp.concatenate([ordered_sum(force), jnp.stack(torques)])
+
+    def _forces(self, q: jax.Array, velocity: jax.Array) -> jax.Array:
+        """Returns the drag (3, 2) on links that move at ``velocity`` (3, 2) [N]."""
+        turns = q[_YAW:]
+        heading = jnp.stack([turns[0], ordered_sum(turns[:2]), ordered_sum(turns)])
+        along = jnp.stack([jnp.cos(heading), jnp.sin(heading)], axis=1)
+        across = jnp.stack([-along[:, 1], along[:, 0]], axis=1)
+        force = -rounded(np.asarray(_LINEAR, self.dtype) * velocity)
+        for axis, coefficient in zip((along, across), _QUADRATIC, strict=True):
+            speed = ordered_sum((axis * velocity).T)
+            square = np.asarray(coefficient, self.dtype) * jnp.abs(speed) * speed
+            force = force - rounded(square[:, None] * axis)
+        return force
+
+    def _outcome(
+        self, before: PhysicsState, after: PhysicsState, action: Action
+    ) -> tuple[jax.Array, jax.Array, Metrics]:
+        """Returns reward, done and metrics of a step."""
+        start, end = (
+            physics.forward_kinematics(self.system, s.q, s.v) for s in (before, after)
+        )
+        position = self._centre_of_mass(end)
+        velocity = (position - self._centre_of_mass(start)) / self.dt
+        forward = rounded(self._forward_reward_weight * velocity[0])
+        control = rounded(self._ctrl_cost_weight * ordered_sum(jnp.square(action)))
+        metrics = {
+            "reward_fwd": forward,
+            "reward_ctrl": -control,
+            "x_position": position[0],
+            "y_position": position[1],
+            "distance_from_origin": length(end.com[self.system.torso]),
+            "x_velocity": velocity[0],
+            "y_velocity": velocity[1],
+            "forward_reward": forward,
+        }
+        return forward - control, jnp.zeros_like(forward), metrics
+
+    def _centre_of_mass(self, seen: Kinematics) -> jax.Array:
+        """Returns x and y of the centre of mass (2,) [m]; all links are as heavy."""
+        return ordered_sum(seen.com[self._bodies, :2]) / len(_LINKS)
+
+    @property
+    def _bodies(self) -> np.ndarray:
+        """Bodies of the links (3,)."""
+        names = self.system.body_names
+        return np.array([names.index(name) for name in _LINKS], np.int32)

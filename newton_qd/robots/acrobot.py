@@ -1,0 +1,15 @@
+"""Acrobot: two poles that hang from a mount, driven where they meet."""
+
+from newton_qd.robots.row import DEGREE, Robot
+
+ACROBOT = Robot(
+    name="acrobot",
+    urdf="acrobot.urdf",
+    torso="pole",
+    feet=(),
+    actuators=(("hinge2", 25.0),),
+    contacts=(),
+    rest_pose=(("hinge", 180 * DEGREE),),
+    dt=0.01,
+    substeps=4,
+)
