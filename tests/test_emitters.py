@@ -242,6 +242,27 @@ def test_state_is_a_pytree_of_fixed_types(name: str, x64: None) -> None:
     assert types(after) == types(carry)
 
 
+def test_all_mix_in_one_loop() -> None:
+    emitter = MultiEmitter(
+        (
+            CMAMEGAEmitter(score, sigma_g=0.5, batch_size=5, num_emitters=2),
+            CMAMAEGAEmitter(score, sigma_g=0.5, batch_size=4),
+            OMGMEGAEmitter(3, sigma_g=0.5),
+            isoline(2),
+        )
+    )
+    search = algorithm(emitter, annealed=True)
+
+    def run(initial: jax.Array, key: jax.Array) -> Any:
+        repertoire, state, _ = search.init(initial, centroids(), key)
+        return search.scan_update((repertoire, state, key), None)[0]
+
+    repertoire, state, _ = jax.eval_shape(run, start(), jax.random.key(0))
+    assert emitter.batch_size == 10 + 4 + 3 + 2
+    assert state.emitter_states[0].points.shape == (2, SIZE)
+    assert isinstance(repertoire, AnnealedRepertoire)
+
+
 def test_omg_mega_steps_along_the_gradients() -> None:
     emitter = OMGMEGAEmitter(64, sigma_g=0.3)
     repertoire, state = begin(emitter, 1)
