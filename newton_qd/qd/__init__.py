@@ -1,6 +1,8 @@
 """Quality-Diversity on the environments: settings, loop and results.
 
 - ``evolve(EvolveConfig(...), out=...)``: MAP-Elites on a registered environment
+- ``newton_qd.qd.emitters``: emitters of QDax that are fed with exact gradients, and
+  ``AnnealedRepertoire`` for one of them
 - ``load_archive(folder)``, ``plot_archive(...)``: what a run has found
 - ``make_task``, ``make_policy``, ``make_scoring_function``: the parts, for other
   algorithms of QDax
@@ -18,6 +20,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from newton_qd.qd.annealed_repertoire import AnnealedRepertoire
     from newton_qd.qd.checkpoint import CheckpointError
     from newton_qd.qd.config import ConfigError, EvolveConfig
     from newton_qd.qd.evolve import EvolveResult, evolve
@@ -29,6 +32,7 @@ if TYPE_CHECKING:
     from newton_qd.qd.task import Task, make_task
 
 __all__ = [
+    "AnnealedRepertoire",
     "Archive",
     "CheckpointError",
     "ConfigError",
@@ -47,6 +51,7 @@ __all__ = [
 ]
 
 _HOME = {
+    "AnnealedRepertoire": "annealed_repertoire",
     "Archive": "folder",
     "CheckpointError": "checkpoint",
     "ConfigError": "config",

@@ -1,0 +1,152 @@
+"""An archive whose cells become harder to enter little by little."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from qdax.core.containers.mapelites_repertoire import (
+    MapElitesRepertoire,
+    get_cells_indices,
+)
+
+
+class AnnealedRepertoire(MapElitesRepertoire, kw_only=True):
+    r"""Repertoire of CMA-MAE and CMA-MAEGA, with the elitist archive beside it.
+
+    An individual of fitness f enters its cell if f exceeds the threshold t of the
+    cell, not the fitness of the elite; then
+
+    .. math:: t \leftarrow (1 - \alpha) t + \alpha f
+
+    with the learning rate alpha. If k individuals of one batch exceed t,
+
+    .. math:: t \leftarrow (1 - \alpha)^k t + (1 - (1 - \alpha)^k) \bar f
+
+    with their mean fitness, and the best of them enters (Fontaine & Nikolaidis,
+    "Covariance Matrix Adaptation MAP-Annealing", GECCO 2023, algorithm 1 and appendix
+    on batches). An elite may be replaced by a worse one, so what was found is in
+    ``result``: report metrics of that one,
+    ``metrics_function=lambda repertoire: default_qd_metrics(repertoire.result, 0.0)``.
+
+    Individuals whose fitness or descriptor is not finite never enter.
+
+    Attributes:
+        thresholds: (cells,) what an individual must exceed to enter.
+        result: Every cell's best individual so far.
+        learning_rate: Learning rate alpha in [0, 1].
+    """
+
+    thresholds: jax.Array
+    result: MapElitesRepertoire
+    learning_rate: float = flax.struct.field(pytree_node=False)
+
+    def add(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self,
+        batch_of_genotypes: Any,
+        batch_of_descriptors: jax.Array,
+        batch_of_fitnesses: jax.Array,
+        batch_of_extra_scores: Any = None,
+    ) -> AnnealedRepertoire:
+        """Adds a batch of individuals.
+
+        Args:
+            batch_of_genotypes: Genotypes; leaves have the axis N in front.
+            batch_of_descriptors: (N, D) descriptors.
+            batch_of_fitnesses: (N,) or (N, 1) fitnesses.
+            batch_of_extra_scores: Extra scores to keep, axis N in front.
+        """
+        extra, descriptors = batch_of_extra_scores, batch_of_descriptors
+        fitnesses = jnp.reshape(batch_of_fitnesses, (-1,))
+        finite = jnp.isfinite(fitnesses) & jnp.all(jnp.isfinite(descriptors), axis=-1)
+        cells = get_cells_indices(descriptors, self.centroids)
+        enters = finite & (fitnesses > self.thresholds[cells])
+        size = self.thresholds.shape[0]
+        count = jax.ops.segment_sum(enters.astype(fitnesses.dtype), cells, size)
+        total = jax.ops.segment_sum(jnp.where(enters, fitnesses, 0), cells, size)
+        keep = (1 - self.learning_rate) ** count
+        mean = total / jnp.maximum(count, 1)
+
+        # QDax's addition, with the thresholds in place of the elites' fitnesses.
+        lowered = MapElitesRepertoire.add(
+            self.replace(fitnesses=self.thresholds[:, None]),
+            batch_of_genotypes,
+            descriptors,
+            jnp.where(enters, fitnesses, -jnp.inf),
+            extra,
+        )
+        changed = (count > 0)[:, None]
+        return self.replace(
+            genotypes=lowered.genotypes,
+            fitnesses=jnp.where(changed, lowered.fitnesses, self.fitnesses),
+            descriptors=lowered.descriptors,
+            extra_scores=lowered.extra_scores,
+            thresholds=keep * self.thresholds + (1 - keep) * mean,
+            result=self.result.add(
+                batch_of_genotypes,
+                descriptors,
+                jnp.where(finite, fitnesses, -jnp.inf),
+                extra,
+            ),
+        )
+
+    @classmethod
+    def init(  # pyright: ignore[reportIncompatibleMethodOverride]
+        cls,
+        genotypes: Any,
+        fitnesses: jax.Array,
+        descriptors: jax.Array,
+        centroids: jax.Array,
+        extra_scores: Any = None,
+        *,
+        learning_rate: float,
+        threshold_min: float,
+        keys_extra_scores: tuple[str, ...] = (),
+    ) -> AnnealedRepertoire:
+        """Makes a repertoire of the initial population.
+
+        ``functools.partial(AnnealedRepertoire.init, learning_rate=..., threshold_min=
+        ...)`` is the ``repertoire_init`` of QDax's ``MAPElites``.
+
+        Args:
+            genotypes: Initial genotypes; leaves have the axis N in front.
+            fitnesses: (N,) their fitnesses.
+            descriptors: (N, D) their descriptors.
+            centroids: (cells, D) centres of the cells.
+            extra_scores: Their extra scores.
+            learning_rate: Learning rate alpha in [0, 1]: 1 makes the threshold the
+                fitness of the last one that entered, 0 never raises it.
+            threshold_min: First threshold of every cell, in units of the fitness: the
+                worst fitness worth keeping.
+            keys_extra_scores: Extra scores to keep.
+
+        Raises:
+            ValueError: ``learning_rate`` or ``threshold_min`` is out of its range.
+        """
+        if not 0 <= learning_rate <= 1:
+            raise ValueError(f"learning_rate must be in [0, 1], got {learning_rate}")
+        if not math.isfinite(threshold_min):
+            raise ValueError(f"threshold_min must be finite, got {threshold_min}")
+        empty = MapElitesRepertoire.init_default(
+            jax.tree.map(lambda leaf: leaf[0], genotypes),
+            centroids,
+            jax.tree.map(lambda leaf: leaf[0], extra_scores or {}),
+            keys_extra_scores,
+        )
+        dtype = jnp.asarray(fitnesses).dtype
+        repertoire = cls(
+            genotypes=empty.genotypes,
+            fitnesses=empty.fitnesses,
+            descriptors=empty.descriptors,
+            centroids=centroids,
+            extra_scores=empty.extra_scores,
+            keys_extra_scores=keys_extra_scores,
+            thresholds=jnp.full(centroids.shape[0], threshold_min, dtype),
+            # No buffer is shared with the repertoire: both can be donated to a jit.
+            result=jax.tree.map(jnp.copy, empty),
+            learning_rate=learning_rate,
+        )
+        return repertoire.add(genotypes, descriptors, fitnesses, extra_scores)

@@ -1,0 +1,62 @@
+"""Emitters that are fed with exact gradients, as emitters of QDax.
+
+- ``OMGMEGAEmitter``: random steps along the gradients of elites
+- ``CMAMEGAEmitter``: CMA-ES searches for the steps along the gradients of a solution
+  point
+- ``CMAMAEGAEmitter``: the same on an annealed archive, ``AnnealedRepertoire``
+- ``GradientVariationEmitter``: elites climb their fitness, or move along descriptors
+- ``SteeringEmitter``: elites move towards empty cells
+
+All of them read ``extra_scores["gradients"]`` as ``gradients.py`` describes, run under
+``jax.jit`` and ``jax.lax.scan``, and mix with QDax's emitters in its ``MultiEmitter``.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from newton_qd.qd.extras import require_extra
+
+if TYPE_CHECKING:
+    from newton_qd.qd.emitters.cma_maega import CMAMAEGAEmitter
+    from newton_qd.qd.emitters.cma_mega import CMAMEGAEmitter
+    from newton_qd.qd.emitters.gradient_variation import GradientVariationEmitter
+    from newton_qd.qd.emitters.gradients import GradientsError
+    from newton_qd.qd.emitters.omg_mega import OMGMEGAEmitter
+    from newton_qd.qd.emitters.restarts import RestartRule
+    from newton_qd.qd.emitters.steering import SteeringEmitter
+
+__all__ = [
+    "CMAMAEGAEmitter",
+    "CMAMEGAEmitter",
+    "GradientVariationEmitter",
+    "GradientsError",
+    "OMGMEGAEmitter",
+    "RestartRule",
+    "SteeringEmitter",
+]
+
+_HOME = {
+    "CMAMAEGAEmitter": "cma_maega",
+    "CMAMEGAEmitter": "cma_mega",
+    "GradientVariationEmitter": "gradient_variation",
+    "GradientsError": "gradients",
+    "OMGMEGAEmitter": "omg_mega",
+    "RestartRule": "restarts",
+    "SteeringEmitter": "steering",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Loads a name of this package when it is first used."""
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    require_extra("qdax", "qd")
+    value = getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

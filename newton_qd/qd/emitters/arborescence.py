@@ -1,0 +1,370 @@
+"""Gradient arborescence: CMA-ES searches for steps along the gradients of a point.
+
+What CMA-MEGA (Fontaine & Nikolaidis, "Differentiable Quality Diversity", NeurIPS 2021,
+algorithm 1) and CMA-MAEGA share. A solution point theta has the offspring
+
+    theta + c_0 grad f(theta) + sum_j c_j grad m_j(theta),    c ~ N(mu, Sigma)
+
+with normalized gradients. The offspring are ranked by what they would do to the
+archive; CMA-ES moves mu and Sigma towards the better half, and theta takes a gradient
+step towards their weighted mean. A point that has converged restarts from an elite.
+
+Any number of points search in parallel; their states carry a leading axis E.
+"""
+
+from __future__ import annotations
+
+import abc
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from jax.core import Tracer
+from jax.typing import ArrayLike
+from qdax.core.containers.mapelites_repertoire import get_cells_indices
+from qdax.core.emitters.emitter import Emitter, EmitterState
+
+from newton_qd.qd.emitters.cma_es import CMAES, CMAESState
+from newton_qd.qd.emitters.gradients import (
+    GradientsError,
+    Scores,
+    ScoringFunction,
+    check_genotypes,
+    finite_scores,
+    normalize,
+    read_scores,
+)
+from newton_qd.qd.emitters.restarts import RestartRule
+
+# Ranks of offspring (pyribs' status); what failed comes last.
+NEW, IMPROVED, WORSE, FAILED = 2, 1, 0, -1
+# pyribs' limit for the spread of values in a batch.
+_FLAT = 1e-12
+
+
+class ArborescenceState(EmitterState):
+    """State of E solution points.
+
+    The coefficients of the next offspring are drawn when the state is made, so that
+    emitting and updating cannot disagree about them.
+
+    Attributes:
+        key: Random key of the next update.
+        points: (E, size) solution points theta.
+        gradients: (E, 1 + D, size) normalized gradients of the points.
+        finite: (E,) whether scores and gradients of the points are finite.
+        bars: (cells,) what an offspring must exceed to enter the archive.
+        cma_es: Search distributions of the coefficients, leading axis E.
+        optimizer: State of the gradient optimizer, leading axis E.
+        coefficients: (E, B - 1, 1 + D) coefficients of the offspring.
+        age: (E,) updates since the last restart.
+        restarts: () restarts so far, of all points.
+        rejected: () individuals so far with a score that is not finite, and points
+            with such a gradient.
+    """
+
+    key: jax.Array
+    points: jax.Array
+    gradients: jax.Array
+    finite: jax.Array
+    bars: jax.Array
+    cma_es: CMAESState
+    optimizer: Any
+    coefficients: jax.Array
+    age: jax.Array
+    restarts: jax.Array
+    rejected: jax.Array
+
+
+class ArborescenceEmitter(Emitter, abc.ABC):
+    """Emitter of E solution points; subclasses say how offspring rank."""
+
+    def __init__(
+        self,
+        scoring_function: ScoringFunction,
+        *,
+        sigma_g: float,
+        batch_size: int = 36,
+        num_emitters: int = 1,
+        optimizer: optax.GradientTransformation | None = None,
+        restart_rule: RestartRule,
+        restart_period: int | None = None,
+        start: ArrayLike | None = None,
+    ) -> None:
+        """Sets up the search; evaluates nothing.
+
+        Args:
+            scoring_function: Scores solution points (E, size) with gradients, as
+                ``gradients.py`` describes. The loop may use a cheaper one without.
+            sigma_g: Initial standard deviation of the coefficients, in units of the
+                genotype.
+            batch_size: Individuals that each point emits in one iteration: the point
+                itself and ``batch_size - 1`` offspring.
+            num_emitters: Number E of solution points.
+            optimizer: Takes the gradient steps of the points, such as
+                ``optax.adam(0.002)``. None is gradient ascent with rate 1, which
+                moves a point to the weighted mean of its best offspring.
+            restart_rule: When a point restarts.
+            restart_period: Restart after this many updates in any case.
+            start: (size,) first solution point. None draws elites of the initial
+                repertoire.
+
+        Raises:
+            ValueError: A number is out of its range.
+        """
+        for name, value, low in (
+            ("batch_size", batch_size, 3),
+            ("num_emitters", num_emitters, 1),
+            ("restart_period", 1 if restart_period is None else restart_period, 1),
+        ):
+            if value < low:
+                raise ValueError(f"{name} must be at least {low}, got {value}")
+        if not sigma_g > 0:
+            raise ValueError(f"sigma_g must be positive, got {sigma_g}")
+        self._scoring_function = scoring_function
+        self._sigma_g = sigma_g
+        self._population = batch_size
+        self._num_emitters = num_emitters
+        self._optimizer = optax.sgd(1.0) if optimizer is None else optimizer
+        self._restart_rule = restart_rule
+        self._restart_period = restart_period
+        self._start = start
+
+    @property
+    def batch_size(self) -> int:
+        """Individuals emitted in one iteration, of all solution points."""
+        return self._num_emitters * self._population
+
+    @abc.abstractmethod
+    def _bars(self, repertoire: Any) -> jax.Array:
+        """(cells,) what an individual must exceed to enter the repertoire."""
+
+    @abc.abstractmethod
+    def _rank(
+        self, fitnesses: jax.Array, bars: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Values offspring by what they would do to the archive.
+
+        Args:
+            fitnesses: (B,) fitnesses, finite.
+            bars: (B,) bars of their cells.
+
+        Returns:
+            (B,) class, the higher the better, and (B,) value within a class.
+        """
+
+    def init(
+        self,
+        key: jax.Array,
+        repertoire: Any,
+        genotypes: Any,
+        fitnesses: jax.Array,
+        descriptors: jax.Array,
+        extra_scores: Any,
+    ) -> ArborescenceState:
+        """Scores the first solution points.
+
+        Raises:
+            GradientsError: The scoring function returns no gradients of the right
+                shape, or none that are finite (outside ``jit``), or ``start`` has
+                another shape than the genotypes.
+        """
+        del fitnesses, extra_scores
+        size, dtype = check_genotypes(genotypes).shape[1], genotypes.dtype
+        points_key, score_key, sample_key, state_key = jax.random.split(key, 4)
+        if self._start is None:
+            points = repertoire.select(points_key, self._num_emitters).genotypes
+        else:
+            if jnp.shape(self._start) != (size,):
+                raise GradientsError(
+                    f"start must have the genotypes' shape {(size,)}, got "
+                    f"{jnp.shape(self._start)}"
+                )
+            points = jnp.broadcast_to(
+                jnp.asarray(self._start, dtype), (self._num_emitters, size)
+            )
+        scores = self._score(points, score_key)
+        if not isinstance(scores.finite, Tracer) and not scores.finite.any():
+            raise GradientsError(
+                "extra_scores['gradients'] or the scores of every first solution point "
+                "are not finite: give another start"
+            )
+        strategy = self._strategy(descriptors.shape[-1])
+        cma_es = jax.vmap(lambda _: strategy.init(dtype))(points)
+        return ArborescenceState(
+            key=state_key,
+            points=points,
+            gradients=normalize(scores.gradients),
+            finite=scores.finite,
+            bars=self._bars(_add(repertoire, scores)),
+            cma_es=cma_es,
+            optimizer=jax.vmap(self._optimizer.init)(points),
+            coefficients=self._sample(strategy, cma_es, sample_key),
+            age=jnp.zeros(self._num_emitters, jnp.int32),
+            restarts=jnp.zeros((), jnp.int32),
+            rejected=jnp.sum(~scores.finite, dtype=jnp.int32),
+        )
+
+    def emit(
+        self, repertoire: Any, emitter_state: Any, key: jax.Array
+    ) -> tuple[jax.Array, dict[str, Any]]:
+        """Moves the solution points along their gradients.
+
+        Args:
+            repertoire: Not used: all randomness is in the state already.
+            emitter_state: State to emit from.
+            key: Not used.
+
+        Returns:
+            (E * B, size) each point followed by its offspring; an empty dictionary.
+        """
+        del repertoire, key
+        points = emitter_state.points[:, None]
+        steps = emitter_state.coefficients @ emitter_state.gradients
+        emitted = jnp.concatenate([points, points + steps], axis=1)
+        return emitted.reshape(-1, emitted.shape[-1]), {}
+
+    def state_update(
+        self,
+        emitter_state: Any,
+        repertoire: Any = None,
+        genotypes: Any = None,
+        fitnesses: Any = None,
+        descriptors: Any = None,
+        extra_scores: Any = None,
+    ) -> ArborescenceState:
+        """Ranks the offspring, moves the points and scores them.
+
+        Args:
+            emitter_state: State that emitted.
+            repertoire: Repertoire after the addition.
+            genotypes: Not used.
+            fitnesses: (E * B,) fitnesses of the emitted.
+            descriptors: (E * B, D) descriptors of the emitted.
+            extra_scores: Not used.
+
+        Raises:
+            GradientsError: The scoring function returns no gradients of the right
+                shape.
+        """
+        del genotypes, extra_scores
+        state, shape = emitter_state, (self._num_emitters, self._population)
+        finite = finite_scores(fitnesses, descriptors)
+        cells = get_cells_indices(descriptors, repertoire.centroids)
+        fitnesses = jnp.where(finite, jnp.reshape(fitnesses, (-1,)), 0)
+        # The first individual of each point is the point itself.
+        cma_es, improved, flat = jax.vmap(self._adapt)(
+            state.cma_es,
+            state.coefficients,
+            fitnesses.reshape(shape)[:, 1:],
+            state.bars[cells].reshape(shape)[:, 1:],
+            finite.reshape(shape)[:, 1:],
+        )
+        points, optimizer = jax.vmap(self._climb)(
+            state.points, state.gradients, cma_es.mean, state.optimizer
+        )
+        strategy = self._strategy(descriptors.shape[-1])
+        age = state.age + 1
+        restart = flat | ~state.finite | jax.vmap(strategy.stopped)(cma_es)
+        if self._restart_rule is RestartRule.NO_IMPROVEMENT:
+            restart |= ~improved
+        if self._restart_period is not None:
+            restart |= age >= self._restart_period
+
+        key, elite_key, score_key, sample_key = jax.random.split(state.key, 4)
+        elites = repertoire.select(elite_key, self._num_emitters).genotypes
+        points, optimizer, cma_es, age = _where(
+            restart,
+            (
+                elites,
+                jax.vmap(self._optimizer.init)(elites),
+                jax.vmap(lambda point: strategy.init(point.dtype))(elites),
+                jnp.zeros_like(age),
+            ),
+            (points, optimizer, cma_es, age),
+        )
+        scores = self._score(points, score_key)
+        rejected = jnp.sum(~finite, dtype=jnp.int32)
+        rejected += jnp.sum(~scores.finite, dtype=jnp.int32)
+        return ArborescenceState(
+            key=key,
+            points=points,
+            gradients=normalize(scores.gradients),
+            finite=scores.finite,
+            bars=self._bars(_add(repertoire, scores)),
+            cma_es=cma_es,
+            optimizer=optimizer,
+            coefficients=self._sample(strategy, cma_es, sample_key),
+            age=age,
+            restarts=state.restarts + jnp.sum(restart, dtype=jnp.int32),
+            rejected=state.rejected + rejected,
+        )
+
+    def _strategy(self, descriptor_length: int) -> CMAES:
+        return CMAES(1 + descriptor_length, self._population - 1, self._sigma_g)
+
+    def _score(self, points: jax.Array, key: jax.Array) -> Scores:
+        return read_scores(points, *self._scoring_function(points, key))
+
+    def _sample(self, strategy: CMAES, cma_es: CMAESState, key: jax.Array) -> jax.Array:
+        keys = jax.random.split(key, self._num_emitters)
+        return jax.vmap(strategy.sample)(cma_es, keys)
+
+    def _adapt(
+        self,
+        cma_es: CMAESState,
+        coefficients: jax.Array,
+        fitnesses: jax.Array,
+        bars: jax.Array,
+        finite: jax.Array,
+    ) -> tuple[CMAESState, jax.Array, jax.Array]:
+        """Updates the distribution of one point.
+
+        Args:
+            cma_es: Its distribution.
+            coefficients: (B, 1 + D) coefficients of its offspring.
+            fitnesses: (B,) fitnesses of the offspring, zero if not finite.
+            bars: (B,) bars of their cells.
+            finite: (B,) whether fitness and descriptor are finite.
+
+        Returns:
+            The new distribution, whether any offspring would enter the archive, and
+            whether all of them are equally good.
+        """
+        classes, values = self._rank(fitnesses, bars)
+        classes = jnp.where(finite, classes, FAILED)
+        values = jnp.where(finite, values, 0)
+        best_first = jnp.lexsort((-values, -classes))
+        # What failed pulls the distribution nowhere.
+        pull = jnp.where(finite[:, None], coefficients, cma_es.mean)
+        strategy = self._strategy(coefficients.shape[1] - 1)
+        flat = (jnp.max(classes) == jnp.min(classes)) & (
+            jnp.max(values) - jnp.min(values) < _FLAT
+        )
+        improved = jnp.any(finite & (fitnesses > bars))
+        return strategy.update(cma_es, pull[best_first]), improved, flat
+
+    def _climb(
+        self, point: jax.Array, gradients: jax.Array, mean: jax.Array, optimizer: Any
+    ) -> tuple[jax.Array, Any]:
+        """Steps one point towards the weighted mean of its best offspring."""
+        # optax descends.
+        update, optimizer = self._optimizer.update(
+            -(mean @ gradients), optimizer, point
+        )
+        return jnp.asarray(optax.apply_updates(point, update)), optimizer
+
+
+def _add(repertoire: Any, scores: Scores) -> Any:
+    """The repertoire with the solution points; only its bars are ever computed."""
+    return repertoire.add(scores.genotypes, scores.descriptors, scores.fitnesses)
+
+
+def _where(choose: jax.Array, new: Any, old: Any) -> Any:
+    """Chooses between trees whose leaves have the axis of ``choose`` (E,) in front."""
+
+    def leaf(a: jax.Array, b: jax.Array) -> jax.Array:
+        return jnp.where(choose.reshape(-1, *(1,) * (b.ndim - 1)), a, b)
+
+    return jax.tree.map(leaf, new, old)

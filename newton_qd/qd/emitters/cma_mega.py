@@ -1,0 +1,63 @@
+"""Covariance matrix adaptation MAP-Elites via a gradient arborescence."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from jax.typing import ArrayLike
+
+from newton_qd.qd.emitters.arborescence import (
+    IMPROVED,
+    NEW,
+    WORSE,
+    ArborescenceEmitter,
+)
+from newton_qd.qd.emitters.gradients import ScoringFunction
+from newton_qd.qd.emitters.restarts import RestartRule
+
+
+class CMAMEGAEmitter(ArborescenceEmitter):
+    """CMA-ES searches for the steps along the gradients that improve the archive.
+
+    Fontaine & Nikolaidis, "Differentiable Quality Diversity", NeurIPS 2021, algorithm
+    1: offspring that fill an empty cell come first, then those that improve an elite,
+    each ordered by improvement (two-stage improvement ranking, Fontaine et al. 2020).
+    """
+
+    def __init__(
+        self,
+        scoring_function: ScoringFunction,
+        *,
+        sigma_g: float,
+        batch_size: int = 36,
+        num_emitters: int = 1,
+        optimizer: optax.GradientTransformation | None = None,
+        restart_rule: RestartRule = RestartRule.NO_IMPROVEMENT,
+        restart_period: int | None = None,
+        start: ArrayLike | None = None,
+    ) -> None:
+        """Sets up the search as ``ArborescenceEmitter`` describes."""
+        super().__init__(
+            scoring_function,
+            sigma_g=sigma_g,
+            batch_size=batch_size,
+            num_emitters=num_emitters,
+            optimizer=optimizer,
+            restart_rule=restart_rule,
+            restart_period=restart_period,
+            start=start,
+        )
+
+    def _bars(self, repertoire: Any) -> jax.Array:
+        return repertoire.fitnesses[:, 0]
+
+    def _rank(
+        self, fitnesses: jax.Array, bars: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        empty = bars == -jnp.inf
+        improvement = fitnesses - jnp.where(empty, 0, bars)
+        classes = jnp.where(fitnesses > bars, IMPROVED, WORSE)
+        return jnp.where(empty, NEW, classes), improvement

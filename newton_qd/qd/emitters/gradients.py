@@ -1,0 +1,125 @@
+"""What emitters read: scores with gradients, checked once, in one place.
+
+A scoring function maps genotypes (N, size) and a key to fitnesses (N,), descriptors
+(N, D) and ``extra_scores``, with
+
+    extra_scores["gradients"]: (N, 1 + D, size)
+
+the gradients with respect to the genotype: row 0 that of the fitness, row 1 + j that
+of descriptor j, in their own units (emitters normalize where their paper does). An
+individual that could not be evaluated has fitness ``-inf``.
+
+QDax 0.5.0's own emitters want them the other way round, (N, size, 1 + D); those of
+this package take one layout only and say so when they meet the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+GRADIENTS = "gradients"
+"""Key of the gradients in ``extra_scores``."""
+
+ScoringFunction = Callable[[Any, jax.Array], tuple[jax.Array, jax.Array, Any]]
+
+# pyribs' epsilon: a gradient shorter than this stays shorter than one.
+_EPSILON = 1e-8
+
+
+class GradientsError(ValueError):
+    """Scores do not hold the gradients that an emitter needs."""
+
+
+class Scores(flax.struct.PyTreeNode):
+    """Evaluated individuals.
+
+    Attributes:
+        genotypes: (N, size) policy weights or other solutions.
+        fitnesses: (N,) fitnesses, ``-inf`` where anything is not finite.
+        descriptors: (N, D) descriptors.
+        gradients: (N, 1 + D, size) gradients, zero where anything is not finite.
+        finite: (N,) whether fitness, descriptor and gradients are finite.
+    """
+
+    genotypes: jax.Array
+    fitnesses: jax.Array
+    descriptors: jax.Array
+    gradients: jax.Array
+    finite: jax.Array
+
+
+def read_scores(
+    genotypes: Any, fitnesses: jax.Array, descriptors: jax.Array, extra_scores: Any
+) -> Scores:
+    """Checks what a scoring function returned and sets aside what is not finite.
+
+    Args:
+        genotypes: (N, size) the individuals.
+        fitnesses: (N,) or (N, 1) their fitnesses.
+        descriptors: (N, D) their descriptors.
+        extra_scores: Dictionary with ``"gradients"`` (N, 1 + D, size).
+
+    Raises:
+        GradientsError: The gradients are missing or have another shape, or genotypes
+            are not one array.
+    """
+    count, size = check_genotypes(genotypes).shape
+    if extra_scores is None or GRADIENTS not in extra_scores:
+        held = ", ".join(repr(key) for key in extra_scores or ()) or "nothing"
+        raise GradientsError(
+            f"extra_scores[{GRADIENTS!r}] is missing: extra_scores holds {held}. The "
+            "scoring function must return the gradients of fitness and descriptors, "
+            f"(N, 1 + D, size) = {(count, 1 + descriptors.shape[-1], size)}"
+        )
+    gradients = extra_scores[GRADIENTS]
+    expected = (count, 1 + descriptors.shape[-1], size)
+    if jnp.shape(gradients) != expected:
+        swapped = jnp.shape(gradients) == (expected[0], expected[2], expected[1])
+        hint = "; swap the last two axes" if swapped else ""
+        raise GradientsError(
+            f"extra_scores[{GRADIENTS!r}] must be (N, 1 + D, size) = {expected}, "
+            f"objective first, got {jnp.shape(gradients)}{hint}"
+        )
+    gradients = jnp.asarray(gradients, genotypes.dtype)
+    finite = finite_scores(fitnesses, descriptors) & jnp.all(
+        jnp.isfinite(gradients), axis=(1, 2)
+    )
+    return Scores(
+        genotypes=genotypes,
+        fitnesses=jnp.where(finite, jnp.reshape(fitnesses, (-1,)), -jnp.inf),
+        descriptors=descriptors,
+        gradients=jnp.where(finite[:, None, None], gradients, 0),
+        finite=finite,
+    )
+
+
+def check_genotypes(genotypes: Any) -> jax.Array:
+    """Returns genotypes that are one array (N, size).
+
+    Raises:
+        GradientsError: They are not.
+    """
+    if not isinstance(genotypes, jax.Array) or genotypes.ndim != 2:
+        shapes = jax.tree.map(jnp.shape, genotypes)
+        raise GradientsError(
+            f"genotypes must be one array (N, size), got {shapes}; flatten the "
+            "parameters of a policy with jax.flatten_util.ravel_pytree"
+        )
+    return genotypes
+
+
+def finite_scores(fitnesses: jax.Array, descriptors: jax.Array) -> jax.Array:
+    """(N,) whether fitness and descriptor of an individual are finite."""
+    finite = jnp.isfinite(jnp.reshape(fitnesses, (-1,)))
+    return finite & jnp.all(jnp.isfinite(descriptors), axis=-1)
+
+
+def normalize(gradients: jax.Array) -> jax.Array:
+    """(..., size) gradients of length one; a zero gradient stays zero."""
+    lengths = jnp.linalg.norm(gradients, axis=-1, keepdims=True)
+    return gradients / (lengths + _EPSILON)

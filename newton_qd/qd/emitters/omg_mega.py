@@ -1,0 +1,65 @@
+"""Objective and measure gradient MAP-Elites via a gradient arborescence."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from newton_qd.qd.emitters.elite_gradients import EliteGradientEmitter
+from newton_qd.qd.emitters.gradients import normalize
+
+
+class OMGMEGAEmitter(EliteGradientEmitter):
+    r"""Random steps along the gradients of elites.
+
+    An elite :math:`\theta` has the offspring
+
+    .. math::
+
+        \theta + |c_0| \nabla f(\theta) + \sum_j c_j \nabla m_j(\theta),
+        \qquad c \sim N(0, \sigma_g^2 I)
+
+    with normalized gradients of fitness f and descriptors m_j (Fontaine & Nikolaidis,
+    "Differentiable Quality Diversity", NeurIPS 2021, section 4, eq. 1). The gradients
+    of the elites are kept, so that no parent is evaluated again: with the same number
+    of evaluations this emits twice as many individuals as the paper's implementation.
+    """
+
+    def __init__(self, batch_size: int, sigma_g: float, selector: Any = None) -> None:
+        """Sets the size of steps.
+
+        Args:
+            batch_size: Individuals emitted in one iteration.
+            sigma_g: Standard deviation of the coefficients, in units of the genotype
+                (QDax's parameter of this name is its square).
+            selector: Selector of QDax; None draws uniformly with replacement.
+
+        Raises:
+            ValueError: ``sigma_g`` is not positive, or the batch is empty.
+        """
+        super().__init__(batch_size, selector)
+        if not sigma_g > 0:
+            raise ValueError(f"sigma_g must be positive, got {sigma_g}")
+        self._sigma_g = sigma_g
+
+    def emit(
+        self, repertoire: Any, emitter_state: Any, key: jax.Array
+    ) -> tuple[jax.Array, dict[str, Any]]:
+        """Draws parents and moves each along its gradients.
+
+        Returns:
+            (batch_size, size) offspring and an empty dictionary.
+        """
+        parent_key, step_key = jax.random.split(key)
+        cells = emitter_state.select(
+            repertoire, parent_key, self._batch_size, self._selector
+        )
+        parents = repertoire.genotypes[cells]
+        gradients = normalize(emitter_state.at(repertoire, cells))
+        steps = self._sigma_g * jax.random.normal(
+            step_key, gradients.shape[:2], parents.dtype
+        )
+        steps = steps.at[:, 0].set(jnp.abs(steps[:, 0]))
+        return parents + jnp.einsum("nr,nrs->ns", steps, gradients), {}

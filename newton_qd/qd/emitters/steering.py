@@ -1,0 +1,131 @@
+"""Elites that are steered towards empty cells."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from newton_qd.qd.emitters.elite_gradients import EliteGradientEmitter
+from newton_qd.qd.emitters.gradients import ScoringFunction, read_scores
+
+# Keeps the system regular where no descriptor has a gradient.
+_TINY = 1e-12
+
+
+class SteeringEmitter(EliteGradientEmitter):
+    r"""Moves elites to the centres of empty cells, by the descriptors' gradients.
+
+    Draws empty cells with centres c, takes as parents the elites whose descriptors m
+    are nearest to them, and takes ``steps`` damped Gauss-Newton steps
+
+    .. math::
+
+        \theta \leftarrow \theta + J^T (J J^T + \lambda I)^{-1} (c - m),
+        \qquad \lambda = \textrm{damping} \cdot \textrm{tr}(J J^T) / D
+
+    with the descriptors' Jacobian J (D, size) (Levenberg 1944 and Marquardt 1963, in
+    the dual form for more unknowns than equations: the shortest step that does it).
+    Once no cell is empty, it draws from all cells.
+    """
+
+    def __init__(
+        self,
+        batch_size: int,
+        *,
+        max_step: float,
+        steps: int = 1,
+        scoring_function: ScoringFunction | None = None,
+        damping: float = 1e-3,
+    ) -> None:
+        """Sets the steps.
+
+        Args:
+            batch_size: Individuals emitted in one iteration.
+            max_step: Longest step, in units of the genotype.
+            steps: Steps of each offspring. The first uses the gradients that the
+                parent was evaluated with.
+            scoring_function: Scores with gradients, as ``gradients.py`` describes;
+                needed for a second step.
+            damping: Relative damping [-].
+
+        Raises:
+            ValueError: ``steps`` asks for a ``scoring_function``, or a number is out
+                of its range.
+        """
+        super().__init__(batch_size)
+        if steps < 1:
+            raise ValueError(f"steps must be at least 1, got {steps}")
+        if steps > 1 and scoring_function is None:
+            raise ValueError(f"steps = {steps} needs a scoring_function")
+        for name, value in (("max_step", max_step), ("damping", damping)):
+            if not value > 0:
+                raise ValueError(f"{name} must be positive, got {value}")
+        self._max_step = max_step
+        self._steps = steps
+        self._scoring_function = scoring_function
+        self._damping = damping
+
+    def emit(
+        self, repertoire: Any, emitter_state: Any, key: jax.Array
+    ) -> tuple[jax.Array, dict[str, Any]]:
+        """Draws empty cells and steers the nearest elites towards them.
+
+        Returns:
+            (batch_size, size) offspring and an empty dictionary. An offspring stays
+            where its gradients are not finite.
+
+        Raises:
+            GradientsError: The scoring function returns no gradients of the right
+                shape.
+        """
+        target_key, score_key = jax.random.split(key)
+        targets = self._targets(repertoire, target_key)
+        known = emitter_state.known(repertoire)
+        parents = jax.vmap(_nearest, (None, None, 0))(
+            repertoire.descriptors, known, targets
+        )
+        genotypes = repertoire.genotypes[parents]
+        gradients = emitter_state.at(repertoire, parents)
+        genotypes += self._step(
+            gradients[:, 1:], targets - repertoire.descriptors[parents]
+        )
+
+        def step(genotypes: jax.Array, key: jax.Array) -> tuple[jax.Array, None]:
+            assert self._scoring_function is not None
+            scores = read_scores(genotypes, *self._scoring_function(genotypes, key))
+            error = jnp.where(scores.finite[:, None], targets - scores.descriptors, 0)
+            return genotypes + self._step(scores.gradients[:, 1:], error), None
+
+        if self._steps > 1:
+            keys = jax.random.split(score_key, self._steps - 1)
+            genotypes, _ = jax.lax.scan(step, genotypes, keys)
+        return genotypes, {}
+
+    def _targets(self, repertoire: Any, key: jax.Array) -> jax.Array:
+        """(batch_size, D) centres of empty cells."""
+        empty = repertoire.fitnesses[:, 0] == -jnp.inf
+        weights = (empty | ~jnp.any(empty)).astype(repertoire.centroids.dtype)
+        cells = jax.random.choice(
+            key, empty.shape[0], (self._batch_size,), p=weights / jnp.sum(weights)
+        )
+        return repertoire.centroids[cells]
+
+    def _step(self, jacobian: jax.Array, error: jax.Array) -> jax.Array:
+        """(N, size) steps that reduce errors (N, D), for Jacobians (N, D, size)."""
+        size = jacobian.shape[1]
+        error = error.astype(jacobian.dtype)
+        gram = jnp.einsum("nds,nes->nde", jacobian, jacobian)
+        damping = self._damping * jnp.trace(gram, axis1=1, axis2=2) / size + _TINY
+        gram += damping[:, None, None] * jnp.eye(size, dtype=gram.dtype)
+        weights = jnp.linalg.solve(gram, error[..., None])[..., 0]
+        step = jnp.einsum("nd,nds->ns", weights, jacobian)
+        length = jnp.linalg.norm(step, axis=1, keepdims=True)
+        return step * (self._max_step / jnp.maximum(length, self._max_step))
+
+
+def _nearest(descriptors: jax.Array, known: jax.Array, target: jax.Array) -> jax.Array:
+    """() cell of the known elite whose descriptor is nearest to a target (D,)."""
+    distances = jnp.sum((descriptors - target) ** 2, axis=-1)
+    return jnp.argmin(jnp.where(known, distances, jnp.inf))

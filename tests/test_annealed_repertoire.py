@@ -1,0 +1,136 @@
+"""The annealed archive against a loop in NumPy and against pyribs'."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from qdax.core.containers.mapelites_repertoire import compute_euclidean_centroids
+
+from newton_qd.qd.annealed_repertoire import AnnealedRepertoire
+
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
+
+CELLS = (4, 3)
+RATE, FLOOR = 0.3, -0.5
+
+
+def batches(count: int, size: int) -> list[tuple[Any, Any, Any]]:
+    """Genotypes (N, 2), descriptors (N, 2) and fitnesses (N,)."""
+    rng = np.random.default_rng(0)
+    return [
+        (
+            rng.normal(size=(size, 2)),
+            rng.uniform(-0.1, 1.1, size=(size, 2)),
+            rng.normal(size=size) + 0.05 * number,
+        )
+        for number in range(count)
+    ]
+
+
+def cell(descriptor: np.ndarray) -> int:
+    """Cell of a descriptor, in QDax's order."""
+    x, y = (
+        min(max(int(np.floor(c * n)), 0), n - 1)
+        for c, n in zip(descriptor, CELLS, strict=True)
+    )
+    return y * CELLS[0] + x
+
+
+def repertoire(data: list[tuple[Any, Any, Any]]) -> AnnealedRepertoire:
+    """Repertoire of several batches."""
+    centroids = compute_euclidean_centroids(CELLS, [0.0, 0.0], [1.0, 1.0])
+    init = functools.partial(
+        AnnealedRepertoire.init, learning_rate=RATE, threshold_min=FLOOR
+    )
+    add = jax.jit(lambda repertoire, g, d, f: repertoire.add(g, d, f))
+    genotypes, descriptors, fitnesses = map(jnp.asarray, data[0])
+    found = jax.jit(init)(genotypes, fitnesses, descriptors, centroids, {})
+    for batch in data[1:]:
+        found = add(found, *map(jnp.asarray, batch))
+    return found
+
+
+@pytest.mark.parametrize("size", [1, 20])
+def test_thresholds_and_elites(size: int, x64: None) -> None:
+    data = batches(40, size)
+    found = repertoire(data)
+    thresholds = np.full(12, FLOOR)
+    fitnesses, best = np.full(12, -np.inf), np.full(12, -np.inf)
+    genotypes = np.zeros((12, 2))
+    for batch in data:
+        entering: dict[int, list[int]] = {}
+        for index, (descriptor, f) in enumerate(zip(*batch[1:], strict=True)):
+            where = cell(descriptor)
+            best[where] = max(best[where], f)
+            if f > thresholds[where]:
+                entering.setdefault(where, []).append(index)
+        for where, indices in entering.items():
+            f = batch[2][indices]
+            # One after the other, each of the mean fitness.
+            for _ in indices:
+                thresholds[where] = (1 - RATE) * thresholds[where] + RATE * f.mean()
+            fitnesses[where] = f.max()
+            genotypes[where] = batch[0][indices[int(np.argmax(f))]]
+    np.testing.assert_allclose(found.thresholds, thresholds, rtol=1e-12)
+    np.testing.assert_array_equal(found.fitnesses[:, 0], fitnesses)
+    np.testing.assert_array_equal(found.genotypes, genotypes)
+    np.testing.assert_array_equal(found.result.fitnesses[:, 0], best)
+    assert np.any(best > fitnesses), "the annealed archive has forgotten nothing"
+
+
+def test_agrees_with_pyribs(x64: None) -> None:
+    pytest.importorskip("ribs")
+    from ribs.archives import GridArchive
+
+    data = batches(20, 20)
+    found = repertoire(data)
+    archive = GridArchive(
+        solution_dim=2,
+        dims=CELLS,
+        ranges=[(0, 1)] * 2,
+        learning_rate=RATE,
+        threshold_min=FLOOR,
+    )
+    for genotypes, descriptors, fitnesses in data:
+        archive.add(genotypes, fitnesses, descriptors)
+    held = archive.data()
+    cells = [cell(measures) for measures in held["measures"]]
+    assert len(cells) == 12
+    np.testing.assert_allclose(np.asarray(found.thresholds)[cells], held["threshold"])
+    np.testing.assert_array_equal(np.asarray(found.genotypes)[cells], held["solution"])
+
+
+def test_what_is_not_finite_never_enters() -> None:
+    bad = np.array([np.nan, np.inf, 1.0, 2.0, -np.inf])
+    descriptors = np.full((5, 2), 0.1)
+    descriptors[2] = np.nan
+    found = repertoire([(np.ones((5, 2)), descriptors, bad)])
+    for held in (found, found.result):
+        filled = np.asarray(held.fitnesses[:, 0]) > -np.inf
+        assert np.flatnonzero(filled).tolist() == [cell(np.array([0.1, 0.1]))]
+        assert held.fitnesses[filled, 0].tolist() == [2.0]
+    assert bool(jnp.all(jnp.isfinite(found.thresholds)))
+
+
+@pytest.mark.parametrize(
+    ("rate", "floor", "message"),
+    [
+        (1.5, 0.0, r"learning_rate must be in \[0, 1\], got 1.5"),
+        (0.1, -np.inf, "threshold_min must be finite, got -inf"),
+    ],
+)
+def test_refuses(rate: float, floor: float, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        AnnealedRepertoire.init(
+            jnp.zeros((1, 2)),
+            jnp.zeros(1),
+            jnp.zeros((1, 2)),
+            jnp.zeros((4, 2)),
+            learning_rate=rate,
+            threshold_min=floor,
+        )
