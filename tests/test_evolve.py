@@ -543,6 +543,7 @@ CHANGES = {
     "grid": (4, 5),
     "iso_sigma": 0.1,
     "line_sigma": 0.1,
+    "algorithm": "cma-me",
 }
 
 
@@ -556,7 +557,7 @@ def test_resuming_with_a_changed_setting_names_it(reference: Path, name: str) ->
 
 def test_every_setting_has_a_changed_value() -> None:
     names = {field.name for field in dataclasses.fields(EvolveConfig)}
-    assert names - set(CHANGES) == {"env_name", "centroids"}
+    assert names - set(CHANGES) == {"env_name", "centroids", "options"}
 
 
 def damage(content: bytes) -> dict[str, bytes]:
@@ -643,7 +644,9 @@ def test_another_machine_is_noticed(
         ({"iso_sigma": float("nan")}, "iso_sigma"),
         ({"line_sigma": -0.1}, "line_sigma must be a finite number"),
         ({"env_name": ""}, "env_name"),
-        ({"colour": "red"}, "unknown setting 'colour'; known: batch_size"),
+        ({"algorithm": 3}, "algorithm must be a name, got 3"),
+        ({"options": 3}, "options must be names with values, got 3"),
+        ({"colour": "red"}, "unknown setting 'colour'; known: algorithm, batch_size"),
     ],
 )
 def test_bad_settings_are_named(settings: dict[str, Any], message: str) -> None:
