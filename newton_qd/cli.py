@@ -125,6 +125,7 @@ def _add_setting_arguments(parser: argparse.ArgumentParser) -> None:
         ("episode_length", int, "control steps of one evaluation"),
         ("iso_sigma", float, "isotropic part of the variation"),
         ("line_sigma", float, "part of the variation towards a second parent"),
+        ("reevaluations", int, "evaluations of each elite for corrected metrics"),
     ):
         group.add_argument(
             f"--{name.replace('_', '-')}",
@@ -135,7 +136,7 @@ def _add_setting_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--algorithm",
         metavar="NAME",
-        help=f"me, cma-me, pga-me, dcrl-me or me-es (default: {_DEFAULTS.algorithm})",
+        help=f"me, cma-me, pga-me or me-es (default: {_DEFAULTS.algorithm})",
     )
     group.add_argument(
         "--option",
@@ -322,6 +323,12 @@ def _report(result: EvolveResult, out: Path) -> None:
             f"coverage {first['coverage']:.1f} -> {last['coverage']:.1f} %, "
             f"best fitness {first['max_fitness']:.1f} -> {last['max_fitness']:.1f}"
         )
+        if (corrected := result.corrected) is not None:
+            print(
+                f"corrected ({corrected.reevaluations} evaluations of each elite): "
+                f"QD score {corrected.qd_score:,.0f}, coverage "
+                f"{corrected.coverage:.1f} %, best fitness {corrected.max_fitness:.1f}"
+            )
         print(f"results in {out}")
     if result.interrupted:
         when = "before the initial population"

@@ -31,7 +31,6 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "me": {},
     "cma-me": {"emitters": 2},
     "pga-me": CRITIC,
-    "dcrl-me": CRITIC,
     "me-es": {"num_optimizer_steps": 2, "sample_sigma": 0.1, "learning_rate": 0.1},
 }
 
@@ -53,6 +52,7 @@ def test_a_stop_changes_nothing(
         hidden=(4,),
         grid=(8, 8),
         algorithm=name,
+        reevaluations=0,
         options=OPTIONS[name],  # pyright: ignore[reportArgumentType]
     )
     common: dict[str, Any] = {"progress": False, "checkpoint_seconds": 1e9}

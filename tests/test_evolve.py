@@ -54,6 +54,7 @@ SMALL = EvolveConfig(
     episode_length=9,
     hidden=(4,),
     grid=(4, 4),
+    reevaluations=0,
 )
 
 
@@ -186,6 +187,32 @@ def test_metrics_file(reference: Path) -> None:
     lines = (reference / "metrics.csv").read_text().splitlines()
     assert lines[0] == "iteration,evaluations,env_steps,qd_score,coverage,max_fitness"
     assert [int(line.split(",")[0]) for line in lines[1:]] == list(range(13))
+
+
+def test_corrected_metrics_are_those_of_the_elites_put_anew(tmp_path: Path) -> None:
+    config = SMALL.replace(iterations=2, reevaluations=5)
+    result = run(config, out=tmp_path / "run")
+    corrected = result.corrected
+    assert corrected is not None
+    written = json.loads((tmp_path / "run" / "corrected.json").read_text())
+    assert written == dataclasses.asdict(corrected)
+    task = point_task(config)
+    policy = make_policy(task.env, config.hidden)
+    score = jax.jit(make_scoring_function(task, policy, config.episode_length))
+    reset = jax.random.fold_in(jax.random.split(jax.random.key(config.seed), 4)[1], 1)
+    genotypes = result.archive.genotypes[result.archive.filled]
+    scores = [score(genotypes, key)[:2] for key in jax.random.split(reset, 5)]
+    fitness = np.median([np.asarray(f) for f, _ in scores], axis=0)
+    found = np.median([np.asarray(d) for _, d in scores], axis=0)
+    best: dict[int, float] = {}
+    for value, descriptor in zip(fitness, found, strict=True):
+        distance = np.square(result.archive.centroids - descriptor).sum(-1)
+        cell = int(distance.argmin())
+        best[cell] = max(value, best.get(cell, -np.inf))
+    assert corrected.coverage == 100 * len(best) / 16
+    assert corrected.max_fitness == pytest.approx(max(best.values()))
+    assert corrected.qd_score == pytest.approx(sum(best.values()) + 45 * len(best))
+    assert run(SMALL.replace(iterations=1)).corrected is None
 
 
 def test_seed_decides() -> None:
@@ -544,6 +571,7 @@ CHANGES = {
     "iso_sigma": 0.1,
     "line_sigma": 0.1,
     "algorithm": "cma-me",
+    "reevaluations": 2,
 }
 
 

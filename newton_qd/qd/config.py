@@ -52,6 +52,8 @@ class EvolveConfig:
             units of policy weights [-].
         line_sigma: Standard deviation of the step towards the second parent,
             relative to the distance of the parents [-].
+        reevaluations: Evaluations of each elite at the end of the run, for corrected
+            metrics; 0 leaves them out.
         algorithm: Name of a row of ``ALGORITHMS``.
         options: Settings that this algorithm alone has, as ``(name, value)`` in the
             order of their names; may be given as a dictionary.
@@ -67,6 +69,7 @@ class EvolveConfig:
     centroids: int | None = None
     iso_sigma: float = 0.02
     line_sigma: float = 0.2
+    reevaluations: int = 32
     algorithm: str = "me"
     options: tuple[tuple[str, Any], ...] = ()
 
@@ -87,6 +90,7 @@ class EvolveConfig:
         _check_integer("seed", self.seed, 0, 2**32 - 1)
         _check_integer("iterations", self.iterations, 0)
         _check_integer("batch_size", self.batch_size, 1)
+        _check_integer("reevaluations", self.reevaluations, 0)
         _check_integer("episode_length", self.episode_length, 1)
         _check_integers("hidden", self.hidden, 1)
         for name in ("iso_sigma", "line_sigma"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -12,8 +13,9 @@ import numpy as np
 from newton_qd.qd.algorithms import ALGORITHMS, Parts
 from newton_qd.qd.checkpoint import Checkpoint, CheckpointError
 from newton_qd.qd.config import ConfigError, EvolveConfig, settings_text
+from newton_qd.qd.corrected import Corrected, correct
 from newton_qd.qd.extras import require_extra
-from newton_qd.qd.folder import COLUMNS
+from newton_qd.qd.folder import COLUMNS, Archive
 from newton_qd.qd.rollout import make_policy, make_scoring_function
 from newton_qd.qd.task import Task
 
@@ -72,6 +74,7 @@ class Search:
         keys = jax.random.split(jax.random.key(config.seed), 4)
         self._key_centroids, self._key_reset = keys[0], keys[1]
         self._key_initial, self._key_generations = keys[2], keys[3]
+        self._key_corrected = jax.random.fold_in(self._key_reset, 1)
         self._key_emitter = jax.random.fold_in(self._key_generations, 0)
         self._policy = make_policy(task.env, config.hidden)
         self._centroids = self._make_centroids()
@@ -156,6 +159,24 @@ class Search:
             centroids=np.asarray(repertoire.centroids),
             metrics=state.metrics,
             emitter=tuple(_leaf_to_host(x) for x in jax.tree.leaves(state.emitter)),
+        )
+
+    def correct(
+        self, archive: Archive, stop: Callable[[], bool] = lambda: False
+    ) -> Corrected | None:
+        """Evaluates the elites of an archive again; ``None`` where none are asked."""
+        if not self._config.reevaluations:
+            return None
+        score = make_scoring_function(
+            self._task, self._policy, self._config.episode_length
+        )
+        return correct(
+            archive,
+            score,
+            self._key_corrected,
+            reevaluations=self._config.reevaluations,
+            offset=self._task.reward_offset * self._config.episode_length,
+            stop=stop,
         )
 
     def restore(self, checkpoint: Checkpoint) -> SearchState:
