@@ -20,8 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import newton_qd
+from newton_qd.extractors import Trajectories
 from newton_qd.qd import EvolveConfig, make_policy, make_task
-from newton_qd.qd.rollout import Trajectories
 from newton_qd.qd.task import Task
 
 WORLDS, STEPS, CELLS, HIDDEN = 1000, 1000, 1024, (64, 64)

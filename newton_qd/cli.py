@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import ast
 import shlex
 import sys
 from collections.abc import Callable, Sequence
@@ -73,8 +74,8 @@ def _make_parser() -> argparse.ArgumentParser:
     commands.add_parser("envs", help="list the environments")
     evolve = commands.add_parser(
         "evolve",
-        help="run MAP-Elites on an environment",
-        description="Runs MAP-Elites on an environment and writes a results folder: "
+        help="run an algorithm of MAP-Elites' family on an environment",
+        description="Evolves an archive of policies and writes a results folder: "
         "archive.npz, archive.png, metrics.csv, config.json and a checkpoint.",
     )
     _add_run_arguments(evolve)
@@ -152,7 +153,7 @@ def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
         "--config",
         type=Path,
         metavar="FILE",
-        help="take the settings of an earlier run's config.json",
+        help="take the settings of an earlier run's config.json, or of a TOML file",
     )
     parser.add_argument(
         "--checkpoint-seconds",
@@ -173,6 +174,7 @@ def _add_setting_arguments(parser: argparse.ArgumentParser) -> None:
         ("episode_length", int, "control steps of one evaluation"),
         ("iso_sigma", float, "isotropic part of the variation"),
         ("line_sigma", float, "part of the variation towards a second parent"),
+        ("reevaluations", int, "evaluations of each elite for corrected metrics"),
     ):
         group.add_argument(
             f"--{name.replace('_', '-')}",
@@ -180,6 +182,20 @@ def _add_setting_arguments(parser: argparse.ArgumentParser) -> None:
             metavar="N" if kind is int else "X",
             help=f"{text} (default: {getattr(_DEFAULTS, name)})",
         )
+    group.add_argument(
+        "--algorithm",
+        metavar="NAME",
+        help=f"me, cma-me, pga-me or me-es (default: {_DEFAULTS.algorithm})",
+    )
+    group.add_argument(
+        "--option",
+        dest="options",
+        type=_option,
+        action="append",
+        metavar="NAME=VALUE",
+        help="setting that the algorithm alone has, for example discount=0.95; may be "
+        "repeated",
+    )
     group.add_argument(
         "--hidden",
         type=_widths,
@@ -199,6 +215,18 @@ def _add_setting_arguments(parser: argparse.ArgumentParser) -> None:
         type=int,
         metavar="N",
         help="cells of a centroidal Voronoi tessellation instead of a grid",
+    )
+
+
+def _option(text: str) -> tuple[str, Any]:
+    name, separator, value = text.partition("=")
+    try:
+        if name and separator:
+            return name, ast.literal_eval(value)
+    except (SyntaxError, ValueError):
+        pass
+    raise argparse.ArgumentTypeError(
+        f"expected a name and a value like discount=0.95, got {text!r}"
     )
 
 
@@ -338,6 +366,8 @@ def _settle(arguments: argparse.Namespace) -> tuple[EvolveConfig, Path]:
         base = base.replace(centroids=None)
     if "centroids" in given:
         base = base.replace(grid=None)
+    if "options" in given:
+        given["options"] = {**dict(base.options), **dict(given["options"])}
     return base.replace(**given), out
 
 
@@ -367,6 +397,12 @@ def _report(result: EvolveResult, out: Path) -> None:
             f"coverage {first['coverage']:.1f} -> {last['coverage']:.1f} %, "
             f"best fitness {first['max_fitness']:.1f} -> {last['max_fitness']:.1f}"
         )
+        if (corrected := result.corrected) is not None:
+            print(
+                f"corrected ({corrected.reevaluations} evaluations of each elite): "
+                f"QD score {corrected.qd_score:,.0f}, coverage "
+                f"{corrected.coverage:.1f} %, best fitness {corrected.max_fitness:.1f}"
+            )
         print(f"results in {out}")
     if result.interrupted:
         when = "before the initial population"

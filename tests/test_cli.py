@@ -25,6 +25,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
 ROOT = Path(__file__).resolve().parent.parent
 POINT = ["evolve", "point", "--quiet", "--iterations", "3", "--batch-size", "16"]
 POINT += ["--episode-length", "9", "--hidden", "4", "--grid", "4x4"]
+POINT += ["--reevaluations", "2"]
 
 
 def call(*arguments: object) -> int:

@@ -54,6 +54,7 @@ SMALL = EvolveConfig(
     episode_length=9,
     hidden=(4,),
     grid=(4, 4),
+    reevaluations=0,
 )
 
 
@@ -186,6 +187,32 @@ def test_metrics_file(reference: Path) -> None:
     lines = (reference / "metrics.csv").read_text().splitlines()
     assert lines[0] == "iteration,evaluations,env_steps,qd_score,coverage,max_fitness"
     assert [int(line.split(",")[0]) for line in lines[1:]] == list(range(13))
+
+
+def test_corrected_metrics_are_those_of_the_elites_put_anew(tmp_path: Path) -> None:
+    config = SMALL.replace(iterations=2, reevaluations=5)
+    result = run(config, out=tmp_path / "run")
+    corrected = result.corrected
+    assert corrected is not None
+    written = json.loads((tmp_path / "run" / "corrected.json").read_text())
+    assert written == dataclasses.asdict(corrected)
+    task = point_task(config)
+    policy = make_policy(task.env, config.hidden)
+    score = jax.jit(make_scoring_function(task, policy, config.episode_length))
+    reset = jax.random.fold_in(jax.random.split(jax.random.key(config.seed), 4)[1], 1)
+    genotypes = result.archive.genotypes[result.archive.filled]
+    scores = [score(genotypes, key)[:2] for key in jax.random.split(reset, 5)]
+    fitness = np.median([np.asarray(f) for f, _ in scores], axis=0)
+    found = np.median([np.asarray(d) for _, d in scores], axis=0)
+    best: dict[int, float] = {}
+    for value, descriptor in zip(fitness, found, strict=True):
+        distance = np.square(result.archive.centroids - descriptor).sum(-1)
+        cell = int(distance.argmin())
+        best[cell] = max(value, best.get(cell, -np.inf))
+    assert corrected.coverage == 100 * len(best) / 16
+    assert corrected.max_fitness == pytest.approx(max(best.values()))
+    assert corrected.qd_score == pytest.approx(sum(best.values()) + 45 * len(best))
+    assert run(SMALL.replace(iterations=1)).corrected is None
 
 
 def test_seed_decides() -> None:
@@ -543,6 +570,8 @@ CHANGES = {
     "grid": (4, 5),
     "iso_sigma": 0.1,
     "line_sigma": 0.1,
+    "algorithm": "cma-me",
+    "reevaluations": 2,
 }
 
 
@@ -556,7 +585,7 @@ def test_resuming_with_a_changed_setting_names_it(reference: Path, name: str) ->
 
 def test_every_setting_has_a_changed_value() -> None:
     names = {field.name for field in dataclasses.fields(EvolveConfig)}
-    assert names - set(CHANGES) == {"env_name", "centroids"}
+    assert names - set(CHANGES) == {"env_name", "centroids", "options"}
 
 
 def damage(content: bytes) -> dict[str, bytes]:
@@ -643,7 +672,9 @@ def test_another_machine_is_noticed(
         ({"iso_sigma": float("nan")}, "iso_sigma"),
         ({"line_sigma": -0.1}, "line_sigma must be a finite number"),
         ({"env_name": ""}, "env_name"),
-        ({"colour": "red"}, "unknown setting 'colour'; known: batch_size"),
+        ({"algorithm": 3}, "algorithm must be a name, got 3"),
+        ({"options": 3}, "options must be names with values, got 3"),
+        ({"colour": "red"}, "unknown setting 'colour'; known: algorithm, batch_size"),
     ],
 )
 def test_bad_settings_are_named(settings: dict[str, Any], message: str) -> None:

@@ -42,8 +42,8 @@ LAYERS = (
 )
 # Leaves read every layer, and these leaves.
 LEAVES: dict[str, set[str]] = {
-    "qd": set(),
-    "compat": {"qd"},
+    "compat": set(),
+    "qd": {"compat"},
     "viewers": set(),
     "cli": {"qd", "compat", "viewers"},
     "__main__": {"cli"},

@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from newton_qd.envs.state import select
 from newton_qd.extractors import Trajectories
 from newton_qd.gradients.flow import GradientOptions, passed_back
 
@@ -27,11 +28,14 @@ class Outcome:
         descriptor: (D,) descriptor of the episode.
         faulty: () whether the world was at fault before the episode ended, or
             fitness or descriptor are not finite: they mean nothing then.
+        transitions: Empty, or the fields of QDax's ``QDTransition`` by name,
+            (T, ...) each.
     """
 
     fitness: jax.Array
     descriptor: jax.Array
     faulty: jax.Array
+    transitions: dict[str, jax.Array] = dataclasses.field(default_factory=dict)
 
 
 def make_episode(
@@ -42,6 +46,7 @@ def make_episode(
     episode_length: int,
     unravel: Callable[[Any], Any] = lambda genotype: genotype,
     options: GradientOptions | None = None,
+    transitions: bool = False,
 ) -> Callable[[Any, jax.Array], Outcome]:
     """Builds the function that runs one episode.
 
@@ -58,6 +63,9 @@ def make_episode(
         unravel: Maps a genotype to the parameters, once an episode.
         options: What becomes of the gradient on its way back; ``None``: no care is
             taken of its memory, and it is exact.
+        transitions: Whether to return the steps, for algorithms that learn from
+            them. An episode that ends early is followed by another one then, which
+            counts for nothing else.
 
     Returns:
         Function of the genotype and the key of the reset. Under ``jax.vmap`` the
@@ -67,7 +75,7 @@ def make_episode(
 
     def run(genotype: Any, key: jax.Array) -> Outcome:
         parameters = unravel(genotype)
-        state = env.reset(key)
+        first = state = env.reset(key)
         dtype = state.reward.dtype
         rows: dict[str, Any] = {}
         if not kept.exact:
@@ -77,26 +85,30 @@ def make_episode(
 
         def advance(carry: tuple, row: dict[str, jax.Array]) -> tuple[tuple, tuple]:
             state, fitness, over, bad = carry
-            reading = state.info["state_descriptor"]
+            begin = state
             if "factor" in row:
                 state = passed_back(state, row["factor"], kept.clip)
             action = row["action"] if policy is None else policy(parameters, state.obs)
             state = env.step(state, action)
+            steps = _transition(begin, action, state) if transitions else {}
             # The sum runs in time order here, not in a reduction over time, so
             # that a row's return does not depend on the size of the batch.
             fitness = jnp.where(over, fitness, fitness + state.reward)
             bad = bad | (~over & _at_fault(state))
-            return (state, fitness, over | (state.done > 0), bad), (reading, over)
+            reading, ended = begin.info["state_descriptor"], state.done > 0
+            if transitions:
+                state = select(ended, first, state)
+            return (state, fitness, over | ended, bad), (reading, over, steps)
 
         no = jnp.zeros((), bool)
         start = (state, jnp.zeros((), dtype), no, no)
-        (_, fitness, _, bad), (readings, over) = _scan(
+        (_, fitness, _, bad), (readings, over, steps) = _scan(
             advance, start, rows, episode_length, kept.checkpoint_every
         )
         data = Trajectories(state_desc=readings[None])
         descriptor = descriptor_extractor(data, over[None].astype(readings.dtype))[0]
         bad = bad | ~jnp.isfinite(fitness) | ~jnp.all(jnp.isfinite(descriptor))
-        return Outcome(fitness, descriptor, bad)
+        return Outcome(fitness, descriptor, bad, steps)
 
     return run
 
@@ -131,6 +143,20 @@ def _scan(
     kept = jax.checkpoint(functools.partial(segment, length=steps - cut))
     carry, last = kept(carry, tail)
     return carry, jax.tree.map(lambda *x: jnp.concatenate(x), readings, last)
+
+
+def _transition(begin: Any, action: jax.Array, end: Any) -> dict[str, jax.Array]:
+    """The fields of QDax's ``QDTransition`` for one step."""
+    return {
+        "obs": begin.obs,
+        "next_obs": end.obs,
+        "rewards": end.reward,
+        "dones": end.done,
+        "truncations": end.info["truncation"],
+        "actions": action,
+        "state_desc": begin.info["state_descriptor"],
+        "next_state_desc": end.info["state_descriptor"],
+    }
 
 
 def _at_fault(state: Any) -> jax.Array:

@@ -33,6 +33,7 @@ class Checkpoint:
         descriptors: (cells, D) descriptors, zero in empty cells.
         centroids: (cells, D) centres of the cells.
         metrics: (iteration + 1, columns) rows of ``metrics.csv``.
+        emitter: What the algorithm has learned: the leaves of its emitter's state.
     """
 
     settings: str
@@ -42,6 +43,7 @@ class Checkpoint:
     descriptors: np.ndarray
     centroids: np.ndarray
     metrics: np.ndarray
+    emitter: tuple[np.ndarray, ...] = ()
 
 
 def temporary_name(path: Path) -> Path:
@@ -77,8 +79,10 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     fields = {
         field.name: np.asarray(getattr(checkpoint, field.name))
         for field in dataclasses.fields(checkpoint)
+        if field.name != "emitter"
     }
-    payload = npz_bytes(**fields)
+    leaves = {f"emitter_{i}": leaf for i, leaf in enumerate(checkpoint.emitter)}
+    payload = npz_bytes(**fields, **leaves)
     digest = hashlib.sha256(payload).hexdigest().encode()
     write_atomically(path, _MAGIC + digest + b"\n" + payload)
 
@@ -105,8 +109,12 @@ def load_checkpoint(path: Path) -> Checkpoint:
         )
     with np.load(io.BytesIO(payload), allow_pickle=False) as arrays:
         fields = {
-            field.name: arrays[field.name] for field in dataclasses.fields(Checkpoint)
+            field.name: arrays[field.name]
+            for field in dataclasses.fields(Checkpoint)
+            if field.name != "emitter"
         }
+        count = sum(name.startswith("emitter_") for name in arrays.files)
+        leaves = tuple(arrays[f"emitter_{i}"] for i in range(count))
     fields["settings"] = str(fields["settings"])
     fields["iteration"] = int(fields["iteration"])
-    return Checkpoint(**fields)
+    return Checkpoint(**fields, emitter=leaves)

@@ -7,6 +7,7 @@ import importlib.metadata
 import json
 import math
 import platform
+import tomllib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -51,6 +52,11 @@ class EvolveConfig:
             units of policy weights [-].
         line_sigma: Standard deviation of the step towards the second parent,
             relative to the distance of the parents [-].
+        reevaluations: Evaluations of each elite at the end of the run, for corrected
+            metrics; 0 leaves them out.
+        algorithm: Name of a row of ``ALGORITHMS``.
+        options: Settings that this algorithm alone has, as ``(name, value)`` in the
+            order of their names; may be given as a dictionary.
     """
 
     env_name: str = "ant_uni"
@@ -63,6 +69,9 @@ class EvolveConfig:
     centroids: int | None = None
     iso_sigma: float = 0.02
     line_sigma: float = 0.2
+    reevaluations: int = 32
+    algorithm: str = "me"
+    options: tuple[tuple[str, Any], ...] = ()
 
     def __post_init__(self) -> None:
         """Normalizes sequences to tuples and checks every value."""
@@ -70,14 +79,18 @@ class EvolveConfig:
             value = getattr(self, name)
             if isinstance(value, list):
                 object.__setattr__(self, name, tuple(value))
+        object.__setattr__(self, "options", _pairs(self.options))
         self._check()
 
     def _check(self) -> None:
         if not isinstance(self.env_name, str) or not self.env_name:
             raise ConfigError(f"env_name must be a name, got {self.env_name!r}")
+        if not isinstance(self.algorithm, str) or not self.algorithm:
+            raise ConfigError(f"algorithm must be a name, got {self.algorithm!r}")
         _check_integer("seed", self.seed, 0, 2**32 - 1)
         _check_integer("iterations", self.iterations, 0)
         _check_integer("batch_size", self.batch_size, 1)
+        _check_integer("reevaluations", self.reevaluations, 0)
         _check_integer("episode_length", self.episode_length, 1)
         _check_integers("hidden", self.hidden, 1)
         for name in ("iso_sigma", "line_sigma"):
@@ -144,6 +157,21 @@ class EvolveConfig:
         return [row for row in pairs if row[1] != row[2]]
 
 
+def _pairs(options: Any) -> tuple[tuple[str, Any], ...]:
+    """Brings options into the order of their names; lists become tuples."""
+    items = options.items() if isinstance(options, dict) else options
+    try:
+        pairs = {
+            str(name): tuple(value) if isinstance(value, list) else value
+            for name, value in items
+        }
+    except (TypeError, ValueError) as error:
+        raise ConfigError(
+            f"options must be names with values, got {options!r}"
+        ) from error
+    return tuple(sorted(pairs.items()))
+
+
 def _check_integer(name: str, value: Any, low: int, high: int | None = None) -> None:
     bad_type = not isinstance(value, int) or isinstance(value, bool)
     if bad_type or value < low or (high is not None and value > high):
@@ -194,10 +222,11 @@ def settings_text(config: EvolveConfig) -> str:
 
 
 def read_config(path: Path) -> tuple[EvolveConfig, dict[str, Any]]:
-    """Reads a ``config.json``.
+    """Reads a ``config.json``, or settings that were written by hand as TOML.
 
     Args:
-        path: File to read.
+        path: File to read. One that ends in ``.toml`` holds the names of settings
+            with their values, and those of ``options`` in a table of that name.
 
     Returns:
         Settings and the facts of the machine that wrote them (maybe empty).
@@ -206,12 +235,16 @@ def read_config(path: Path) -> tuple[EvolveConfig, dict[str, Any]]:
         ConfigError: The file is missing, is not such a file, or holds a bad
             setting.
     """
+    written_by_hand = path.suffix == ".toml"
+    kind, parse = ("TOML", tomllib.loads) if written_by_hand else ("JSON", json.loads)
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
+        document = parse(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigError(f"cannot read {path}: {error.strerror}") from error
     except ValueError as error:
-        raise ConfigError(f"{path} is not valid JSON: {error}") from error
+        raise ConfigError(f"{path} is not valid {kind}: {error}") from error
+    if written_by_hand:
+        document = {"format": FORMAT, "settings": document}
     if not isinstance(document, dict) or "settings" not in document:
         raise ConfigError(f"{path} is not a newton-qd config: no 'settings'")
     if document.get("format") != FORMAT:

@@ -14,6 +14,7 @@ import numpy as np
 from newton_qd.physics import interrupts
 from newton_qd.qd.checkpoint import Checkpoint
 from newton_qd.qd.config import EvolveConfig, environment_facts
+from newton_qd.qd.corrected import Corrected
 from newton_qd.qd.extras import require_extra
 from newton_qd.qd.folder import COLUMNS, Archive, RunFolder
 from newton_qd.qd.interrupt import StopFlag, graceful_stop
@@ -37,6 +38,7 @@ class EvolveResult:
         interrupted: Whether a signal ended the run before its last generation.
         out: Results folder, if there is one.
         seconds: Time that this call took [s].
+        corrected: Metrics from evaluating the elites again, of a finished run.
     """
 
     config: EvolveConfig
@@ -46,6 +48,7 @@ class EvolveResult:
     interrupted: bool
     out: Path | None
     seconds: float
+    corrected: Corrected | None = None
 
 
 def evolve(
@@ -104,9 +107,16 @@ def evolve(
         state = _loop(search, state, config.iterations, display, stop, save)
         save.now(state)
         result = _result(config, search.checkpoint(state), folder, begin)
+        if not result.interrupted:
+            display.note("evaluating the elites again, for corrected metrics")
+            corrected = search.correct(result.archive, lambda: stop.requested)
+            seconds = time.monotonic() - begin
+            result = dataclasses.replace(result, corrected=corrected, seconds=seconds)
         if folder is not None and state.iteration >= 0:
             picture = archive_png(result.archive, config, task, state.iteration)
             folder.save_archive(result.archive, picture)
+        if folder is not None and result.corrected is not None:
+            folder.save_corrected(dataclasses.asdict(result.corrected))
         return result
 
 

@@ -1,13 +1,15 @@
 """The results folder of a run: what is in it, and who may write to it.
 
 ``config.json`` (settings), ``checkpoint.bin`` (state to resume from),
-``metrics.csv`` (one row per generation), ``archive.npz`` and ``archive.png``.
+``metrics.csv`` (one row per generation), ``archive.npz``, ``archive.png`` and
+``corrected.json`` (metrics of the finished run, from evaluating its elites again).
 """
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+import json
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -38,7 +40,8 @@ CHECKPOINT = "checkpoint.bin"
 METRICS = "metrics.csv"
 ARCHIVE = "archive.npz"
 PICTURE = "archive.png"
-_FILES = (CONFIG, CHECKPOINT, METRICS, ARCHIVE, PICTURE)
+CORRECTED = "corrected.json"
+_FILES = (CONFIG, CHECKPOINT, METRICS, ARCHIVE, PICTURE, CORRECTED)
 
 COLUMNS = (
     "iteration",
@@ -221,6 +224,11 @@ class RunFolder:
         arrays = {f.name: getattr(archive, f.name) for f in dataclasses.fields(archive)}
         write_atomically(self.path / ARCHIVE, npz_bytes(**arrays))
         write_atomically(self.path / PICTURE, picture)
+
+    def save_corrected(self, corrected: dict[str, Any]) -> None:
+        """Writes the corrected metrics."""
+        text = json.dumps(corrected, indent=2) + "\n"
+        write_atomically(self.path / CORRECTED, text.encode())
 
 
 def metrics_to_csv(metrics: np.ndarray) -> str:

@@ -11,12 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from newton_qd.extractors import Trajectories
 from newton_qd.gradients.episode import make_episode
 from newton_qd.qd.extras import require_extra
 from newton_qd.qd.task import Task
-
-__all__ = ["Policy", "Trajectories", "make_policy", "make_scoring_function"]
 
 ScoringFunction = Callable[
     [jax.Array, jax.Array], tuple[jax.Array, jax.Array, dict[str, Any]]
@@ -33,12 +30,16 @@ class Policy:
         unravel: Maps weights (size,) to the parameters that ``apply`` takes.
         apply: Maps parameters and an observation (O,) to an action (A,) inside
             [-1, 1].
+        ravel: Maps parameters to weights (size,); undoes ``unravel``.
+        network: The Flax module that ``apply`` calls.
     """
 
     size: int
     init: Callable[[jax.Array], jax.Array]
     unravel: Callable[[jax.Array], Any]
     apply: Callable[[Any, jax.Array], jax.Array]
+    ravel: Callable[[Any], jax.Array]
+    network: Any
 
 
 def make_policy(env: Any, hidden: tuple[int, ...]) -> Policy:
@@ -70,11 +71,18 @@ def make_policy(env: Any, hidden: tuple[int, ...]) -> Policy:
     def apply(parameters: Any, observation: jax.Array) -> jax.Array:
         return jnp.asarray(network.apply(parameters, observation))
 
-    return Policy(size=flat.size, init=init, unravel=unravel, apply=apply)
+    return Policy(
+        size=flat.size,
+        init=init,
+        unravel=unravel,
+        apply=apply,
+        ravel=lambda parameters: ravel_pytree(parameters)[0],
+        network=network,
+    )
 
 
 def make_scoring_function(
-    task: Task, policy: Policy, episode_length: int
+    task: Task, policy: Policy, episode_length: int, *, transitions: bool = False
 ) -> ScoringFunction:
     """Builds the function that evaluates a batch of individuals.
 
@@ -85,12 +93,16 @@ def make_scoring_function(
         task: Environment and descriptor.
         policy: Policy whose weights are the genotypes.
         episode_length: Control steps of an evaluation.
+        transitions: Whether to return the steps, for algorithms that learn from
+            them. An individual whose episode ends early begins another one then,
+            which counts for nothing else.
 
     Returns:
         Function of genotypes (N, size) and a key for the reset; returns fitnesses
-        (N,), descriptors (N, D) and an empty dict. An individual whose world was
-        faulty or whose result is not finite has fitness ``-inf``: archives do not
-        take it.
+        (N,), descriptors (N, D) and a dict, which is empty or holds ``transitions``:
+        the fields of QDax's ``QDTransition`` by name, (N, T, ...) each. An individual
+        whose world was faulty or whose result is not finite has fitness ``-inf``:
+        archives do not take it.
     """
     episode = make_episode(
         task.env,
@@ -98,6 +110,7 @@ def make_scoring_function(
         task.descriptor_extractor,
         episode_length=episode_length,
         unravel=policy.unravel,
+        transitions=transitions,
     )
 
     def score(
@@ -105,6 +118,7 @@ def make_scoring_function(
     ) -> tuple[jax.Array, jax.Array, dict[str, Any]]:
         outcome = jax.vmap(episode, in_axes=(0, None))(genotypes, key)
         fitness = jnp.where(outcome.faulty, -jnp.inf, outcome.fitness)
-        return fitness, outcome.descriptor, {}
+        extra = {"transitions": outcome.transitions} if transitions else {}
+        return fitness, outcome.descriptor, extra
 
     return score

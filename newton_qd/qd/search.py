@@ -1,18 +1,21 @@
-"""MAP-Elites as a pure step from generation to generation, built from QDax."""
+"""Algorithms as a pure step from generation to generation, built from QDax."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from newton_qd.qd.checkpoint import Checkpoint
+from newton_qd.qd.algorithms import ALGORITHMS, Parts
+from newton_qd.qd.checkpoint import Checkpoint, CheckpointError
 from newton_qd.qd.config import ConfigError, EvolveConfig, settings_text
+from newton_qd.qd.corrected import Corrected, correct
 from newton_qd.qd.extras import require_extra
-from newton_qd.qd.folder import COLUMNS
+from newton_qd.qd.folder import COLUMNS, Archive
 from newton_qd.qd.rollout import make_policy, make_scoring_function
 from newton_qd.qd.task import Task
 
@@ -32,15 +35,17 @@ class SearchState:
         iteration: Generations that are finished; -1 before the initial population.
         repertoire: QDax's ``MapElitesRepertoire`` with flat genotypes.
         metrics: (iteration + 1, columns) one row per generation.
+        emitter: State of QDax's emitter; ``None`` before the initial population.
     """
 
     iteration: int
     repertoire: Any
     metrics: np.ndarray
+    emitter: Any = None
 
 
 class Search:
-    """MAP-Elites with iso+line variation on one task.
+    """One algorithm of the family of MAP-Elites on one task.
 
     Generation ``i`` draws its random numbers from a key folded with ``i``; the state
     after it depends on the settings only.
@@ -55,30 +60,43 @@ class Search:
 
         Raises:
             MissingExtra: QDax is not installed.
+            ConfigError: The algorithm or one of its options does not exist.
         """
         require_extra("qdax", "qd")
+        if config.algorithm not in ALGORITHMS:
+            raise ConfigError(
+                f"algorithm: {config.algorithm!r} does not exist; allowed: "
+                f"{', '.join(ALGORITHMS)}"
+            )
+        self._algorithm = ALGORITHMS[config.algorithm]
         self._config = config
         self._task = task
         keys = jax.random.split(jax.random.key(config.seed), 4)
         self._key_centroids, self._key_reset = keys[0], keys[1]
         self._key_initial, self._key_generations = keys[2], keys[3]
+        self._key_corrected = jax.random.fold_in(self._key_reset, 1)
+        self._key_emitter = jax.random.fold_in(self._key_generations, 0)
         self._policy = make_policy(task.env, config.hidden)
-        score = make_scoring_function(task, self._policy, config.episode_length)
-        algorithm = _make_algorithm(config, task)
-
-        def ask(repertoire: Any, key: jax.Array) -> jax.Array:
-            genotypes, _ = algorithm.ask(repertoire, None, key)
-            # Under x64 QDax draws its noise in double precision.
-            return genotypes.astype(jnp.float32)
-
-        def tell(repertoire: Any, genotypes: Any, fitnesses: Any, found: Any) -> Any:
-            fitnesses = _break_ties(fitnesses, found, repertoire.centroids)
-            told = algorithm.tell(genotypes, fitnesses, found, repertoire, None)
-            return told[0], told[2]
-
+        self._centroids = self._make_centroids()
+        score = make_scoring_function(
+            task,
+            self._policy,
+            config.episode_length,
+            transitions=self._algorithm.transitions,
+        )
+        self._emitter = self._algorithm.make(
+            Parts(
+                config,
+                task,
+                self._policy,
+                lambda genotypes, _: score(genotypes, self._key_reset),
+                self._centroids,
+            )
+        )
         self._score = jax.jit(score)
-        self._ask = jax.jit(ask)
-        self._tell = jax.jit(tell)
+        self._ask = jax.jit(self._proposed)
+        self._begin = jax.jit(self._begun)
+        self._tell = jax.jit(self._told)
         self._population = jax.jit(jax.vmap(self._policy.init))
 
     def empty(self) -> SearchState:
@@ -87,7 +105,7 @@ class Search:
 
         repertoire = MapElitesRepertoire.init_default(
             genotype=jnp.zeros((self._policy.size,), jnp.float32),
-            centroids=jnp.asarray(self._centroids(), jnp.float32),
+            centroids=self._centroids,
         )
         rows = np.zeros((0, len(COLUMNS)))
         return SearchState(iteration=-1, repertoire=repertoire, metrics=rows)
@@ -102,12 +120,19 @@ class Search:
         if iteration == 0:
             keys = jax.random.split(self._key_initial, self._config.batch_size)
             genotypes = self._population(keys)
+            scores = self._score(genotypes, self._key_reset)
+            repertoire, emitter, metrics = self._begin(
+                state.repertoire, genotypes, scores
+            )
         else:
             key = jax.random.fold_in(self._key_generations, iteration)
-            genotypes = self._ask(state.repertoire, key)
-        fitnesses, found, _ = self._score(genotypes, self._key_reset)
-        repertoire, metrics = self._tell(state.repertoire, genotypes, fitnesses, found)
-        evaluations = (iteration + 1) * self._config.batch_size
+            genotypes, remembered = self._ask(state.repertoire, state.emitter, key)
+            scores = self._score(genotypes, self._key_reset)
+            repertoire, emitter, metrics = self._tell(
+                state.repertoire, state.emitter, genotypes, remembered, scores
+            )
+        each = self._algorithm.evaluations(self._config)
+        evaluations = self._config.batch_size + iteration * each
         row = {
             "iteration": iteration,
             "evaluations": evaluations,
@@ -120,7 +145,7 @@ class Search:
                 "descriptor: the environment is faulty for every one of them"
             )
         rows = np.vstack([state.metrics, [row[name] for name in COLUMNS]])
-        return SearchState(iteration, repertoire, rows)
+        return SearchState(iteration, repertoire, rows, emitter)
 
     def checkpoint(self, state: SearchState) -> Checkpoint:
         """Copies a state to the host."""
@@ -133,6 +158,25 @@ class Search:
             descriptors=np.asarray(repertoire.descriptors),
             centroids=np.asarray(repertoire.centroids),
             metrics=state.metrics,
+            emitter=tuple(_leaf_to_host(x) for x in jax.tree.leaves(state.emitter)),
+        )
+
+    def correct(
+        self, archive: Archive, stop: Callable[[], bool] = lambda: False
+    ) -> Corrected | None:
+        """Evaluates the elites of an archive again; ``None`` where none are asked."""
+        if not self._config.reevaluations:
+            return None
+        score = make_scoring_function(
+            self._task, self._policy, self._config.episode_length
+        )
+        return correct(
+            archive,
+            score,
+            self._key_corrected,
+            reevaluations=self._config.reevaluations,
+            offset=self._task.reward_offset * self._config.episode_length,
+            stop=stop,
         )
 
     def restore(self, checkpoint: Checkpoint) -> SearchState:
@@ -147,9 +191,88 @@ class Search:
             descriptors=jnp.asarray(checkpoint.descriptors),
             centroids=jnp.asarray(checkpoint.centroids),
         )
-        return SearchState(checkpoint.iteration, repertoire, checkpoint.metrics)
+        return SearchState(
+            checkpoint.iteration,
+            repertoire,
+            checkpoint.metrics,
+            self._restore_emitter(checkpoint.emitter),
+        )
 
-    def _centroids(self) -> np.ndarray:
+    def _restore_emitter(self, leaves: tuple[np.ndarray, ...]) -> Any:
+        """Puts the leaves of a checkpoint where they belong."""
+        shape = (self._config.batch_size, self._policy.size)
+        genotypes = jax.ShapeDtypeStruct(shape, jnp.float32)
+        scores = jax.eval_shape(self._score, genotypes, self._key_reset)
+        repertoire = self.empty().repertoire
+        example = jax.eval_shape(self._begin, repertoire, genotypes, scores)[1]
+        expected, structure = jax.tree.flatten(example)
+        if len(leaves) != len(expected):
+            raise CheckpointError(
+                f"the checkpoint holds {len(leaves)} arrays of the algorithm "
+                f"{self._config.algorithm!r}; this version of it has {len(expected)}"
+            )
+        return jax.tree.unflatten(
+            structure,
+            [
+                _leaf_to_device(x, like)
+                for x, like in zip(leaves, expected, strict=True)
+            ],
+        )
+
+    def _proposed(self, repertoire: Any, emitter: Any, key: jax.Array) -> Any:
+        """Next genotypes (N, size), and what the emitter wants told with them."""
+        _, key = jax.random.split(key)
+        genotypes, remembered = self._emitter.emit(repertoire, emitter, key)
+        # Under x64 QDax draws its noise in double precision.
+        return genotypes.astype(jnp.float32), remembered
+
+    def _begun(self, repertoire: Any, genotypes: Any, scores: Any) -> Any:
+        """Archive, emitter's state and metrics after the initial population."""
+        repertoire, told = self._added(repertoire, genotypes, scores)
+        emitter = self._emitter.init(key=self._key_emitter, **told)
+        return repertoire, emitter, self._measured(repertoire)
+
+    def _told(
+        self,
+        repertoire: Any,
+        emitter: Any,
+        genotypes: Any,
+        remembered: dict[str, Any],
+        scores: Any,
+    ) -> Any:
+        """Archive, emitter's state and metrics after another generation."""
+        repertoire, told = self._added(repertoire, genotypes, scores)
+        told["extra_scores"] = {**told["extra_scores"], **remembered}
+        emitter = self._emitter.state_update(emitter, **told)
+        return repertoire, emitter, self._measured(repertoire)
+
+    def _added(self, repertoire: Any, genotypes: Any, scores: Any) -> tuple[Any, dict]:
+        """The archive with a generation in it, and what the emitter hears of that."""
+        fitnesses, found, extra = scores
+        kept = _break_ties(fitnesses, found, repertoire.centroids)
+        repertoire = repertoire.add(genotypes, found, kept, {})
+        # Emitters take no infinite fitness: a faulty individual has the worst one.
+        worst = -self._task.reward_offset * self._config.episode_length
+        return repertoire, {
+            "repertoire": repertoire,
+            "genotypes": genotypes,
+            "fitnesses": jnp.where(jnp.isfinite(fitnesses), fitnesses, worst),
+            "descriptors": found,
+            "extra_scores": extra,
+        }
+
+    def _measured(self, repertoire: Any) -> Any:
+        """QD score, coverage [%] and best fitness."""
+        from qdax.utils.metrics import default_qd_metrics
+
+        offset = self._task.reward_offset * self._config.episode_length
+        return default_qd_metrics(repertoire, qd_offset=offset)
+
+    def _make_centroids(self) -> jax.Array:
+        """(cells, D) centres of the cells."""
+        return jnp.asarray(self._tessellation(), jnp.float32)
+
+    def _tessellation(self) -> np.ndarray:
         """(cells, D) centres of the cells."""
         from qdax.core.containers import mapelites_repertoire as qdax_containers
 
@@ -187,34 +310,18 @@ class Search:
         return np.asarray(centroids)
 
 
-def _make_algorithm(config: EvolveConfig, task: Task) -> Any:
-    """QDax's MAP-Elites; asked and told, so the evaluation stays outside."""
-    from functools import partial
+def _leaf_to_host(leaf: Any) -> np.ndarray:
+    """Copies a leaf; a key becomes its numbers."""
+    if jnp.issubdtype(jnp.asarray(leaf).dtype, jax.dtypes.prng_key):
+        leaf = jax.random.key_data(leaf)
+    return np.asarray(leaf)
 
-    from qdax.core.emitters.mutation_operators import isoline_variation
-    from qdax.core.emitters.standard_emitters import MixingEmitter
-    from qdax.core.map_elites import MAPElites
-    from qdax.utils.metrics import default_qd_metrics
 
-    def no_mutation(genotypes: Any, key: jax.Array) -> Any:
-        del key
-        return genotypes
-
-    variation: Any = partial(
-        isoline_variation, iso_sigma=config.iso_sigma, line_sigma=config.line_sigma
-    )
-    emitter = MixingEmitter(
-        mutation_fn=no_mutation,
-        variation_fn=variation,
-        variation_percentage=1.0,
-        batch_size=config.batch_size,
-    )
-    offset = task.reward_offset * config.episode_length
-    return MAPElites(
-        scoring_function=None,
-        emitter=emitter,
-        metrics_function=partial(default_qd_metrics, qd_offset=offset),
-    )
+def _leaf_to_device(leaf: np.ndarray, like: Any) -> jax.Array:
+    """Undoes ``_leaf_to_host``."""
+    if jnp.issubdtype(like.dtype, jax.dtypes.prng_key):
+        return jax.random.wrap_key_data(jnp.asarray(leaf))
+    return jnp.asarray(leaf, like.dtype)
 
 
 def _break_ties(

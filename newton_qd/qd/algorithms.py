@@ -1,0 +1,249 @@
+"""The algorithms of ``evolve``: what each of them proposes next.
+
+Each is an emitter of QDax. Genotypes are weight vectors (size,) throughout; emitters
+that need the parameters of a network see them through ``_OfParameters``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+
+from newton_qd import compat
+from newton_qd.qd.config import ConfigError, EvolveConfig
+from newton_qd.qd.rollout import Policy, ScoringFunction
+from newton_qd.qd.task import Task
+
+
+@dataclasses.dataclass(frozen=True)
+class Parts:
+    """What an emitter may be made of.
+
+    Attributes:
+        config: Settings.
+        task: Environment and descriptor.
+        policy: Policy whose weights are the genotypes.
+        score: Scoring function of genotypes (N, size) and a key that is not used:
+            all evaluations of a run begin in one state.
+        centroids: (cells, D) centres of the cells.
+    """
+
+    config: EvolveConfig
+    task: Task
+    policy: Policy
+    score: ScoringFunction
+    centroids: jax.Array
+
+
+def _batch_size(config: EvolveConfig) -> int:
+    return config.batch_size
+
+
+@dataclasses.dataclass(frozen=True)
+class Algorithm:
+    """One row of ``ALGORITHMS``.
+
+    Attributes:
+        make: Makes the emitter; raises ``ConfigError`` for options that it does not
+            have.
+        transitions: Whether its emitter learns from the steps of the episodes.
+        evaluations: Episodes of one generation, given the settings.
+    """
+
+    make: Callable[[Parts], Any]
+    transitions: bool = False
+    evaluations: Callable[[EvolveConfig], int] = _batch_size
+
+
+class _OfParameters:
+    """An emitter of network parameters as one of weight vectors.
+
+    Args:
+        emitter: Emitter of QDax.
+        policy: Says how weights and parameters belong together.
+        convert: Makes QDax's transitions from the dictionary of the scores.
+    """
+
+    def __init__(
+        self, emitter: Any, policy: Policy, convert: Callable[[Any], Any]
+    ) -> None:
+        self._emitter = emitter
+        self._policy = policy
+        self._convert = convert
+
+    def init(self, key: jax.Array, **told: Any) -> Any:
+        """Returns the state before the second generation."""
+        return self._emitter.init(key=key, **self._told(told))
+
+    def emit(self, repertoire: Any, state: Any, key: jax.Array) -> Any:
+        """Returns weights (N, size) and what the emitter remembers of them."""
+        parameters, remembered = self._emitter.emit(self._seen(repertoire), state, key)
+        return jax.vmap(self._policy.ravel)(parameters), remembered
+
+    def state_update(self, emitter_state: Any, **told: Any) -> Any:
+        """Learns from a generation."""
+        return self._emitter.state_update(emitter_state, **self._told(told))
+
+    def _seen(self, repertoire: Any) -> Any:
+        return repertoire.replace(genotypes=self._unravel(repertoire.genotypes))
+
+    def _unravel(self, genotypes: jax.Array) -> Any:
+        return jax.vmap(self._policy.unravel)(genotypes)
+
+    def _told(self, told: dict[str, Any]) -> dict[str, Any]:
+        extra = told["extra_scores"]
+        return {
+            **told,
+            "repertoire": self._seen(told["repertoire"]),
+            "genotypes": self._unravel(told["genotypes"]),
+            "extra_scores": {
+                **extra,
+                "transitions": self._convert(extra["transitions"]),
+            },
+        }
+
+
+def _settings(kind: Any, config: EvolveConfig, **defaults: Any) -> Any:
+    """Fills QDax's settings of an emitter with the options of a run."""
+    allowed = {field.name for field in dataclasses.fields(kind)}
+    for name, value in config.options:
+        if name not in allowed:
+            raise ConfigError(
+                f"options: {config.algorithm!r} has no {name!r}; allowed: "
+                f"{', '.join(sorted(allowed)) or 'none'}"
+            )
+        defaults[name] = value
+    return kind(**defaults)
+
+
+def _no_mutation(genotypes: Any, key: jax.Array) -> Any:
+    del key
+    return genotypes
+
+
+def _variation(config: EvolveConfig) -> Any:
+    from qdax.core.emitters.mutation_operators import isoline_variation
+
+    return functools.partial(
+        isoline_variation, iso_sigma=config.iso_sigma, line_sigma=config.line_sigma
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class _NoOptions:
+    """Settings of an algorithm that has no others than those of a run."""
+
+
+def _me(parts: Parts) -> Any:
+    """MAP-Elites with iso+line variation (Vassiliades and Mouret 2018)."""
+    from qdax.core.emitters.standard_emitters import MixingEmitter
+
+    _settings(_NoOptions, parts.config)
+    return MixingEmitter(
+        mutation_fn=_no_mutation,
+        variation_fn=_variation(parts.config),
+        variation_percentage=1.0,
+        batch_size=parts.config.batch_size,
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class CMAMEOptions:
+    """Options of CMA-ME (Fontaine et al. 2020).
+
+    Attributes:
+        emitters: Number of emitters that take turns.
+        sigma_g: Initial step size, in units of policy weights [-].
+    """
+
+    emitters: int = 4
+    sigma_g: float = 0.5
+
+
+def _cma_me(parts: Parts) -> Any:
+    """CMA-ME with improvement emitters; its memory grows with size squared."""
+    from qdax.core.emitters.cma_improvement_emitter import CMAImprovementEmitter
+    from qdax.core.emitters.cma_pool_emitter import CMAPoolEmitter
+
+    options = _settings(CMAMEOptions, parts.config)
+    emitter = CMAImprovementEmitter(
+        batch_size=parts.config.batch_size,
+        genotype_dim=parts.policy.size,
+        centroids=parts.centroids,
+        sigma_g=options.sigma_g,
+        min_count=1,
+    )
+    return CMAPoolEmitter(num_states=options.emitters, emitter=emitter)
+
+
+_REPLAY_BUFFER = 100_000
+"""Transitions that are kept; a million, as QDax has it, would be in checkpoints."""
+
+
+def _pga_me(parts: Parts) -> Any:
+    """PGA-ME: half of the variations follow a critic (Nilsson and Cully 2021)."""
+    compat.install()  # QDax's file imports environments that JAX of today refuses
+    from qdax.core.emitters.pga_me_emitter import PGAMEConfig, PGAMEEmitter
+    from qdax.core.neuroevolution.buffers.buffer import QDTransition
+
+    options = _settings(
+        PGAMEConfig,
+        parts.config,
+        env_batch_size=parts.config.batch_size,
+        replay_buffer_size=_REPLAY_BUFFER,
+    )
+    emitter = PGAMEEmitter(
+        options, parts.policy.network, parts.task.env, _variation(parts.config)
+    )
+    return _OfParameters(emitter, parts.policy, lambda steps: QDTransition(**steps))
+
+
+class _FromOne:
+    """ME-ES, which grows from one individual, in a population of any size."""
+
+    def __init__(self, emitter: Any) -> None:
+        self.emit = emitter.emit
+        self.state_update = emitter.state_update
+        self._emitter = emitter
+
+    def init(self, key: jax.Array, genotypes: Any, **told: Any) -> Any:
+        """Returns the state before the second generation."""
+        first = jax.tree.map(lambda leaf: leaf[:1], genotypes)
+        return self._emitter.init(key=key, genotypes=first, **told)
+
+
+def _me_es(parts: Parts) -> Any:
+    """ME-ES: evolution strategies from elites (Colas et al. 2020)."""
+    from qdax.core.emitters.mees_emitter import MEESConfig, MEESEmitter
+
+    samples = parts.config.batch_size
+    options = _settings(MEESConfig, parts.config, sample_number=samples)
+    if options.sample_number != samples:
+        raise ConfigError(
+            f"options: sample_number is batch_size ({samples}), not "
+            f"{options.sample_number}"
+        )
+    emitter = MEESEmitter(
+        options,
+        # The archive of its novelty holds one descriptor for each generation.
+        total_generations=max(
+            parts.config.iterations + 1, options.novelty_nearest_neighbors
+        ),
+        scoring_fn=parts.score,
+        num_descriptors=parts.task.descriptor_length,
+    )
+    return _FromOne(emitter)
+
+
+ALGORITHMS: Mapping[str, Algorithm] = {
+    "me": Algorithm(_me),
+    "cma-me": Algorithm(_cma_me),
+    "pga-me": Algorithm(_pga_me, transitions=True),
+    # The samples of a gradient, and the individual that they lead to.
+    "me-es": Algorithm(_me_es, evaluations=lambda config: config.batch_size + 1),
+}
+"""The algorithms of ``evolve`` by their names."""

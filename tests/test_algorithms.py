@@ -1,0 +1,144 @@
+"""The algorithms of ``evolve``: what they find, and that a stop changes nothing."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from test_evolve import SMALL, interrupt_after, point_task, run
+
+import newton_qd.compat
+from newton_qd import cli
+from newton_qd.qd.algorithms import ALGORITHMS
+from newton_qd.qd.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
+from newton_qd.qd.config import ConfigError, EvolveConfig, read_config
+from newton_qd.qd.evolve import evolve
+
+# QDax and what it imports warn about their own use of other packages.
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
+
+CRITIC = {
+    "critic_hidden_layer_size": (8,),
+    "num_critic_training_steps": 2,
+    "num_pg_training_steps": 2,
+    "batch_size": 16,
+    "replay_buffer_size": 1024,
+}
+OPTIONS: dict[str, dict[str, Any]] = {
+    "me": {},
+    "cma-me": {"emitters": 2},
+    "pga-me": CRITIC,
+    "me-es": {"num_optimizer_steps": 2, "sample_sigma": 0.1, "learning_rate": 0.1},
+}
+
+
+def test_every_algorithm_is_tested() -> None:
+    assert set(OPTIONS) == set(ALGORITHMS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", OPTIONS)
+def test_a_stop_changes_nothing(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = EvolveConfig(
+        env_name="pointmaze",
+        iterations=6,
+        batch_size=16,
+        episode_length=20,
+        hidden=(4,),
+        grid=(8, 8),
+        algorithm=name,
+        reevaluations=0,
+        options=OPTIONS[name],  # pyright: ignore[reportArgumentType]
+    )
+    common: dict[str, Any] = {"progress": False, "checkpoint_seconds": 1e9}
+    try:
+        whole = evolve(config, out=tmp_path / "whole", **common)
+        with monkeypatch.context() as patch:
+            interrupt_after(patch, 3)
+            assert evolve(config, out=tmp_path / "parts", **common).interrupted
+        evolve(config, out=tmp_path / "parts", resume=True, **common)
+    finally:
+        newton_qd.compat.uninstall()
+    for file in ("checkpoint.bin", "archive.npz", "metrics.csv"):
+        left, right = (tmp_path / run / file for run in ("whole", "parts"))
+        assert left.read_bytes() == right.read_bytes(), file
+    metrics = whole.metrics
+    for column in ("qd_score", "coverage", "max_fitness"):
+        assert metrics[column][-1] > metrics[column][0], column
+    each = 17 if name == "me-es" else 16
+    np.testing.assert_array_equal(np.diff(metrics["evaluations"]), each)
+
+
+def test_what_does_not_exist_is_refused(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    with pytest.raises(
+        ConfigError, match="algorithm: 'ga' does not exist; allowed: me"
+    ):
+        run(SMALL.replace(algorithm="ga"), out=out)
+    with pytest.raises(
+        ConfigError, match="options: 'me' has no 'noise'; allowed: none"
+    ):
+        run(SMALL.replace(options={"noise": 1}), out=out)
+    cma = SMALL.replace(algorithm="cma-me", options={"sigma": 1})
+    with pytest.raises(ConfigError, match="has no 'sigma'; allowed: emitters, sigma_g"):
+        run(cma, out=out)
+    assert not out.exists()
+
+
+def test_a_checkpoint_without_the_emitter_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = SMALL.replace(algorithm="cma-me", options={"emitters": 2}, iterations=2)
+    out = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        interrupt_after(patch, 1)
+        run(config, out=out)
+    path = out / "checkpoint.bin"
+    whole = load_checkpoint(path)
+    assert whole.emitter
+    save_checkpoint(path, type(whole)(**{**vars(whole), "emitter": ()}))
+    with pytest.raises(
+        CheckpointError, match="holds 0 arrays of the algorithm 'cma-me'"
+    ):
+        run(config, out=out, resume=True)
+
+
+def test_settings_from_toml(tmp_path: Path) -> None:
+    path = tmp_path / "run.toml"
+    path.write_text(
+        'env_name = "point"\nalgorithm = "cma-me"\nbatch_size = 16\n'
+        "hidden = [4]\ngrid = [4, 4]\nepisode_length = 9\niterations = 1\n"
+        "[options]\nemitters = 2\n"
+    )
+    config, facts = read_config(path)
+    assert (
+        facts == {} and config.hidden == (4,) and config.options == (("emitters", 2),)
+    )
+    out = tmp_path / "run"
+    given = ["evolve", "--quiet", "--config", path, "--option", "sigma_g=0.25"]
+    arguments = [str(part) for part in (*given, "--out", out)]
+    assert cli.main(arguments, task_factory=point_task) == cli.OK
+    settings = json.loads((out / "config.json").read_text())["settings"]
+    assert settings["options"] == [["emitters", 2], ["sigma_g", 0.25]]
+    assert read_config(out / "config.json")[0].options == (
+        ("emitters", 2),
+        ("sigma_g", 0.25),
+    )
+    path.write_text("env_name = ")
+    with pytest.raises(ConfigError, match=r"run\.toml is not valid TOML"):
+        read_config(path)
+    path.write_text('colour = "red"')
+    with pytest.raises(ConfigError, match="unknown setting 'colour'"):
+        read_config(path)
+
+
+def test_options_that_cannot_be_parsed(capsys: pytest.CaptureFixture[str]) -> None:
+    for text in ("discount", "=3", "a=b c"):
+        with pytest.raises(SystemExit):
+            cli.main(["evolve", "ant_uni", "--option", text])
+        assert "like discount=0.95" in capsys.readouterr().err
