@@ -156,7 +156,7 @@ def test_acrobot() -> None:
 
 @pytest.mark.parametrize("name", REACHERS)
 def test_reachers(name: str) -> None:
-    before, after, actions = rolled(name)
+    _, after, actions = rolled(name)
     q, links = after.pipeline_state.q, bodies(name, after)
     frame, twist = links["body1"]
     tip = point(frame, (0.11, 0, 0))

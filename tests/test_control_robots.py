@@ -25,7 +25,7 @@ Vector = tuple[float, float, float]
 
 
 class Part(NamedTuple):
-    """A body: mass, default position, and its collider: radius, length, centre, axis."""
+    """A body: mass, default position; its capsule: radius, length, centre, axis."""
 
     mass: float
     position: Vector
