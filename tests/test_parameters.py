@@ -194,6 +194,7 @@ def test_gradient_of_a_step(x64: None, robot: Robot) -> None:
         assert felt[: WORLDS // 2].all(), name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robot", [ANT, HOPPER], ids=lambda robot: robot.name)
 def test_gradient_of_many_steps(x64: None, robot: Robot) -> None:
     system = physics.load_system(robot, "float64")
@@ -219,6 +220,7 @@ def readings(state: State) -> jax.Array:
     return jnp.concatenate([jnp.ravel(part) for part in parts])
 
 
+@pytest.mark.slow
 def test_jacobian_of_an_episode(x64: None) -> None:
     """All that a step of an environment returns, under every transformation."""
     env = task(auto_reset=False, dtype="float64")
