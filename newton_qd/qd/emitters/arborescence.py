@@ -28,7 +28,6 @@ from qdax.core.emitters.emitter import Emitter, EmitterState
 from newton_qd.qd.emitters.cma_es import CMAES, CMAESState
 from newton_qd.qd.emitters.gradients import (
     GradientsError,
-    Scores,
     ScoringFunction,
     check_genotypes,
     finite_scores,
@@ -184,27 +183,19 @@ class ArborescenceEmitter(Emitter, abc.ABC):
             points = jnp.broadcast_to(
                 jnp.asarray(self._start, dtype), (self._num_emitters, size)
             )
-        scores = self._score(points, score_key)
-        if not isinstance(scores.finite, Tracer) and not scores.finite.any():
+        state = self._state(
+            repertoire,
+            self._fresh(points, descriptors.shape[-1]),
+            (state_key, score_key, sample_key),
+            restarts=jnp.zeros((), jnp.int32),
+            rejected=jnp.zeros((), jnp.int32),
+        )
+        if not isinstance(state.finite, Tracer) and not state.finite.any():
             raise GradientsError(
                 "extra_scores['gradients'] or the scores of every first solution point "
                 "are not finite: give another start"
             )
-        strategy = self._strategy(descriptors.shape[-1])
-        cma_es = jax.vmap(lambda _: strategy.init(dtype))(points)
-        return ArborescenceState(
-            key=state_key,
-            points=points,
-            gradients=normalize(scores.gradients),
-            finite=scores.finite,
-            bars=self._bars(_add(repertoire, scores)),
-            cma_es=cma_es,
-            optimizer=jax.vmap(self._optimizer.init)(points),
-            coefficients=self._sample(strategy, cma_es, sample_key),
-            age=jnp.zeros(self._num_emitters, jnp.int32),
-            restarts=jnp.zeros((), jnp.int32),
-            rejected=jnp.sum(~scores.finite, dtype=jnp.int32),
-        )
+        return state
 
     def emit(
         self, repertoire: Any, emitter_state: Any, key: jax.Array
@@ -274,42 +265,69 @@ class ArborescenceEmitter(Emitter, abc.ABC):
 
         key, elite_key, score_key, sample_key = jax.random.split(state.key, 4)
         elites = repertoire.select(elite_key, self._num_emitters).genotypes
-        points, optimizer, cma_es, age = _where(
+        search = _where(
             restart,
-            (
-                elites,
-                jax.vmap(self._optimizer.init)(elites),
-                jax.vmap(lambda point: strategy.init(point.dtype))(elites),
-                jnp.zeros_like(age),
-            ),
-            (points, optimizer, cma_es, age),
+            self._fresh(elites, descriptors.shape[-1]),
+            (points, cma_es, optimizer, age),
         )
-        scores = self._score(points, score_key)
-        rejected = jnp.sum(~finite, dtype=jnp.int32)
-        rejected += jnp.sum(~scores.finite, dtype=jnp.int32)
-        return ArborescenceState(
-            key=key,
-            points=points,
-            gradients=normalize(scores.gradients),
-            finite=scores.finite,
-            bars=self._bars(_add(repertoire, scores)),
-            cma_es=cma_es,
-            optimizer=optimizer,
-            coefficients=self._sample(strategy, cma_es, sample_key),
-            age=age,
+        return self._state(
+            repertoire,
+            search,
+            (key, score_key, sample_key),
             restarts=state.restarts + jnp.sum(restart, dtype=jnp.int32),
-            rejected=state.rejected + rejected,
+            rejected=state.rejected + jnp.sum(~finite, dtype=jnp.int32),
         )
 
     def _strategy(self, descriptor_length: int) -> CMAES:
         return CMAES(1 + descriptor_length, self._population - 1, self._sigma_g)
 
-    def _score(self, points: jax.Array, key: jax.Array) -> Scores:
-        return read_scores(points, *self._scoring_function(points, key))
+    def _fresh(self, points: jax.Array, descriptor_length: int) -> tuple:
+        """Searches that start at some points: points, CMA-ES, optimizer and age."""
+        strategy = self._strategy(descriptor_length)
+        return (
+            points,
+            jax.vmap(lambda point: strategy.init(point.dtype))(points),
+            jax.vmap(self._optimizer.init)(points),
+            jnp.zeros(self._num_emitters, jnp.int32),
+        )
 
-    def _sample(self, strategy: CMAES, cma_es: CMAESState, key: jax.Array) -> jax.Array:
-        keys = jax.random.split(key, self._num_emitters)
-        return jax.vmap(strategy.sample)(cma_es, keys)
+    def _state(
+        self,
+        repertoire: Any,
+        search: tuple,
+        keys: tuple[jax.Array, jax.Array, jax.Array],
+        restarts: jax.Array,
+        rejected: jax.Array,
+    ) -> ArborescenceState:
+        """Scores points and draws the coefficients of their offspring.
+
+        Args:
+            repertoire: Repertoire that the offspring are to improve.
+            search: Points, CMA-ES, optimizer and age, leading axis E.
+            keys: Keys of the state, of scoring and of sampling.
+            restarts: () restarts so far.
+            rejected: () individuals rejected so far, without the points.
+        """
+        (points, cma_es, optimizer, age), (key, score_key, sample_key) = search, keys
+        scores = read_scores(points, *self._scoring_function(points, score_key))
+        # Of the repertoire with the points, only the bars are ever computed.
+        added = repertoire.add(points, scores.descriptors, scores.fitnesses)
+        strategy = self._strategy(scores.descriptors.shape[-1])
+        return ArborescenceState(
+            key=key,
+            points=points,
+            gradients=normalize(scores.gradients),
+            finite=scores.finite,
+            bars=self._bars(added),
+            cma_es=cma_es,
+            optimizer=optimizer,
+            coefficients=jax.vmap(strategy.sample)(
+                cma_es, jax.random.split(sample_key, self._num_emitters)
+            ),
+            age=age,
+            restarts=restarts,
+            rejected=rejected + jnp.sum(~scores.finite, dtype=jnp.int32),
+        )
 
     def _adapt(
         self,
@@ -354,11 +372,6 @@ class ArborescenceEmitter(Emitter, abc.ABC):
             -(mean @ gradients), optimizer, point
         )
         return jnp.asarray(optax.apply_updates(point, update)), optimizer
-
-
-def _add(repertoire: Any, scores: Scores) -> Any:
-    """The repertoire with the solution points; only its bars are ever computed."""
-    return repertoire.add(scores.genotypes, scores.descriptors, scores.fitnesses)
 
 
 def _where(choose: jax.Array, new: Any, old: Any) -> Any:
