@@ -5,6 +5,8 @@
 The first two lines after the imports are all that a script for QDax needs.
 """
 
+# QDax's annotations differ from what its functions take and return.
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false
 from __future__ import annotations
 
 import argparse

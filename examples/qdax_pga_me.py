@@ -3,6 +3,8 @@
 python examples/qdax_pga_me.py
 """
 
+# QDax's annotations differ from what its functions take and return.
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false
 from __future__ import annotations
 
 import argparse

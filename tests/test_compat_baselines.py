@@ -4,6 +4,8 @@ The tests of each algorithm are those that QDax's examples show, with small netw
 and short training.
 """
 
+# QDax's annotations differ from what its functions take and return.
+# pyright: reportArgumentType=false, reportCallIssue=false
 from __future__ import annotations
 
 import functools

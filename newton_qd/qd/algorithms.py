@@ -15,7 +15,7 @@ import jax
 
 from newton_qd import compat
 from newton_qd.qd.config import ConfigError, EvolveConfig
-from newton_qd.qd.rollout import Policy, ScoringFunction
+from newton_qd.qd.rollout import Policy
 from newton_qd.qd.task import Task
 
 
@@ -35,7 +35,7 @@ class Parts:
     config: EvolveConfig
     task: Task
     policy: Policy
-    score: ScoringFunction
+    score: Callable[[Any, Any], Any]
     centroids: jax.Array
 
 
