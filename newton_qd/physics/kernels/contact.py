@@ -1,4 +1,4 @@
-"""Contacts of a robot, linearised for the three solves.
+"""Contacts with static obstacles and of moving bodies, linearised for the solves.
 
 The predictor solve takes the normal force as linear in the new velocity. Its normal
 impulse may turn negative when a body lifts off, and its friction weight belongs to
