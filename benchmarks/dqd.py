@@ -35,7 +35,7 @@ LEARNING_RATE = 0.01
 THRESHOLD_MIN = 0.0
 ALGORITHMS = ("omg_mega", "cma_mega", "cma_mega_adam", "cma_maega")
 LIBRARIES = ("newton_qd", "pyribs")
-# QD score divided by the number of cells: Fontaine & Nikolaidis 2021, table 1.
+# Mean QD score over the number of cells, of Fontaine & Nikolaidis 2021.
 PUBLISHED = {
     ("lp_sphere", "omg_mega"): 71.6,
     ("lp_rastrigin", "omg_mega"): 55.9,
