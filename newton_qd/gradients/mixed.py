@@ -61,8 +61,9 @@ def make_mixed_gradient(
     ``sigma``, by alpha times the mean gradient of the samples plus (1 - alpha) times
     the mean of (f(x + w) - f(x - w)) w / (2 sigma^2), in pairs of w and -w. Alpha
     weights them by their inverse variances, and less where the two differ by more
-    than the tolerance (Suh et al. 2022, "Do differentiable simulators give better
-    policy gradients?", eqs. 6 to 9).
+    than the tolerance: the alpha-order gradient of Suh et al. 2022, "Do differentiable
+    simulators give better policy gradients?", whose error bound of the zeroth order is
+    its standard error here.
 
     Args:
         env: As in :func:`~newton_qd.gradients.make_episode_gradient`; so are the
