@@ -156,7 +156,7 @@ def ours(run: Run, domain: Domain) -> tuple[Any, Any, jax.Array]:
     def score_with_gradients(solutions: jax.Array, key: jax.Array) -> tuple:
         del key
         values, gradients = domain.score_with_gradients(solutions)
-        return values[:, 0], values[:, 1:], {"gradients": gradients}
+        return values[:, 0], values[:, 1:], {"gradients": jnp.swapaxes(gradients, 1, 2)}
 
     if run.algorithm == "omg_mega":
         emitter = OMGMEGAEmitter(POPULATION // 2, domain.sigma_omg)

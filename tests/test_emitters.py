@@ -57,7 +57,7 @@ def score(genotypes: jax.Array, key: jax.Array) -> tuple[Any, Any, dict[str, Any
     del key
     found = jax.vmap(values)(genotypes)
     gradients = jax.vmap(jax.jacrev(values))(genotypes)
-    return found[:, 0], found[:, 1:], {"gradients": gradients}
+    return found[:, 0], found[:, 1:], {"gradients": jnp.swapaxes(gradients, 1, 2)}
 
 
 def broken(
@@ -267,7 +267,7 @@ def test_omg_mega_steps_along_the_gradients() -> None:
     emitter = OMGMEGAEmitter(64, sigma_g=0.3)
     repertoire, state = begin(emitter, 1)
     steps = np.asarray(emit(emitter, repertoire, state) - start()[:1])
-    gradients = normalize(score(start()[:1], jax.random.key(0))[2]["gradients"])[0]
+    gradients = normalize(score(start()[:1], jax.random.key(0))[2]["gradients"][0].T)
     coefficients, residual, _, _ = np.linalg.lstsq(gradients.T, steps.T, rcond=None)
     assert np.max(residual) < 1e-9
     assert np.all(coefficients[0] > 0)
@@ -280,6 +280,7 @@ def test_gradients_belong_to_the_elites_of_all_emitters() -> None:
     filled = np.asarray(repertoire.fitnesses[:, 0] > -np.inf)
     np.testing.assert_array_equal(gradients.known(repertoire), filled)
     expected = score(repertoire.genotypes, jax.random.key(0))[2]["gradients"]
+    expected = np.swapaxes(expected, 1, 2)
     np.testing.assert_allclose(
         np.asarray(gradients.gradients)[filled], np.asarray(expected)[filled], atol=1e-6
     )
@@ -403,10 +404,10 @@ def test_errors_name_what_is_wrong() -> None:
     with pytest.raises(GradientsError, match="extra_scores holds nothing"):
         read(None)
     swapped = {"gradients": jnp.swapaxes(extra["gradients"], 1, 2)}
-    with pytest.raises(GradientsError, match=r"\(16, 3, 20\).*swap the last two axes"):
+    with pytest.raises(GradientsError, match=r"\(16, 20, 3\).*swap the last two axes"):
         read(swapped)
-    with pytest.raises(GradientsError, match=r"got \(16, 3, 19\)"):
-        read({"gradients": extra["gradients"][..., 1:]})
+    with pytest.raises(GradientsError, match=r"got \(16, 19, 3\)"):
+        read({"gradients": extra["gradients"][:, 1:]})
     with pytest.raises(GradientsError, match="ravel_pytree"):
         read_scores({"w": start()}, fitnesses, descriptors, extra)
 

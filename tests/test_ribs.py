@@ -90,7 +90,7 @@ def test_gradients_reach_the_scheduler() -> None:
         del key
         values = jax.vmap(one)(genotypes)
         gradients = jax.vmap(jax.jacrev(one))(genotypes)
-        return values[:, 0], values[:, 1:], {"gradients": gradients}
+        return values[:, 0], values[:, 1:], {"gradients": jnp.swapaxes(gradients, 1, 2)}
 
     common: dict[str, Any] = {"limits": LIMITS, "worst": -100.0}
     key = jax.random.key(0)

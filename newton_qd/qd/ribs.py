@@ -32,8 +32,8 @@ def make_ribs_evaluation(
 
     Args:
         score: As made by ``make_scoring_function``; with ``jacobian`` its third
-            result holds ``"gradients"`` (N, 1 + D, size): of the fitness, then of
-            each descriptor, not normalized.
+            result holds ``"gradients"`` (N, size, 1 + D): of the fitness, then of
+            each descriptor, not normalized; ``make_gradient_scoring_function``.
         key: Key for the resets.
         limits: Lowest and highest descriptor, (D,) each, as in ``Task.limits``.
         worst: Objective of an individual whose world was faulty; pyribs takes no
@@ -60,7 +60,8 @@ def make_ribs_evaluation(
         measures = jnp.where(bad[:, None], low, descriptors)
         if not jacobian:
             return objectives, measures
-        gradients = jnp.where(bad[:, None, None], 0.0, extra["gradients"])
+        gradients = jnp.swapaxes(extra["gradients"], 1, 2)
+        gradients = jnp.where(bad[:, None, None], 0.0, gradients)
         return objectives, measures, gradients
 
     def evaluate(solutions: np.ndarray) -> tuple[np.ndarray, ...]:

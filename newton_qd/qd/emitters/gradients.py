@@ -3,14 +3,12 @@
 A scoring function maps genotypes (N, size) and a key to fitnesses (N,), descriptors
 (N, D) and ``extra_scores``, with
 
-    extra_scores["gradients"]: (N, 1 + D, size)
+    extra_scores["gradients"]: (N, size, 1 + D)
 
-the gradients with respect to the genotype: row 0 that of the fitness, row 1 + j that
-of descriptor j, in their own units (emitters normalize where their paper does). An
-individual that could not be evaluated has fitness ``-inf``.
-
-QDax 0.5.0's own emitters want them the other way round, (N, size, 1 + D); those of
-this package take one layout only and say so when they meet the other.
+the gradients with respect to the genotype, laid out as QDax's emitters want them:
+column 0 is that of the fitness, column 1 + j that of descriptor j, in their own units
+(emitters normalize where their paper does). An individual that could not be evaluated
+has fitness ``-inf``. ``make_gradient_scoring_function`` makes such functions.
 """
 
 from __future__ import annotations
@@ -62,7 +60,7 @@ def read_scores(
         genotypes: (N, size) the individuals.
         fitnesses: (N,) or (N, 1) their fitnesses.
         descriptors: (N, D) their descriptors.
-        extra_scores: Dictionary with ``"gradients"`` (N, 1 + D, size).
+        extra_scores: Dictionary with ``"gradients"`` (N, size, 1 + D).
 
     Raises:
         GradientsError: The gradients are missing or have another shape, or genotypes
@@ -74,18 +72,18 @@ def read_scores(
         raise GradientsError(
             f"extra_scores[{GRADIENTS!r}] is missing: extra_scores holds {held}. The "
             "scoring function must return the gradients of fitness and descriptors, "
-            f"(N, 1 + D, size) = {(count, 1 + descriptors.shape[-1], size)}"
+            f"(N, size, 1 + D) = {(count, size, 1 + descriptors.shape[-1])}"
         )
     gradients = extra_scores[GRADIENTS]
-    expected = (count, 1 + descriptors.shape[-1], size)
+    expected = (count, size, 1 + descriptors.shape[-1])
     if jnp.shape(gradients) != expected:
         swapped = jnp.shape(gradients) == (expected[0], expected[2], expected[1])
         hint = "; swap the last two axes" if swapped else ""
         raise GradientsError(
-            f"extra_scores[{GRADIENTS!r}] must be (N, 1 + D, size) = {expected}, "
+            f"extra_scores[{GRADIENTS!r}] must be (N, size, 1 + D) = {expected}, "
             f"objective first, got {jnp.shape(gradients)}{hint}"
         )
-    gradients = jnp.asarray(gradients, genotypes.dtype)
+    gradients = jnp.swapaxes(jnp.asarray(gradients, genotypes.dtype), 1, 2)
     finite = finite_scores(fitnesses, descriptors) & jnp.all(
         jnp.isfinite(gradients), axis=(1, 2)
     )
