@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from newton_qd import physics
 from newton_qd.envs.base import PhysicsEnv
@@ -103,5 +102,5 @@ class InvertedDoublePendulum(PhysicsEnv):
         seen = physics.forward_kinematics(self.system, after.q, after.v)
         x, _, height = point(seen, self.system.body_names.index("pole2"), _TIP)[0]
         off = jnp.stack([x, height - 2, after.v[1], after.v[2]])
-        penalty = ordered_sum(np.asarray(_WEIGHTS, self.dtype) * jnp.square(off))
+        penalty = ordered_sum(jnp.asarray(_WEIGHTS, self.dtype) * jnp.square(off))
         return 10 - penalty, (height <= 1).astype(self.dtype), {}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import jax
-import numpy as np
+import jax.numpy as jnp
 
 from newton_qd.envs.vectors import cross, rotated
 from newton_qd.physics.inspection import Kinematics
@@ -23,7 +23,7 @@ def point(
         Position (3,) [m] and velocity (3,) [m/s], world axes.
     """
     row = slice(body, body + 1)
-    local = np.asarray([offset], seen.position.dtype)
+    local = jnp.asarray([offset], seen.position.dtype)
     position = seen.position[row] + rotated(seen.rotation[row], local)
     arm = position - seen.com[row]
     velocity = seen.linear_velocity[row] + cross(seen.angular_velocity[row], arm)

@@ -127,8 +127,8 @@ class ReacherAngle(Reacher):
         """Returns the angles that the joints are driven to (nu,) [rad]."""
         del state
         dofs = self.system.control_dof
-        low = np.asarray(self.system.limit_lower[dofs], self.dtype)
-        high = np.asarray(self.system.limit_upper[dofs], self.dtype)
+        low = jnp.asarray(self.system.limit_lower[dofs], self.dtype)
+        high = jnp.asarray(self.system.limit_upper[dofs], self.dtype)
         return low + (high - low) * (jnp.clip(action, -1, 1) + 1) / 2
 
     def _outcome(

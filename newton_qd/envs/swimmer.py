@@ -88,7 +88,7 @@ class Swimmer(PhysicsEnv):
         finite = jnp.all(jnp.isfinite(state.q)) & jnp.all(jnp.isfinite(state.v))
         state = select(finite, state, self._rest())  # its gradient too
         drag = self._drag(state)
-        scale = 1 / np.asarray(self.system.gear[:2], self.dtype)
+        scale = 1 / jnp.asarray(self.system.gear[:2], self.dtype)
         return jnp.concatenate(
             [action + rounded(scale * drag[_JOINTS:]), drag[:_JOINTS]]
         )
@@ -113,10 +113,10 @@ class Swimmer(PhysicsEnv):
         heading = jnp.stack([turns[0], ordered_sum(turns[:2]), ordered_sum(turns)])
         along = jnp.stack([jnp.cos(heading), jnp.sin(heading)], axis=1)
         across = jnp.stack([-along[:, 1], along[:, 0]], axis=1)
-        force = -rounded(np.asarray(_LINEAR, self.dtype) * velocity)
+        force = -rounded(jnp.asarray(_LINEAR, self.dtype) * velocity)
         for axis, coefficient in zip((along, across), _QUADRATIC, strict=True):
             speed = ordered_sum((axis * velocity).T)
-            square = np.asarray(coefficient, self.dtype) * jnp.abs(speed) * speed
+            square = jnp.asarray(coefficient, self.dtype) * jnp.abs(speed) * speed
             force = force - rounded(square[:, None] * axis)
         return force
 
