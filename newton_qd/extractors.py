@@ -72,10 +72,10 @@ def get_feet_contact_proportion(data: Any, mask: Mask) -> Descriptor:
         (n, nd) proportions [-].
     """
     valid = (1.0 - mask)[..., None].astype(data.state_desc.dtype)
-    # a number of steps for each component: XLA would multiply by the reciprocal of one
-    # for all, and 41 * (1 / 41) is not 1
+    # XLA would see that the number of steps is one for all components and multiply by
+    # its reciprocal, in some batches: 41 * (1 / 41) is not 1
     steps = folded_sum(jnp.broadcast_to(valid, data.state_desc.shape), 1)
-    return folded_sum(data.state_desc * valid, 1) / steps
+    return folded_sum(data.state_desc * valid, 1) / jax.lax.optimization_barrier(steps)
 
 
 class Encoder(Protocol):

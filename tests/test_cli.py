@@ -212,7 +212,7 @@ def test_envs_lists_every_environment(capsys: pytest.CaptureFixture[str]) -> Non
     table = [line.split() for line in capsys.readouterr().out.splitlines()]
     rows = {row[0]: row[1:] for row in table[1:]}
     assert set(rows) == set(newton_qd.registered_envs())
-    assert rows["ant_uni"] == ["87", "8", "feet_contact", "(4)", "3.24"]
+    assert rows["ant_uni"] == ["87", "8", "feet_contact", "(4)", "4.35"]
     assert rows["ant"] == ["87", "8", "-", "-"]
 
 

@@ -10,7 +10,7 @@ import warp as wp
 
 from newton_qd.physics import reference
 from newton_qd.physics.precision import kernels, pack_width
-from newton_qd.physics.system import CONTACT_FRACTION, System
+from newton_qd.physics.system import CONTACT_FRACTION, STANDARD_GRAVITY, System
 from newton_qd.physics.tree import Tree, build_tree, origin_axes
 
 # Solves of a substep: the predictor and two correctors.
@@ -77,7 +77,8 @@ def build_model(system: System, device: Any, parametric: bool = False) -> Any:
     model.torso_q = int(system.q_start[system.torso]) if floats else -1
     model.nf = len(system.feet)
     put("foot", [int(body) + 1 for body in system.feet] or [0])
-    model.foot_weight = system.total_mass * robot.gravity * robot.dt
+    gravity = robot.gravity or STANDARD_GRAVITY
+    model.foot_weight = system.total_mass * gravity * robot.dt
     model.foot_fraction = CONTACT_FRACTION
     model.foot_width = system.feet_width
     return model

@@ -31,14 +31,16 @@ def initial_state(system: System, q: jax.Array, v: jax.Array) -> PhysicsState:
     if not system.torso_floats:
         seen = bodies or forward_kinematics(system, q, v)
         torso_xy = seen.position[system.torso, :2]
-    feet, excess = system.feet.shape, CONTACT_FRACTION / system.feet_width
+    feet = system.feet.shape
+    # of no load: 1 / (1 + exp(.)), which does not overflow
+    unloaded = np.exp(-np.logaddexp(0.0, CONTACT_FRACTION / system.feet_width))
     return PhysicsState(
         q=q,
         v=v,
         impulse=jnp.zeros((system.nb, 6), dtype),
         normal_impulse=jnp.zeros((system.nb,), dtype),
         feet_contact=jnp.zeros(feet, dtype),
-        smooth_feet_contact=jnp.full(feet, 1 / (1 + np.exp(excess)), dtype),
+        smooth_feet_contact=jnp.full(feet, unloaded, dtype),
         torso_xy=torso_xy,
         bodies=bodies,
     )

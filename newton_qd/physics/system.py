@@ -13,6 +13,8 @@ from newton_qd.scenes import Scene
 
 CONTACT_FRACTION = 0.01
 """Share of the robot's weight above which a foot touches the ground [-]."""
+STANDARD_GRAVITY = 9.81
+"""Gives a robot without gravity the weight that its feet are measured by [m/s^2]."""
 
 
 class JointKind(enum.IntEnum):

@@ -71,7 +71,8 @@ class FeetContactWrapper(Wrapper, QDEnv):
         return self._described(self.env.step(state, action, params))
 
     def _described(self, state: State) -> State:
-        descriptor = self._read(state)
+        # a buffer that is in a state twice could not be donated
+        descriptor = jnp.copy(self._read(state))
         return state.replace(info={**state.info, "state_descriptor": descriptor})
 
     def _read(self, state: State) -> Descriptor:

@@ -65,7 +65,8 @@ class XYPositionWrapper(Wrapper, QDEnv):
         low, high = self.state_descriptor_limits
         described = {
             "state_descriptor": jnp.clip(position, low, high),
-            "xy_position": position,
+            # a buffer that is in a state twice could not be donated
+            "xy_position": jnp.copy(position),
         }
         return state.replace(info={**state.info, **described})
 

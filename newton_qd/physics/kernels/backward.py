@@ -3,9 +3,9 @@
 import warp as wp
 
 from . import scalar
-from .simulate import conclude, simulate
+from .simulate import simulate
 from .structs import Model, Scratch, row_after, row_at
-from .world import detect_fault, load_world, pack_at, seed_world
+from .world import load_world, pack_at, seed_world
 
 
 @wp.kernel
@@ -33,8 +33,6 @@ def step_backward(
     lane = tid - n * lanes
     pack = pack_at(n, first, worlds, slot_stride)
     load_world(m, sc, g, row_at(m, pack.slot, 1, 0, 0), pack, x, x_bar, lane, lanes)
-    simulate(m, sc, pack.slot, 1, lane, lanes)
-    detect_fault(m, sc, pack, x, lane)
-    conclude(m, sc, pack, x, 1, lane, lanes)
+    simulate(m, sc, pack, x, 1, lane, lanes)
     row = row_after(m, pack.slot, 1)
     seed_world(m, sc, g, row, pack, y_bar, lane, lanes)

@@ -39,27 +39,21 @@ WEIGHT_STEPS = wp.constant(2)
 @stage
 def contact_predictor(m: Model, sc: Scratch, row: Row, c: int):
     """Geometry, and the contact law linearised about the velocity at the start."""
-    body = row.body + load(m.contact_body, c)
-    partner = load(m.contact_partner, c)
-    if partner < 0:
-        r, normal, gap = touch_obstacle(m, sc, row, c)
-        vc = load(sc.twist_v, body) + cross(load(sc.twist_w, body), r)
-        contact_law(m, sc, row, c, r, normal, gap, vc)
-    else:
-        r, normal, gap = touch_partner(m, sc, row, c)
-        vc = load(sc.twist_v, body) + cross(load(sc.twist_w, body), r)
-        other = row.body + load(m.contact_body, partner)
-        vo = load(sc.twist_v, other) + cross(load(sc.twist_w, other), r)
-        contact_law(m, sc, row, c, r, normal, gap, vc - vo)
-
-
-@stage
-def contact_law(
-    m: Model, sc: Scratch, row: Row, c: int, r: vec3, normal: vec3, gap: real, vc: vec3
-):
-    """The contact law, linearised about the velocity ``vc`` at the start."""
     i = load(m.contact_body, c)
     x = load(sc.pose, row.body + i)
+    partner = load(m.contact_partner, c)
+    # one law for both: written twice, a GPU's compiler takes twice as long
+    r = vec3()
+    normal = vec3()
+    gap = real()
+    if partner < 0:
+        r, normal, gap = touch_obstacle(m, sc, row, c)
+    else:
+        r, normal, gap = touch_partner(m, sc, row, c)
+    vc = load(sc.twist_v, row.body + i) + cross(load(sc.twist_w, row.body + i), r)
+    if partner >= 0:
+        other = row.body + load(m.contact_body, partner)
+        vc = vc - (load(sc.twist_v, other) + cross(load(sc.twist_w, other), r))
     vn = dot(normal, vc)
     vt = vc - vn * normal
     reach = gap + m.h * vn
@@ -89,12 +83,10 @@ def contact_slip(m: Model, sc: Scratch, row: Row, c: int):
     r = load(sc.point, row.contact + c)
     dv = load(sc.change_v, at) + cross(load(sc.change_w, at), r)
     partner = load(m.contact_partner, c)
-    if partner < 0:
-        store(sc.slip, row.solve_contact + c, dv)
-    else:
+    if partner >= 0:
         other = row.solve_body + load(m.contact_body, partner)
-        vo = load(sc.change_v, other) + cross(load(sc.change_w, other), r)
-        store(sc.slip, row.solve_contact + c, dv - vo)
+        dv = dv - (load(sc.change_v, other) + cross(load(sc.change_w, other), r))
+    store(sc.slip, row.solve_contact + c, dv)
 
 
 @stage

@@ -3,9 +3,9 @@
 import warp as wp
 
 from . import scalar
-from .simulate import conclude, simulate
+from .simulate import simulate
 from .structs import Model, Scratch, row_after, row_at
-from .world import detect_fault, load_world, pack_at, store_world
+from .world import load_world, pack_at, store_world
 
 wp.set_module_options({"enable_backward": False})
 
@@ -30,7 +30,5 @@ def step_forward(
     lane = tid - n * lanes
     pack = pack_at(n, first, worlds, slot_stride)
     load_world(m, sc, sc, row_at(m, pack.slot, 0, 0, 0), pack, x, x, lane, lanes)
-    simulate(m, sc, pack.slot, 0, lane, lanes)
-    detect_fault(m, sc, pack, x, lane)
-    conclude(m, sc, pack, x, 0, lane, lanes)
+    simulate(m, sc, pack, x, 0, lane, lanes)
     store_world(m, sc, row_after(m, pack.slot, 0), pack, y, lane, lanes)

@@ -17,7 +17,7 @@ from .kinematics import free_joint, hinge_joint, world_frame
 from .memory import load
 from .readings import body_impulse, body_reading, foot_contact, torso_position
 from .structs import Model, Row, Scratch, row_after, row_at
-from .world import Pack, settle
+from .world import Pack, detect_fault, settle
 
 
 @stage
@@ -65,39 +65,37 @@ def linear_solve(m: Model, sc: Scratch, row: Row, lane: int, lanes: int):
     sync(lane)
 
 
-@wp.func
-def simulate(m: Model, sc: Scratch, slot: int, keep: int, lane: int, lanes: int):
-    """All substeps of one world; ``keep`` as in ``row_at``."""
-    for s in range(m.substeps):
-        first = row_at(m, slot, keep, s, 0)
-        kinematics(m, sc, first, lane, lanes)
-        for i in range(1 + lane, m.nb + 1, lanes):
-            rigid_inertia(m, sc, first, i)
-        # predictor, then correctors
-        for p in range(m.passes):
-            row = row_at(m, slot, keep, s, p)
-            for c in range(lane, m.nc, lanes):
-                if p == 0:
-                    contact_predictor(m, sc, row, c)
-                else:
-                    if p == 1:
-                        contact_clip(m, sc, row, c)
-                    contact_corrector(m, sc, row, c, p)
-            sync(lane)
-            linear_solve(m, sc, row, lane, lanes)
-        last = row_at(m, slot, keep, s, m.passes - 1)
-        for k in range(lane, m.nv, lanes):
-            new_velocity(sc, last, k)
+@stage
+def substep(m: Model, sc: Scratch, slot: int, keep: int, s: int, lane: int, lanes: int):
+    """Substep ``s`` from its kinematics on; ``keep`` as in ``row_at``."""
+    first = row_at(m, slot, keep, s, 0)
+    for i in range(1 + lane, m.nb + 1, lanes):
+        rigid_inertia(m, sc, first, i)
+    # predictor, then correctors
+    for p in range(m.passes):
+        row = row_at(m, slot, keep, s, p)
         for c in range(lane, m.nc, lanes):
-            contact_impulse(sc, last, c)
+            if p == 0:
+                contact_predictor(m, sc, row, c)
+            else:
+                if p == 1:
+                    contact_clip(m, sc, row, c)
+                contact_corrector(m, sc, row, c, p)
         sync(lane)
-        for i in range(1 + lane, m.nb + 1, lanes):
-            new_coordinates(m, sc, last, i)
-        sync(lane)
+        linear_solve(m, sc, row, lane, lanes)
+    last = row_at(m, slot, keep, s, m.passes - 1)
+    for k in range(lane, m.nv, lanes):
+        new_velocity(sc, last, k)
+    for c in range(lane, m.nc, lanes):
+        contact_impulse(sc, last, c)
+    sync(lane)
+    for i in range(1 + lane, m.nb + 1, lanes):
+        new_coordinates(m, sc, last, i)
+    sync(lane)
 
 
 @wp.func
-def conclude(
+def simulate(
     m: Model,
     sc: Scratch,
     pack: Pack,
@@ -106,18 +104,33 @@ def conclude(
     lane: int,
     lanes: int,
 ):
-    """The returned state, and what is read from it, after :func:`detect_fault`."""
+    """All substeps of a pack, then the returned state and what is read from it."""
     slot = pack.slot
-    end = row_at(m, slot, keep, m.substeps, 0)
-    row = row_after(m, slot, keep)
-    settle(m, sc, pack, x, end, row, lane, lanes)
+    for n in range(m.substeps + 1):
+        # the kinematics of the returned state are those of a last turn: written
+        # twice, a GPU's compiler takes twice as long
+        s = n + n // m.substeps
+        row = row_at(m, slot, keep, s, 0)
+        if n == m.substeps:
+            detect_fault(m, sc, pack, x, lane)
+            settle(m, sc, pack, x, row_at(m, slot, keep, n, 0), row, lane, lanes)
+            sync(lane)
+        if n < m.substeps or m.reports_bodies == 1 or m.torso_q < 0:
+            kinematics(m, sc, row, lane, lanes)
+        if n < m.substeps:
+            substep(m, sc, slot, keep, n, lane, lanes)
+    read_out(m, sc, slot, row_after(m, slot, keep), lane, lanes)
+
+
+@stage
+def read_out(m: Model, sc: Scratch, slot: int, row: Row, lane: int, lanes: int):
+    """What is read from the returned state and from the substeps."""
     for i in range(1 + lane, m.nb + 1, lanes):
         body_impulse(m, sc, slot, row, i)
     sync(lane)
     for f in range(lane, m.nf, lanes):
         foot_contact(m, sc, slot, row, f)
     if m.reports_bodies == 1 or m.torso_q < 0:
-        kinematics(m, sc, row, lane, lanes)
         for i in range(1 + lane, m.nb + 1, lanes):
             body_reading(m, sc, row, i)
         sync(lane)

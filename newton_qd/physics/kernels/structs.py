@@ -193,7 +193,7 @@ def row_at(m: Model, slot: int, keep: int, s: int, p: int):
     solve = slot
     before = slot
     if keep == 1:
-        step = slot * (m.substeps + 1) + s
+        step = slot * (m.substeps + 1) + wp.min(s, m.substeps)
         solve = m.passes * (slot * m.substeps + s) + p
         before = solve - 1
     r = Row()
@@ -218,7 +218,4 @@ def row_at(m: Model, slot: int, keep: int, s: int, p: int):
 @wp.func
 def row_after(m: Model, slot: int, keep: int):
     """Row of the returned state, one after the end of the last substep."""
-    r = row_at(m, slot, keep, m.substeps, 0)
-    r.q = r.q_next
-    r.v = r.v_next
-    return r
+    return row_at(m, slot, keep, m.substeps + 1, 0)
