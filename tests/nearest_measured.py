@@ -36,9 +36,9 @@ def measure(m: MODEL, c: int, o: int, at: wp.array(dtype=VEC3),
 
 
 @functools.cache
-def measuring(folder: Path) -> Any:
+def measuring(folder: Path, boxes: bool) -> Any:
     """A kernel of the geometry alone."""
-    space = kernels("float64", PACK)
+    space = kernels("float64", PACK, boxes=boxes)
     package = space.package
     nearest = importlib.import_module(f"{package.__name__}.nearest")
     path = folder / "measure.py"
@@ -68,8 +68,8 @@ class Measured:
     def __init__(
         self, folder: Path, system: System, contact: int, at: Any, along: Any
     ) -> None:
-        kernel = measuring(folder)
-        package = kernels("float64", PACK).package
+        kernel = measuring(folder, system.has_boxes)
+        package = kernels("float64", PACK, boxes=system.has_boxes).package
         held = [packed(at, package.vec3), packed(along, package.vec3)]
         packs = len(at) // PACK
         y = wp.zeros(5 * packs, dtype=package.real, device="cpu", requires_grad=True)

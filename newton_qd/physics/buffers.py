@@ -33,6 +33,20 @@ def _with_world(table: np.ndarray) -> np.ndarray:
     return np.concatenate([table[:1], table])
 
 
+def kernels_of(
+    system: System, device: Any, parametric: bool = False
+) -> SimpleNamespace:
+    """The kernels for a system on a device, with what it needs and no more.
+
+    Args:
+        system: The system.
+        device: Warp device.
+        parametric: Whether every world brings physical parameters of its own.
+    """
+    width = pack_width(system.dtype, device)
+    return kernels(system.dtype, width, parametric=parametric, boxes=system.has_boxes)
+
+
 def build_model(system: System, device: Any, parametric: bool = False) -> Any:
     """Copy a system to a device as a ``Model`` struct.
 
@@ -44,7 +58,7 @@ def build_model(system: System, device: Any, parametric: bool = False) -> Any:
     Returns:
         The struct of :mod:`newton_qd.physics.kernels.structs`.
     """
-    space = kernels(system.dtype, pack_width(system.dtype, device), parametric)
+    space = kernels_of(system, device, parametric)
     tree = build_tree(system)
     model = space.structs.Model()
     robot, material = system.robot, system.robot.material
@@ -174,7 +188,7 @@ def build_scratch(
         ``values`` and ``adjoints`` (the latter ``values`` itself without adjoint),
         two ``Scratch`` structs, and ``bytes_per_slot``.
     """
-    space = kernels(system.dtype, pack_width(system.dtype, device), parametric)
+    space = kernels_of(system, device, parametric)
     values, adjoints = space.structs.Scratch(), space.structs.Scratch()
     n, nc = system.robot.substeps, max(len(system.contact_body), 1)
     nf = len(system.feet)

@@ -9,7 +9,7 @@ from typing import Any
 import warp as wp
 
 from newton_qd.physics import buffers
-from newton_qd.physics.precision import kernels, pack_width
+from newton_qd.physics.precision import pack_width
 from newton_qd.physics.system import System
 from newton_qd.physics.workers import Worker
 
@@ -83,7 +83,7 @@ class Launcher:
         self.device = device
         self.width = pack_width(system.dtype, device)
         self.parametric = parametric
-        self.kernels = kernels(system.dtype, self.width, parametric)
+        self.kernels = buffers.kernels_of(system, device, parametric)
         self.model = buffers.build_model(system, device, parametric)
         self._block = 1 if device.is_cpu else _GPU_BLOCK
         self._scratch: dict[tuple[bool, Any], tuple[int, Any]] = {}

@@ -17,24 +17,27 @@ _VECTOR_BYTES = 32
 SCALARS = {"float32": wp.float32, "float64": wp.float64}
 
 
-def kernels(dtype: str, width: int, parametric: bool = False) -> SimpleNamespace:
+def kernels(
+    dtype: str, width: int, *, parametric: bool = False, boxes: bool = False
+) -> SimpleNamespace:
     """Load the kernel package for one scalar type and one width.
 
     Args:
         dtype: ``"float32"`` or ``"float64"``.
         width: Worlds of a pack, see :mod:`newton_qd.physics.kernels`.
         parametric: Whether every world brings physical parameters of its own.
+        boxes: Whether obstacles may be boxes.
 
     Returns:
         The modules of :mod:`newton_qd.physics.kernels` as attributes, loaded under a
         package name of their own so that Warp compiles each variant separately.
     """
-    return _load(dtype, width, parametric)
+    return _load(dtype, width, parametric, boxes)
 
 
 @functools.cache
-def _load(dtype: str, width: int, parametric: bool) -> SimpleNamespace:
-    own = "_parametric" if parametric else ""
+def _load(dtype: str, width: int, parametric: bool, boxes: bool) -> SimpleNamespace:
+    own = "_parametric" * parametric + "_boxes" * boxes
     name = f"newton_qd.physics.kernels_{dtype}_{width}{own}"
     spec = importlib.util.spec_from_file_location(
         name, _TEMPLATE / "__init__.py", submodule_search_locations=[str(_TEMPLATE)]
@@ -44,6 +47,7 @@ def _load(dtype: str, width: int, parametric: bool) -> SimpleNamespace:
     package.scalar = SCALARS[dtype]  # type: ignore[attr-defined]
     package.width = width  # type: ignore[attr-defined]
     package.parametric = parametric  # type: ignore[attr-defined]
+    package.boxes = boxes  # type: ignore[attr-defined]
     sys.modules[name] = package
     spec.loader.exec_module(package)
     modules = ("structs", "world", "forward", "backward", "inspect", "episodes")

@@ -180,6 +180,11 @@ class System:
         return self.joint_kind[self.torso] == JointKind.FREE
 
     @property
+    def has_boxes(self) -> bool:
+        """Whether an obstacle is a box, for which the kernels have more to do."""
+        return bool(np.any(self.obstacle_kind == ObstacleKind.BOX))
+
+    @property
     def ground_contacts(self) -> np.ndarray:
         """Rows of the contact tables that touch the ground, obstacle 0."""
         return np.flatnonzero(self.contact_obstacle == 0)

@@ -3,7 +3,8 @@
 The package is a template: :func:`newton_qd.physics.precision.kernels` loads it once
 per scalar type and width under a name of its own, so that float32 and float64, CPU
 and GPU come from one source; and once more where worlds bring physical parameters of
-their own, so that those who bring none pay nothing for them. A thread computes
+their own or a scene has boxes, so that those who have none pay nothing for them, not
+even time to compile. A thread computes
 ``width`` worlds side by side: as the elements of one vector instruction on a CPU,
 where they fill it, and one on a GPU, whose threads are such elements already. So
 ``real``, ``vec3`` and the other types below hold one value for each world of a pack;
@@ -23,6 +24,8 @@ scalar = globals().get("scalar", wp.float32)
 width = globals().get("width", 1)
 # Whether every world brings physical parameters of its own.
 parametric = globals().get("parametric", False)
+# Whether obstacles may be boxes.
+boxes = globals().get("boxes", True)
 
 # One value for each world of a pack.
 real = wp.types.vector(length=width, dtype=scalar)

@@ -10,7 +10,7 @@ few degrees, or cross near an end. The obstacle is a plane, a capsule or a box.
 
 import warp as wp
 
-from . import real, scalar, vec3
+from . import boxes, real, scalar, vec3
 from .algebra import (
     add,
     component,
@@ -32,6 +32,7 @@ from .numbers import uniform
 from .smooth import bounded, finite_length
 from .structs import Model, Row, Scratch
 
+BOXES = wp.constant(boxes)
 # A share of a segment is rounded off over this distance from its ends, -1 and 1.
 SHARE_ROUNDING = wp.constant(scalar(0.1))
 
@@ -94,9 +95,10 @@ def nearest_share(m: Model, c: int, o: int, at: vec3, along: vec3):
             component(along, 2),
             component(size, 1),
         )
-    else:
-        free = box_share(m, size, m.contact_smoothing * radius, at, along)
-        share = bounded(free, uniform(scalar(1.0)), uniform(SHARE_ROUNDING))
+    if BOXES:
+        if load(m.obstacle_kind, o) == 2:
+            free = box_share(m, size, m.contact_smoothing * radius, at, along)
+            share = bounded(free, uniform(scalar(1.0)), uniform(SHARE_ROUNDING))
     return share
 
 
@@ -115,8 +117,9 @@ def obstacle_normal(m: Model, o: int, at: vec3):
     if load(m.obstacle_kind, o) == 1:
         away = from_axis(m, o, at)
         n = (scalar(1.0) / finite_length(away)) * away
-    if load(m.obstacle_kind, o) == 2:
-        n = box_normal(m, constant(m.obstacle_size, o), at)
+    if BOXES:
+        if load(m.obstacle_kind, o) == 2:
+            n = box_normal(m, constant(m.obstacle_size, o), at)
     return n
 
 
@@ -127,8 +130,9 @@ def obstacle_distance(m: Model, o: int, at: vec3):
     if load(m.obstacle_kind, o) == 1:
         radius = component(constant(m.obstacle_size, o), 0)
         d = finite_length(from_axis(m, o, at)) - radius
-    if load(m.obstacle_kind, o) == 2:
-        d = box_distance(m, constant(m.obstacle_size, o), at)
+    if BOXES:
+        if load(m.obstacle_kind, o) == 2:
+            d = box_distance(m, constant(m.obstacle_size, o), at)
     return d
 
 
