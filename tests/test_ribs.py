@@ -57,7 +57,8 @@ def test_a_scheduler_evolves_policies() -> None:
     for _ in range(10):
         scheduler.tell(*evaluate(scheduler.ask()))
     assert archive.stats.coverage > first.coverage
-    assert archive.stats.obj_max > first.obj_max
+    best: Any = archive.stats.obj_max
+    assert best > first.obj_max
     assert traced == [(32, policy.size)]
 
 
