@@ -43,8 +43,9 @@ a CPU): {WORLDS:,} untrained policies, perceptrons with two hidden layers of
 |---|---|---|---|---|---|
 """
 TAIL = """
-The limits are the original's. Those of the position tasks are wide, for robots that run:
-an untrained one falls near its start and reaches few cells, least of all a humanoid.
+The limits are the original's. Those of the position tasks are wide, for robots that
+run: an untrained one falls near its start and reaches few cells, least of all a
+humanoid.
 """
 
 Act = Callable[[jax.Array, jax.Array], jax.Array]

@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import newton_qd
 from newton_qd.envs.base import Env
@@ -22,6 +23,12 @@ NAMES = [
     name
     for name in newton_qd.registered_envs()
     if name in newton_qd.descriptor_extractor and name not in _REPEATED
+]
+# One of each kind; the others share their code with these and run with the slow tests.
+_QUICK = {"ant_uni", "antmaze", "hopper_uni", "humanoid_uni", "pointmaze"}
+EVERY_NAME = [
+    pytest.param(name, marks=() if name in _QUICK else pytest.mark.slow)
+    for name in NAMES
 ]
 STACKS: dict[str, dict[str, Any]] = {
     "default": {},

@@ -90,6 +90,7 @@ def test_what_does_not_exist_is_refused(tmp_path: Path) -> None:
     assert not out.exists()
 
 
+@pytest.mark.slow
 def test_a_checkpoint_without_the_emitter_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -108,6 +109,7 @@ def test_a_checkpoint_without_the_emitter_is_refused(
         run(config, out=out, resume=True)
 
 
+@pytest.mark.slow
 def test_settings_from_toml(tmp_path: Path) -> None:
     path = tmp_path / "run.toml"
     path.write_text(

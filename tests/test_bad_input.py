@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from contract import (
+    EVERY_NAME,
     NAMES,
     coordinates,
     gradient,
@@ -94,7 +95,7 @@ def test_no_gradient_passes_a_fault(name: str, kind: str) -> None:
         assert np.any(bad[1][1, :first] != 0)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", EVERY_NAME)
 def test_auto_reset_heals_a_fault(name: str) -> None:
     env = make(name, "batch")
     first = reset(env)(jax.random.key(0))
@@ -111,7 +112,7 @@ def test_auto_reset_heals_a_fault(name: str) -> None:
     assert same(row(healed.obs, 1), row(step(env)(first, actions).obs, 1))
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", EVERY_NAME)
 def test_check_names_worlds(name: str) -> None:
     env = make(name, "bare")
     state = worlds(env, 4)
@@ -124,7 +125,7 @@ def test_check_names_worlds(name: str) -> None:
         jax.eval_shape(newton_qd.check, state)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", EVERY_NAME)
 def test_bad_actions_are_named(name: str) -> None:
     env = make(name)
     state = reset(env)(jax.random.key(0))
@@ -149,7 +150,7 @@ def test_bad_actions_are_named(name: str) -> None:
         batched.step(state, jnp.zeros((3, size)))
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", EVERY_NAME)
 def test_actions_of_numpy_and_weak_types_are_taken(name: str) -> None:
     env = make(name)
     state = reset(env)(jax.random.key(0))
@@ -159,7 +160,7 @@ def test_actions_of_numpy_and_weak_types_are_taken(name: str) -> None:
     assert same(strong, env.step(state, jnp.full((env.action_size,), 0.5)))
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", EVERY_NAME)
 def test_float64_action_is_refused_by_float32(name: str, x64: None) -> None:
     env = make(name)
     state = reset(env)(jax.random.key(0))

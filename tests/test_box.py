@@ -277,6 +277,7 @@ def test_ball_rests_on_a_box(x64: None, tmp_path: Path, rpy: str) -> None:
     np.testing.assert_allclose(path.q[-1, :2], q[:2], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_ball_never_passes_a_box_wall(tmp_path: Path) -> None:
     """Shots at a wall of 0.2 m, at its faces, ends and top."""
     scene = box_scene(tmp_path, "0.2 4 1", "3 0 0.5")

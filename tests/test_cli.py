@@ -46,6 +46,7 @@ def test_evolve_reports_what_it_did(
     assert settings["iterations"] == 3 and settings["iso_sigma"] == SMALL.iso_sigma
 
 
+@pytest.mark.slow
 def test_a_config_file_reproduces_the_run(tmp_path: Path) -> None:
     first, again, other = (tmp_path / name for name in ("first", "again", "other"))
     assert call(*POINT, "--out", first) == cli.OK

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from contract import (
-    NAMES,
+    EVERY_NAME,
     STACKS,
     batched_reset,
     coordinates,
@@ -40,7 +40,7 @@ from newton_qd.envs.state import State
 from newton_qd.types import INFO_KEYS
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", EVERY_NAME)
 def test_sizes_are_as_declared(name: str) -> None:
     env = make(name)
     first = reset(env)(jax.random.key(1))
@@ -57,7 +57,7 @@ def test_sizes_are_as_declared(name: str) -> None:
         assert env.action_size == robot.system.nu
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", EVERY_NAME)
 def test_descriptors_are_as_declared(name: str) -> None:
     env: Any = make(name)
     state = reset(env)(jax.random.key(1))
@@ -80,7 +80,7 @@ def test_descriptors_are_as_declared(name: str) -> None:
     assert state.info["state_descriptor"].shape == (length,)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", EVERY_NAME)
 def test_reset_takes_both_kinds_of_key(name: str) -> None:
     env = make(name)
     typed = reset(env)(jax.random.key(3))
@@ -90,7 +90,7 @@ def test_reset_takes_both_kinds_of_key(name: str) -> None:
 
 
 @pytest.mark.parametrize("stack", STACKS)
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", EVERY_NAME)
 def test_state_keeps_its_shape(name: str, stack: str) -> None:
     env = make(name, stack)
     first = jax.eval_shape(env.reset, jax.random.key(0))
@@ -105,7 +105,7 @@ def test_state_keeps_its_shape(name: str, stack: str) -> None:
 
 
 @pytest.mark.parametrize("stack", STACKS)
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", EVERY_NAME)
 def test_float32_stays_float32_under_x64(name: str, stack: str, x64: None) -> None:
     env = make(name, stack)
     assert env.dtype == np.float32
@@ -120,7 +120,7 @@ def test_float32_stays_float32_under_x64(name: str, stack: str, x64: None) -> No
     assert outline(first) == outline(second)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", EVERY_NAME)
 def test_x64_changes_no_value(name: str, x64: None) -> None:
     env = make(name)
     state = reset(env)(jax.random.key(0))
@@ -131,7 +131,7 @@ def test_x64_changes_no_value(name: str, x64: None) -> None:
     assert same(wide, narrow)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", EVERY_NAME)
 def test_float64_environment(name: str, x64: None) -> None:
     env = newton_qd.create(name, dtype="float64")
     state = step(env)(
@@ -146,7 +146,7 @@ def test_float64_environment(name: str, x64: None) -> None:
         env.reset(jax.random.key(0))
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", EVERY_NAME)
 def test_step_is_pure(name: str) -> None:
     # not jitted: a traced dictionary is a copy, so that no change would show
     env = make(name, "eval")
@@ -159,7 +159,7 @@ def test_step_is_pure(name: str) -> None:
     assert same(first, second)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", EVERY_NAME)
 def test_no_buffer_is_in_a_state_twice(name: str) -> None:
     # a state with one buffer twice cannot be donated to a jitted step
     state = make(name, "eval").reset(jax.random.key(0))
@@ -167,7 +167,7 @@ def test_no_buffer_is_in_a_state_twice(name: str) -> None:
     assert len({id(leaf) for leaf in leaves}) == len(leaves)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", EVERY_NAME)
 def test_repetition_and_batch_size_change_nothing(name: str) -> None:
     env = make(name)
     state, actions = worlds(env, 64), random_actions(env, (64, 12))
@@ -180,14 +180,14 @@ def test_repetition_and_batch_size_change_nothing(name: str) -> None:
         assert same(alone, row(batch, one))
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", EVERY_NAME)
 def test_reset_does_not_depend_on_the_batch(name: str) -> None:
     env = make(name)
     batch = worlds(env, 64)
     assert same(reset(env)(keys(64)[5]), row(batch, 5))
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", EVERY_NAME)
 def test_population_axis(name: str) -> None:
     env = make(name, "bare")
     state, actions = worlds(env, 4), random_actions(env, (4, 5))
@@ -197,7 +197,7 @@ def test_population_axis(name: str) -> None:
     assert same(reshaped(nested, 2, (4,)), flat)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", EVERY_NAME)
 def test_batched_environment_under_a_population(name: str) -> None:
     env = make(name, "eval")
     population = batched_reset(env)(keys(2))
@@ -207,7 +207,7 @@ def test_batched_environment_under_a_population(name: str) -> None:
         assert same(step(env)(*row((population, action), index)), row(stepped, index))
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", EVERY_NAME)
 def test_environment_is_a_static_argument(name: str) -> None:
     env = make(name)
     assert env == env and hash(env) == hash(env)
@@ -225,7 +225,7 @@ def test_environment_is_a_static_argument(name: str) -> None:
     assert traced == [env]
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", EVERY_NAME)
 def test_every_observation_element_moves(name: str) -> None:
     env = make(name, "bare")
     robot = env.unwrapped
@@ -258,7 +258,7 @@ def contact_never_moves(env: PhysicsEnv, block: str) -> np.ndarray:
     return never
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", EVERY_NAME)
 def test_gradient_is_finite_and_reaches_every_action(name: str) -> None:
     env = make(name, "bare")
     state = worlds(env, 4)
@@ -268,7 +268,7 @@ def test_gradient_is_finite_and_reaches_every_action(name: str) -> None:
     assert np.all(np.asarray(found[1]) != 0)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", EVERY_NAME)
 def test_fixed_initial_state_has_no_noise(name: str) -> None:
     env = newton_qd.create(name, fixed_init_state=True, batch_size=2)
     state = reset(env)(jax.random.key(0))

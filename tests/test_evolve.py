@@ -189,6 +189,7 @@ def test_metrics_file(reference: Path) -> None:
     assert [int(line.split(",")[0]) for line in lines[1:]] == list(range(13))
 
 
+@pytest.mark.slow
 def test_corrected_metrics_are_those_of_the_elites_put_anew(tmp_path: Path) -> None:
     config = SMALL.replace(iterations=2, reevaluations=5)
     result = run(config, out=tmp_path / "run")

@@ -24,6 +24,7 @@ def test_joint_velocities_are_rates_of_the_angles(x64: None) -> None:
     np.testing.assert_allclose(change, np.asarray(rates)[:, 6:], rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_random_actions_stay_finite() -> None:
     steps, worlds = 2000, 16
     env = newton_qd.create("humanoid_uni", episode_length=None, auto_reset=False)

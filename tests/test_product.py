@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from contract import NAMES, outline, zero_action
+from contract import EVERY_NAME, outline, zero_action
 
 import newton_qd
 from newton_qd import registry
@@ -49,7 +49,7 @@ def shared_base(monkeypatch: pytest.MonkeyPatch, request: Any) -> str:
     return name
 
 
-@pytest.mark.parametrize("shared_base", NAMES, indirect=True)
+@pytest.mark.parametrize("shared_base", EVERY_NAME, indirect=True)
 def test_shapes(shared_base: str) -> None:
     for options in PRODUCT:
         if not allowed(options):

@@ -22,6 +22,7 @@ LIMITS = (np.zeros(2), np.ones(2))
 WORST = -5.0 * SMALL.episode_length
 
 
+@pytest.mark.slow
 def test_a_scheduler_evolves_policies() -> None:
     from ribs.archives import GridArchive
     from ribs.emitters import EvolutionStrategyEmitter

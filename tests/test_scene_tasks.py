@@ -223,6 +223,7 @@ def test_with_scene() -> None:
     assert other.system.scene is MAZE and chain.unwrapped is ant
 
 
+@pytest.mark.slow
 def test_precision(x64: None) -> None:
     env = MazeWrapper(Ant(dtype="float64"), "ant")
     after = env.step(env.reset(KEY), action_of(env))

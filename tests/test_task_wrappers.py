@@ -256,6 +256,7 @@ def same_readings(state: State, other: State) -> bool:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "wrapper", [FeetContactWrapper, XYPositionWrapper, NoForwardRewardWrapper]
 )
