@@ -59,7 +59,7 @@ HOMES = {
         "viewers/",
     ),
 }
-LEAF_HOMES = ("qd/", "viewers/", "compat/", "cli.py")
+LEAF_HOMES = ("qd/", "viewers/", "compat/", "cli/")
 HOMES["matplotlib"] = (*LEAF_HOMES, "gradients/report.py")
 # Never loaded by `import newton_qd`.
 HEAVY = {

@@ -1,4 +1,4 @@
-"""The command ``newton-qd``: environments, evolution, and what gradients are worth."""
+"""``newton-qd evolve``: an algorithm of MAP-Elites' family on an environment."""
 
 from __future__ import annotations
 
@@ -6,12 +6,11 @@ import argparse
 import ast
 import shlex
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from newton_qd.errors import MissingExtra, UnknownEnvironment
-from newton_qd.qd.checkpoint import CheckpointError
+from newton_qd.cli.arguments import FAILED, OK, complain, integers, widths
 from newton_qd.qd.config import (
     ConfigError,
     EvolveConfig,
@@ -25,109 +24,20 @@ if TYPE_CHECKING:
     from newton_qd.qd.evolve import EvolveResult
     from newton_qd.qd.task import Task
 
-OK, FAILED, BAD_ARGUMENTS = 0, 1, 2
-
 _DEFAULTS = EvolveConfig()
 
 
-def main(
-    argv: Sequence[str] | None = None,
-    *,
-    task_factory: Callable[[EvolveConfig], Task] | None = None,
-) -> int:
-    """Runs the command line.
-
-    Args:
-        argv: Arguments without the name of the program; those of the process by
-            default.
-        task_factory: Makes the task of ``evolve``; by default from the registered
-            environments.
-
-    Returns:
-        Exit code: 0 success, 1 failure, 2 bad arguments, 130 interrupted and saved.
-    """
-    arguments = _make_parser().parse_args(argv)
-    try:
-        if arguments.command == "envs":
-            return _envs()
-        if arguments.command == "doctor":
-            return _doctor(arguments)
-        return _evolve(arguments, task_factory)
-    except (ConfigError, UnknownEnvironment) as error:
-        return _complain(arguments, error, BAD_ARGUMENTS)
-    except (CheckpointError, MissingExtra, OSError) as error:
-        return _complain(arguments, error, FAILED)
-    except KeyboardInterrupt:
-        return _complain(arguments, "interrupted", INTERRUPTED)
-
-
-def _complain(arguments: argparse.Namespace, what: object, code: int) -> int:
-    print(f"newton-qd {arguments.command}: error: {what}", file=sys.stderr)
-    return code
-
-
-def _make_parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="newton-qd", description="Quality-Diversity on differentiable physics."
-    )
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    commands.add_parser("envs", help="list the environments")
-    evolve = commands.add_parser(
+def add_parser(commands: Any) -> None:
+    """Adds the command to the subparsers of ``newton-qd``."""
+    parser = commands.add_parser(
         "evolve",
         help="run an algorithm of MAP-Elites' family on an environment",
         description="Evolves an archive of policies and writes a results folder: "
-        "archive.npz, archive.png, metrics.csv, config.json and a checkpoint.",
+        "archive.npz, archive.png, metrics.csv, corrected.json, config.json and a "
+        "checkpoint.",
     )
-    _add_run_arguments(evolve)
-    _add_setting_arguments(evolve)
-    doctor = commands.add_parser("doctor", help="measure what gradients are worth")
-    ailments = doctor.add_subparsers(dest="ailment", required=True, metavar="WHAT")
-    _add_doctor_arguments(
-        ailments.add_parser(
-            "gradients",
-            help="over how many control steps a gradient can be used, and why",
-            description="Compares the gradient of the return with central differences "
-            "and with an evolution strategy, horizon by horizon.",
-        )
-    )
-    return parser
-
-
-def _add_doctor_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("env_name", metavar="ENV", help="environment, as ant_uni")
-    parser.add_argument(
-        "--horizons",
-        type=_widths,
-        default=(1, 2, 4, 8, 16, 32, 64),
-        metavar="N,N",
-        help="numbers of control steps (default: 1,2,4,8,16,32,64)",
-    )
-    for name, default, text in (
-        ("worlds", 8, "random plans of actions"),
-        ("directions", 8, "directions of the differences, in each world"),
-        ("samples", 16, "pairs of noisy samples, in each world"),
-        ("seed", 0, "seed of every random number"),
-    ):
-        parser.add_argument(
-            f"--{name}",
-            type=int,
-            default=default,
-            metavar="N",
-            help=f"{text} (default: {default})",
-        )
-    parser.add_argument(
-        "--sigma",
-        type=float,
-        default=0.05,
-        metavar="X",
-        help="standard deviation of the noise on actions (default: 0.05)",
-    )
-    parser.add_argument(
-        "--out",
-        type=Path,
-        metavar="DIR",
-        help="folder for horizons.csv, contacts.csv, report.txt and gradients.png",
-    )
+    _add_run_arguments(parser)
+    _add_setting_arguments(parser)
 
 
 def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
@@ -198,7 +108,7 @@ def _add_setting_arguments(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--hidden",
-        type=_widths,
+        type=widths,
         metavar="N,N",
         help="hidden layers of the policy, 'none' for a linear one (default: "
         f"{','.join(map(str, _DEFAULTS.hidden))})",
@@ -230,75 +140,19 @@ def _option(text: str) -> tuple[str, Any]:
     )
 
 
-def _widths(text: str) -> tuple[int, ...]:
-    return () if text == "none" else _integers(text, ",")
-
-
 def _grid(text: str) -> tuple[int, ...]:
-    return _integers(text, "x")
+    return integers(text, "x")
 
 
-def _integers(text: str, separator: str) -> tuple[int, ...]:
-    try:
-        return tuple(int(part) for part in text.split(separator))
-    except ValueError as error:
-        example = separator.join(("8", "8"))
-        raise argparse.ArgumentTypeError(
-            f"expected integers like {example}, got {text!r}"
-        ) from error
-
-
-def _envs() -> int:
-    """Prints a table of the registered environments."""
-    import newton_qd
-    from newton_qd.physics.precision import quiet
-
-    quiet()
-    rows = [("name", "observation", "action", "descriptor", "reward offset")]
-    for name in newton_qd.registered_envs():
-        env: Any = newton_qd.create(name)
-        descriptor = offset = "-"
-        if name in newton_qd.descriptor_extractor:
-            descriptor = f"{env.state_descriptor_name} ({env.descriptor_length})"
-            offset = f"{newton_qd.reward_offset[name]:g}"
-        sizes = str(env.observation_size), str(env.action_size)
-        rows.append((name, *sizes, descriptor, offset))
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    for row in rows:
-        cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
-        print("  ".join(cells).rstrip())
-    return OK
-
-
-def _doctor(arguments: argparse.Namespace) -> int:
-    """Prints a report, and writes it where asked."""
-    import newton_qd
-    from newton_qd.physics.precision import quiet
-
-    quiet()
-    try:
-        report = newton_qd.diagnose_gradients(
-            arguments.env_name,
-            horizons=arguments.horizons,
-            worlds=arguments.worlds,
-            directions=arguments.directions,
-            samples=arguments.samples,
-            sigma=arguments.sigma,
-            seed=arguments.seed,
-        )
-    except ValueError as error:
-        return _complain(arguments, error, BAD_ARGUMENTS)
-    print(report)
-    if arguments.out is not None:
-        report.write(arguments.out)
-        print(f"written to {arguments.out}")
-    return OK
-
-
-def _evolve(
+def run(
     arguments: argparse.Namespace,
     task_factory: Callable[[EvolveConfig], Task] | None,
 ) -> int:
+    """Evolves, or goes on, and returns the exit code.
+
+    Raises:
+        ConfigError: A setting is missing or wrong.
+    """
     config, out = _settle(arguments)
     if not arguments.checkpoint_seconds >= 0:
         raise ConfigError(
@@ -325,7 +179,7 @@ def _evolve(
             task_factory=make_task if task_factory is None else task_factory,
         )
     except SearchError as error:
-        return _complain(arguments, error, FAILED)
+        return complain(arguments, error, FAILED)
     _report(result, out)
     return INTERRUPTED if result.interrupted else OK
 
@@ -415,7 +269,3 @@ def _report(result: EvolveResult, out: Path) -> None:
             f"interrupted {when}; continue with:\n"
             f"  newton-qd evolve --resume --out {shlex.quote(str(out))}"
         )
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,0 +1,54 @@
+"""The command ``newton-qd``: environments, evolution, and what gradients are worth."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+from newton_qd.cli import doctor, envs, evolve
+from newton_qd.cli.arguments import BAD_ARGUMENTS, FAILED, OK, complain
+from newton_qd.errors import MissingExtra, UnknownEnvironment
+from newton_qd.qd.checkpoint import CheckpointError
+from newton_qd.qd.config import ConfigError, EvolveConfig
+from newton_qd.qd.interrupt import INTERRUPTED
+
+if TYPE_CHECKING:
+    from newton_qd.qd.task import Task
+
+__all__ = ["BAD_ARGUMENTS", "FAILED", "INTERRUPTED", "OK", "main"]
+
+
+def main(
+    argv: Sequence[str] | None = None,
+    *,
+    task_factory: Callable[[EvolveConfig], Task] | None = None,
+) -> int:
+    """Runs the command line.
+
+    Args:
+        argv: Arguments without the name of the program; those of the process by
+            default.
+        task_factory: Makes the task of ``evolve``; by default from the registered
+            environments.
+
+    Returns:
+        Exit code: 0 success, 1 failure, 2 bad arguments, 130 interrupted and saved.
+    """
+    parser = argparse.ArgumentParser(
+        prog="newton-qd", description="Quality-Diversity on differentiable physics."
+    )
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for command in (envs, evolve, doctor):
+        command.add_parser(commands)
+    arguments = parser.parse_args(argv)
+    try:
+        if arguments.command == "evolve":
+            return evolve.run(arguments, task_factory)
+        return arguments.run(arguments)
+    except (ConfigError, UnknownEnvironment) as error:
+        return complain(arguments, error, BAD_ARGUMENTS)
+    except (CheckpointError, MissingExtra, OSError) as error:
+        return complain(arguments, error, FAILED)
+    except KeyboardInterrupt:
+        return complain(arguments, "interrupted", INTERRUPTED)

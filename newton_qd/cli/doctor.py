@@ -1,0 +1,81 @@
+"""``newton-qd doctor``: what gradients are worth on an environment."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from newton_qd.cli.arguments import BAD_ARGUMENTS, OK, complain, widths
+
+
+def add_parser(commands: Any) -> None:
+    """Adds the command to the subparsers of ``newton-qd``."""
+    doctor = commands.add_parser("doctor", help="measure what gradients are worth")
+    ailments = doctor.add_subparsers(dest="ailment", required=True, metavar="WHAT")
+    parser = ailments.add_parser(
+        "gradients",
+        help="over how many control steps a gradient can be used, and why",
+        description="Compares the gradient of the return with central differences "
+        "and with an evolution strategy, horizon by horizon.",
+    )
+    parser.set_defaults(run=run)
+    parser.add_argument("env_name", metavar="ENV", help="environment, as ant_uni")
+    parser.add_argument(
+        "--horizons",
+        type=widths,
+        default=(1, 2, 4, 8, 16, 32, 64),
+        metavar="N,N",
+        help="numbers of control steps (default: 1,2,4,8,16,32,64)",
+    )
+    for name, default, text in (
+        ("worlds", 8, "random plans of actions"),
+        ("directions", 8, "directions of the differences, in each world"),
+        ("samples", 16, "pairs of noisy samples, in each world"),
+        ("seed", 0, "seed of every random number"),
+    ):
+        parser.add_argument(
+            f"--{name}",
+            type=int,
+            default=default,
+            metavar="N",
+            help=f"{text} (default: {default})",
+        )
+    parser.add_argument(
+        "--sigma",
+        type=float,
+        default=0.05,
+        metavar="X",
+        help="standard deviation of the noise on actions (default: 0.05)",
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="folder for horizons.csv, contacts.csv, report.txt and gradients.png",
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Prints a report, writes it where asked, and returns the exit code."""
+    import newton_qd
+    from newton_qd.physics.precision import quiet
+
+    quiet()
+    try:
+        report = newton_qd.diagnose_gradients(
+            arguments.env_name,
+            horizons=arguments.horizons,
+            worlds=arguments.worlds,
+            directions=arguments.directions,
+            samples=arguments.samples,
+            sigma=arguments.sigma,
+            seed=arguments.seed,
+        )
+    except ValueError as error:
+        return complain(arguments, error, BAD_ARGUMENTS)
+    print(report)
+    if arguments.out is not None:
+        report.write(arguments.out)
+        print(f"written to {arguments.out}")
+    return OK
