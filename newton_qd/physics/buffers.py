@@ -166,6 +166,32 @@ def _put_contacts(put: Any, system: System, tree: Tree) -> None:
     put("obstacle_size", system.obstacle_size)
 
 
+def _entries(system: System, adjoint: bool) -> dict[str, int]:
+    """Entries of each scratch array for one pack of worlds."""
+    n, nc = system.robot.substeps, max(len(system.contact_body), 1)
+    nf = len(system.feet)
+    # the state after the last substep has kinematics too
+    steps, solves = (n + 1, _SOLVES * n) if adjoint else (1, 1)
+    return {
+        "fault": 1,
+        "lost": 1,
+        "q": (n + 2) * system.nq,
+        "v": (n + 2) * system.nv,
+        "ctrl": max(system.nu, 1),
+        "parameter": 4 + 2 * system.nb + system.nv,
+        **dict.fromkeys(_PER_BODY, steps * (system.nb + 1)),
+        **dict.fromkeys(("axis_w", "axis_v"), steps * system.nv),
+        **dict.fromkeys(_PER_CONTACT, steps * nc),
+        **dict.fromkeys(_REPORTED, n * nc),
+        **dict.fromkeys(_PER_SOLVE_CONTACT, solves * nc),
+        **dict.fromkeys(_PER_SOLVE_BODY, solves * (system.nb + 1)),
+        "dv": solves * system.nv,
+        **dict.fromkeys(_PER_READING, system.nb + 1),
+        "torso_xy": 2,
+        **dict.fromkeys(("foot_contact", "smooth_foot_contact"), max(nf, 1)),
+    }
+
+
 def build_scratch(
     system: System,
     slots: int,
@@ -190,30 +216,8 @@ def build_scratch(
     """
     space = kernels_of(system, device, parametric)
     values, adjoints = space.structs.Scratch(), space.structs.Scratch()
-    n, nc = system.robot.substeps, max(len(system.contact_body), 1)
-    nf = len(system.feet)
-    # the state after the last substep has kinematics too
-    steps, solves = (n + 1, _SOLVES * n) if adjoint else (1, 1)
-    counts = {
-        "fault": 1,
-        "lost": 1,
-        "q": (n + 2) * system.nq,
-        "v": (n + 2) * system.nv,
-        "ctrl": max(system.nu, 1),
-        "parameter": 4 + 2 * system.nb + system.nv,
-        **dict.fromkeys(_PER_BODY, steps * (system.nb + 1)),
-        **dict.fromkeys(("axis_w", "axis_v"), steps * system.nv),
-        **dict.fromkeys(_PER_CONTACT, steps * nc),
-        **dict.fromkeys(_REPORTED, n * nc),
-        **dict.fromkeys(_PER_SOLVE_CONTACT, solves * nc),
-        **dict.fromkeys(_PER_SOLVE_BODY, solves * (system.nb + 1)),
-        "dv": solves * system.nv,
-        **dict.fromkeys(_PER_READING, system.nb + 1),
-        "torso_xy": 2,
-        **dict.fromkeys(("foot_contact", "smooth_foot_contact"), max(nf, 1)),
-    }
     size = 0
-    for name, count in counts.items():
+    for name, count in _entries(system, adjoint).items():
         dtype = space.structs.Scratch.vars[name].type.dtype
         array = wp.zeros(
             slots * count, dtype=dtype, device=device, requires_grad=adjoint
