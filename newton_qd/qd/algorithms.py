@@ -52,11 +52,13 @@ class Algorithm:
         make: Makes the emitter; raises ``ConfigError`` for options that it does not
             have.
         transitions: Whether its emitter learns from the steps of the episodes.
+        evaluates: Whether its emitter evaluates individuals by itself.
         evaluations: Episodes of one generation, given the settings.
     """
 
     make: Callable[[Parts], Any]
     transitions: bool = False
+    evaluates: bool = False
     evaluations: Callable[[EvolveConfig], int] = _batch_size
 
 
@@ -290,6 +292,8 @@ ALGORITHMS: Mapping[str, Algorithm] = {
     "pga-me": Algorithm(_pga_me, transitions=True),
     "dcrl-me": Algorithm(_dcrl_me, transitions=True),
     # The samples of a gradient, and the individual that they lead to.
-    "me-es": Algorithm(_me_es, evaluations=lambda config: config.batch_size + 1),
+    "me-es": Algorithm(
+        _me_es, evaluates=True, evaluations=lambda config: config.batch_size + 1
+    ),
 }
 """The algorithms of ``evolve`` by their names."""
