@@ -10,13 +10,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from newton_qd.qd.algorithms import ALGORITHMS, Parts
+from newton_qd.qd.algorithms import ALGORITHMS
 from newton_qd.qd.checkpoint import Checkpoint, CheckpointError
 from newton_qd.qd.config import ConfigError, EvolveConfig, settings_text
 from newton_qd.qd.corrected import Corrected, correct
 from newton_qd.qd.extras import require_extra
 from newton_qd.qd.folder import COLUMNS, Archive
-from newton_qd.qd.rollout import make_policy, make_scoring_function
+from newton_qd.qd.parts import Parts
+from newton_qd.qd.rollout import ScoringFunction, make_policy, make_scoring_function
 from newton_qd.qd.task import Task
 
 _CVT_SAMPLES_PER_CELL = 50
@@ -78,18 +79,14 @@ class Search:
         self._key_emitter = jax.random.fold_in(self._key_generations, 0)
         self._policy = make_policy(task.env, config.hidden)
         self._centroids = self._make_centroids()
-        score = make_scoring_function(
-            task,
-            self._policy,
-            config.episode_length,
-            transitions=self._algorithm.transitions,
-        )
+        score = self._scoring_function()
         self._emitter = self._algorithm.make(
             Parts(
                 config,
                 task,
                 self._policy,
                 lambda genotypes, _: score(genotypes, self._key_reset),
+                self._key_reset,
                 self._centroids,
             )
         )
@@ -219,6 +216,17 @@ class Search:
             ],
         )
 
+    def _scoring_function(self) -> ScoringFunction:
+        """The scoring function of the loop."""
+        if self._algorithm.scoring is not None:
+            return self._algorithm.scoring(self._config, self._task, self._policy)
+        return make_scoring_function(
+            self._task,
+            self._policy,
+            self._config.episode_length,
+            transitions=self._algorithm.transitions,
+        )
+
     def _proposed(self, repertoire: Any, emitter: Any, key: jax.Array) -> Any:
         """Next genotypes (N, size), and what the emitter wants told with them."""
         _, key = jax.random.split(key)
@@ -230,7 +238,7 @@ class Search:
         """Archive, emitter's state and metrics after the initial population."""
         repertoire, told = self._added(repertoire, genotypes, scores)
         emitter = self._emitter.init(key=self._key_emitter, **told)
-        return repertoire, emitter, self._measured(repertoire)
+        return repertoire, emitter, self._measured(repertoire, scores)
 
     def _told(
         self,
@@ -244,29 +252,33 @@ class Search:
         repertoire, told = self._added(repertoire, genotypes, scores)
         told["extra_scores"] = {**told["extra_scores"], **remembered}
         emitter = self._emitter.state_update(emitter, **told)
-        return repertoire, emitter, self._measured(repertoire)
+        return repertoire, emitter, self._measured(repertoire, scores)
 
     def _added(self, repertoire: Any, genotypes: Any, scores: Any) -> tuple[Any, dict]:
         """The archive with a generation in it, and what the emitter hears of that."""
         fitnesses, found, extra = scores
         kept = _break_ties(fitnesses, found, repertoire.centroids)
         repertoire = repertoire.add(genotypes, found, kept, {})
-        # Emitters take no infinite fitness: a faulty individual has the worst one.
-        worst = -self._task.reward_offset * self._config.episode_length
+        if not self._algorithm.takes_faulty:
+            worst = -self._task.reward_offset * self._config.episode_length
+            fitnesses = jnp.where(jnp.isfinite(fitnesses), fitnesses, worst)
         return repertoire, {
             "repertoire": repertoire,
             "genotypes": genotypes,
-            "fitnesses": jnp.where(jnp.isfinite(fitnesses), fitnesses, worst),
+            "fitnesses": fitnesses,
             "descriptors": found,
             "extra_scores": extra,
         }
 
-    def _measured(self, repertoire: Any) -> Any:
-        """QD score, coverage [%] and best fitness."""
+    def _measured(self, repertoire: Any, scores: Any) -> Any:
+        """QD score, coverage [%], best fitness and what a generation had rejected."""
         from qdax.utils.metrics import default_qd_metrics
 
         offset = self._task.reward_offset * self._config.episode_length
-        return default_qd_metrics(repertoire, qd_offset=offset)
+        fitnesses, found, _ = scores
+        finite = jnp.isfinite(fitnesses) & jnp.all(jnp.isfinite(found), axis=1)
+        metrics = default_qd_metrics(repertoire, qd_offset=offset)
+        return {**metrics, "rejected": jnp.sum(~finite)}
 
     def _make_centroids(self) -> jax.Array:
         """(cells, D) centres of the cells."""
