@@ -7,10 +7,13 @@ thrown away before the clock starts. What evaluates the elites again, for correc
 metrics, runs after the clock has stopped.
 
 A run is a process of its own and writes one csv file when it is finished; runs whose
-file exists are left out, so that a study can be stopped and continued. Settings are in
-``study/TASK.toml``.
+file exists are left out, so that a study can be stopped and continued. Settings of
+tasks are in ``study/TASK.toml``, those of algorithms, as many of each, in
+``study/variants.toml``. Which variant is best on a task is found first, with another
+seed:
 
-    python benchmarks/study.py --seconds 60 --seeds 5 --workers 2 --out runs
+    python benchmarks/study.py --tune --seconds 20 --workers 2 --out tuning
+    python benchmarks/study.py --tuned tuning --seconds 60 --workers 2 --out runs
     python benchmarks/study_report.py runs --out benchmarks/results/study.csv
 
 With ``--workers N`` N runs go on at once, on a CPU each with its share of the cores, on
@@ -22,6 +25,7 @@ from __future__ import annotations
 import argparse
 import csv
 import dataclasses
+import itertools
 import math
 import os
 import subprocess
@@ -45,28 +49,44 @@ TASKS = (
 ALGORITHMS = ("me", "cma-me", "pga-me", "me-gradient", "cma-maega")
 # Rows of a file: enough for a curve.
 POINTS = 200
+TUNING_SEED = 1000
 
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """A run of the study."""
+    """A run of the study.
+
+    Attributes:
+        task: Name of the environment.
+        variant: Key of ``variants.toml``, such as ``me@1``.
+        seed: Seed of every random number.
+    """
 
     task: str
-    algorithm: str
+    variant: str
     seed: int
 
-    def file(self, folder: Path) -> Path:
-        """Where its csv file is."""
-        return folder / f"{self.task}.{self.algorithm}.{self.seed}.csv"
+    @property
+    def algorithm(self) -> str:
+        """Name of the algorithm, such as ``me``."""
+        return self.variant.split("@")[0]
+
+    def file(self, folder: Path, name: str) -> Path:
+        """Where its csv file is, under the name of its variant or algorithm."""
+        return folder / f"{self.task}.{name}.{self.seed}.csv"
+
+
+def read(name: str) -> dict[str, Any]:
+    """Reads a file of settings."""
+    with (FOLDER / f"{name}.toml").open("rb") as file:
+        return tomllib.load(file)
 
 
 def config_of(run: Run) -> Any:
-    """Settings of a run: those of the task, then those of the algorithm on it."""
+    """Settings of a run: those of the task and those of the variant."""
     from newton_qd.qd import EvolveConfig
 
-    with (FOLDER / f"{run.task}.toml").open("rb") as file:
-        document = tomllib.load(file)
-    given = {**document["settings"], **document.get(run.algorithm, {})}
+    given = {**read(run.task), **read("variants")[run.variant]}
     return EvolveConfig(
         env_name=run.task,
         algorithm=run.algorithm,
@@ -74,6 +94,22 @@ def config_of(run: Run) -> Any:
         iterations=10**6,
         **given,
     )
+
+
+def best_variant(tuning: Path, task: str, algorithm: str) -> str:
+    """The variant with the highest final QD score.
+
+    Raises:
+        FileNotFoundError: None was tried.
+    """
+    scores = {}
+    for path in tuning.glob(f"{task}.{algorithm}@*.csv"):
+        with path.open(newline="", encoding="utf-8") as file:
+            *_, last = csv.DictReader(file)
+        scores[path.name.split(".")[1]] = float(last["qd_score"])
+    if not scores:
+        raise FileNotFoundError(f"{tuning} holds no run of {algorithm} on {task}")
+    return max(scores, key=lambda name: scores[name])
 
 
 def curve(search: Any, gradients: int, seconds: float, wall: bool) -> Iterator[dict]:
@@ -112,7 +148,7 @@ def curve(search: Any, gradients: int, seconds: float, wall: bool) -> Iterator[d
             }
 
 
-def execute(run: Run, seconds: float, device: str, out: Path) -> None:
+def execute(run: Run, seconds: float, device: str, file: Path) -> None:
     """Carries out a run and writes its file."""
     import newton_qd.compat
     from newton_qd.qd import make_task
@@ -140,7 +176,7 @@ def execute(run: Run, seconds: float, device: str, out: Path) -> None:
     for row in rows:
         values = vars(corrected) if corrected and row is rows[-1] else empty
         row.update({f"corrected_{name}": values[name] for name in empty})
-    write(run.file(out), rows)
+    write(file, rows)
 
 
 def write(path: Path, rows: list[dict]) -> None:
@@ -183,12 +219,12 @@ class Pool:
         """Starts this file again with other arguments."""
         args = self.args
         common = ["--seconds", str(args.seconds), "--device", args.device]
-        command = [sys.executable, __file__, *common, "--out", str(args.out), *what]
+        command = [sys.executable, __file__, *common, *what]
         variables = {**os.environ, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
         if args.device == "cuda":
             variables["CUDA_VISIBLE_DEVICES"] = str(slot % self.gpus)
         else:
-            variables["JAX_PLATFORMS"] = "cpu"
+            variables.update(JAX_PLATFORMS="cpu", CUDA_VISIBLE_DEVICES="")
             cores = sorted(os.sched_getaffinity(0))
             share = cores[slot % len(cores) :: len(self.slots)]
             command += ["--cores", *map(str, share)]
@@ -226,9 +262,40 @@ def arguments() -> argparse.Namespace:
         default=math.inf,
         help="start no run later than so many seconds after the command",
     )
+    parser.add_argument(
+        "--tune", action="store_true", help="run every variant, with a seed of its own"
+    )
+    parser.add_argument("--tuned", type=Path, help="folder of what --tune has found")
     parser.add_argument("--cores", type=int, nargs="*", help=argparse.SUPPRESS)
-    parser.add_argument("--run", nargs=3, help=argparse.SUPPRESS)
+    parser.add_argument("--run", nargs=4, help=argparse.SUPPRESS)
     return parser.parse_args()
+
+
+def planned(args: argparse.Namespace) -> list[tuple[Run, Path]]:
+    """Runs and their files.
+
+    Seeds come first, so that a study that was stopped has all tasks and algorithms.
+    """
+    kinds = list(itertools.product(args.tasks, args.algorithms))
+    if args.tune:
+        variants = read("variants")
+        runs = [
+            Run(task, variant, TUNING_SEED)
+            for task, algorithm in kinds
+            for variant in variants
+            if variant.split("@")[0] == algorithm
+        ]
+        return [(run, run.file(args.out, run.variant)) for run in runs]
+    chosen = {
+        kind: best_variant(args.tuned, *kind) if args.tuned else f"{kind[1]}@1"
+        for kind in kinds
+    }
+    runs = [
+        Run(task, variant, seed)
+        for seed in range(args.seeds)
+        for (task, _), variant in chosen.items()
+    ]
+    return [(run, run.file(args.out, run.algorithm)) for run in runs]
 
 
 def main() -> None:
@@ -237,26 +304,20 @@ def main() -> None:
     if args.cores:
         os.sched_setaffinity(0, args.cores)
     if args.run:
-        task, algorithm, seed = args.run
-        execute(Run(task, algorithm, int(seed)), args.seconds, args.device, args.out)
+        task, variant, seed, file = args.run
+        run = Run(task, variant, int(seed))
+        execute(run, args.seconds, args.device, Path(file))
         return
-    # Seeds first, so that a study that was stopped has all tasks and algorithms.
-    runs = [
-        Run(task, algorithm, seed)
-        for seed in range(args.seeds)
-        for task in args.tasks
-        for algorithm in args.algorithms
-    ]
-    missing = [run for run in runs if not run.file(args.out).exists()]
+    missing = [(run, file) for run, file in planned(args) if not file.exists()]
     pool = Pool(args, [None] * args.workers, args.gpus)
-    for number, run in enumerate(missing):
+    for number, (run, file) in enumerate(missing):
         slot = pool.wait()
         spent = time.monotonic() - begin
         if spent > args.start_until:
             print(f"{len(missing) - number} runs are left", flush=True)
             break
         print(f"{spent:5.0f} s: {run}, {number + 1} of {len(missing)}", flush=True)
-        pool.start(slot, "--run", run.task, run.algorithm, str(run.seed))
+        pool.start(slot, "--run", run.task, run.variant, str(run.seed), str(file))
     pool.drain()
 
 
