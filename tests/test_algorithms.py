@@ -37,6 +37,10 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "pga-me": CRITIC,
     "dcrl-me": CRITIC,
     "me-es": {"num_optimizer_steps": 2, "sample_sigma": 0.1, "learning_rate": 0.1},
+    "me-gradient": {},
+    "omg-mega": {},
+    "cma-mega": {"points": 2},
+    "cma-maega": {"points": 2, "adam": 0.05},
 }
 
 
@@ -95,8 +99,11 @@ def test_a_stop_changes_nothing(
     metrics = whole.metrics
     for column in ("qd_score", "coverage", "max_fitness"):
         assert metrics[column][-1] > metrics[column][0], column
-    each = 17 if name == "me-es" else 16
+    # What is differentiated counts, too: two parents, two solution points.
+    more = {"me-es": 1, "me-gradient": 2, "cma-mega": 2, "cma-maega": 2}
+    each = 16 + more.get(name, 0)
     np.testing.assert_array_equal(np.diff(metrics["evaluations"]), each)
+    assert not metrics["rejected"].any()
 
 
 def test_what_does_not_exist_is_refused(tmp_path: Path) -> None:
@@ -121,6 +128,42 @@ def test_shares_of_a_batch_that_do_not_fit_are_refused() -> None:
         with pytest.raises(ConfigError, match=r"must .* add up to batch_size \(16\)"):
             run(config)
     newton_qd.compat.uninstall()
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("me-gradient", {"share": 0}, r"share must be in \(0, 1\], got 0"),
+        ("me-gradient", {"branches": 0}, "branches must be at least 1, got 0"),
+        ("me-gradient", {"branches": 9}, "holds no parent with branches = 9"),
+        ("me-gradient", {"shortest": 3.0}, "0 < shortest <= longest, got shortest"),
+        ("omg-mega", {"sigma_g": -1.0}, "sigma_g must be positive, got -1.0"),
+        ("omg-mega", {"window": -1}, "window=-1: allowed: None, integers from 1"),
+        ("cma-mega", {"points": 3}, "points must divide batch_size = 16, got 3"),
+        ("cma-mega", {"points": 8}, "batch_size must be at least 3, got 2"),
+        ("cma-maega", {"learning_rate": 2.0}, r"learning_rate must be in \[0, 1\]"),
+    ],
+)
+def test_options_out_of_range_are_refused(
+    name: str, options: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ConfigError, match=message):
+        run(SMALL.replace(algorithm=name, options=options))
+
+
+@pytest.mark.parametrize("name", ["me-gradient", "cma-mega"])
+def test_faulty_individuals_are_counted(name: str) -> None:
+    """``PointEnv`` is faulty far right; gradients do not lead out of the archive."""
+    config = SMALL.replace(
+        algorithm=name,
+        iterations=6,
+        options={"longest": 9.0} if name == "me-gradient" else {"points": 2},
+    )
+    result = run(config)
+    assert result.metrics["rejected"].sum() > 0
+    archive = result.archive
+    assert np.isfinite(archive.genotypes).all()
+    assert np.isfinite(archive.fitnesses[archive.filled]).all()
 
 
 @pytest.mark.slow

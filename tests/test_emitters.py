@@ -21,10 +21,12 @@ from qdax.core.emitters.mutation_operators import isoline_variation
 from qdax.core.emitters.standard_emitters import MixingEmitter
 from qdax.core.map_elites import MAPElites
 
+from newton_qd.gradients import EpisodeGradients
 from newton_qd.qd.annealed_repertoire import AnnealedRepertoire
 from newton_qd.qd.emitters import (
     CMAMAEGAEmitter,
     CMAMEGAEmitter,
+    GradientLineEmitter,
     GradientsError,
     GradientVariationEmitter,
     OMGMEGAEmitter,
@@ -88,6 +90,18 @@ def isoline(batch_size: int) -> MixingEmitter:
     return MixingEmitter(no_mutation, variation, 1.0, batch_size)  # pyright: ignore[reportArgumentType]
 
 
+def along(scoring: Callable) -> Callable[..., EpisodeGradients]:
+    """Gradient along directions (N, R, 3) from a scoring function."""
+
+    def gradient(genotypes: Any, directions: Any, key: Any) -> EpisodeGradients:
+        fitnesses, descriptors, extra = scoring(genotypes, key)
+        rows = jnp.einsum("nrk,nsk->nrs", directions, extra["gradients"])
+        faulty = fitnesses == -jnp.inf
+        return EpisodeGradients(fitnesses, descriptors, rows, faulty, faulty[:, None])
+
+    return gradient
+
+
 MAKERS: dict[str, Callable[[Callable], Any]] = {
     "omg_mega": lambda f: OMGMEGAEmitter(16, sigma_g=0.5),
     "cma_mega": lambda f: CMAMEGAEmitter(f, sigma_g=0.5, batch_size=8, num_emitters=2),
@@ -104,6 +118,14 @@ MAKERS: dict[str, Callable[[Callable], Any]] = {
                 directions=[(1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)],
             ),
             SteeringEmitter(6, max_step=2.0, steps=2, scoring_function=f),
+            isoline(4),
+        )
+    ),
+    "line": lambda f: MultiEmitter(
+        (
+            GradientLineEmitter(
+                along(f), parents=3, branches=4, shortest=0.1, longest=3.0
+            ),
             isoline(4),
         )
     ),
@@ -220,7 +242,8 @@ def test_contains_what_is_not_finite(name: str) -> None:
     assert bool(jnp.all(jnp.isfinite(repertoire.genotypes)))
     assert float(jnp.max(jnp.abs(repertoire.genotypes))) <= 0.8
     assert float(rows["coverage"][-1]) > 0.1
-    assert rejected(state) > 0
+    # The line emitter has no state; the loop counts its individuals.
+    assert rejected(state) > 0 or name == "line"
 
 
 @pytest.mark.parametrize("name", MAKERS)
@@ -320,6 +343,27 @@ def test_steering_lands_in_empty_cells() -> None:
     steps = np.asarray(short)[:, None] - np.asarray(repertoire.genotypes)
     lengths = np.linalg.norm(steps, axis=-1).min(axis=1)
     assert np.all(lengths <= 0.1 * (1 + 1e-5))
+
+
+def test_lines_climb_and_steer() -> None:
+    emitter = GradientLineEmitter(
+        along(score), parents=4, branches=3, shortest=0.1, longest=0.8
+    )
+    repertoire, state = begin(emitter, count=1)
+    parent = np.asarray(start()[0])
+    steps = np.asarray(emit(emitter, repertoire, state)).reshape(4, 3, SIZE) - parent
+    lengths = np.linalg.norm(steps, axis=2)
+    edges = 0.1 * 8 ** (np.arange(4) / 3)
+    assert np.all((lengths >= edges[:-1] - 1e-5) & (lengths <= edges[1:] + 1e-5))
+    ways = steps / lengths[..., None]
+    gradients = np.asarray(score(start()[:1], jax.random.key(0))[2]["gradients"][0])
+    uphill = gradients[:, 0] / np.linalg.norm(gradients[:, 0])
+    np.testing.assert_allclose(ways[:2], np.broadcast_to(uphill, (2, 3, SIZE)), 1e-4)
+    # The others change the descriptors alone, which are means of halves.
+    for way in ways[2:]:
+        np.testing.assert_allclose(way, np.broadcast_to(way[0], way.shape), atol=1e-5)
+        halves = way[0].reshape(2, -1)
+        np.testing.assert_allclose(halves, halves[:, :1] * np.ones(10), atol=1e-5)
 
 
 def unbeatable(genotypes: jax.Array, key: jax.Array) -> tuple:
@@ -426,6 +470,11 @@ def test_errors_name_what_is_wrong() -> None:
         search.init(start(), centroids(), jax.random.key(0))
 
 
+def line(**changes: Any) -> GradientLineEmitter:
+    given = {"parents": 2, "branches": 2, "shortest": 0.1, "longest": 1.0, **changes}
+    return GradientLineEmitter(along(score), **given)
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -445,6 +494,12 @@ def test_errors_name_what_is_wrong() -> None:
             lambda: GradientVariationEmitter(4, optax.sgd(1.0), directions=[1.0]),
             "directions must be finite numbers",
         ),
+        (
+            lambda: line(parents=0),
+            "parents must be at least 1, got 0",
+        ),
+        (lambda: line(steered=2.0), r"steered must be in \[0, 1\], got 2.0"),
+        (lambda: line(longest=0.0), "shortest <= longest, got shortest = 0.1, longest"),
         (lambda: SteeringEmitter(4, max_step=0.0), "max_step must be positive"),
         (lambda: SteeringEmitter(4, max_step=1.0, steps=0), "steps must be at least 1"),
     ],

@@ -22,6 +22,7 @@ from newton_qd.extractors import (
 from newton_qd.gradients import (
     EpisodeGradients,
     GradientOptions,
+    make_directional_gradient,
     make_episode,
     make_episode_gradient,
     with_smooth_descriptor,
@@ -131,6 +132,25 @@ def test_value_is_that_without_gradient(hoppers: Any) -> None:
     result = gradient(weights, key)
     np.testing.assert_array_equal(result.fitnesses, outcome.fitness)
     np.testing.assert_array_equal(result.descriptors, outcome.descriptor)
+
+
+def test_directions_are_sums_of_rows(hoppers: Any) -> None:
+    env, gradient, weights, key = hoppers
+    along = make_directional_gradient(
+        env, feedback, get_feet_contact_proportion, episode_length=STEPS
+    )
+    directions = jnp.array([[[2.0, 0.0], [0.5, -3.0]]] * 16)
+    result = jax.jit(along)(weights, directions, key)
+    rows = gradient(weights, key)
+    np.testing.assert_array_equal(result.fitnesses, rows.fitnesses)
+    np.testing.assert_array_equal(result.descriptors, rows.descriptors)
+
+    def check(found: jax.Array, all_rows: jax.Array) -> None:
+        sums = jnp.einsum("nrk,nk...->nr...", directions, all_rows)
+        size = float(jnp.abs(sums).max())
+        np.testing.assert_allclose(found, sums, rtol=1e-4, atol=1e-5 * size)
+
+    jax.tree.map(check, result.gradients, rows.gradients)
 
 
 def test_worlds_and_runs_are_independent(hoppers: Any, device: Any) -> None:

@@ -188,7 +188,8 @@ def test_archive_rows_are_what_the_policies_do(reference: Path) -> None:
 
 def test_metrics_file(reference: Path) -> None:
     lines = (reference / "metrics.csv").read_text().splitlines()
-    assert lines[0] == "iteration,evaluations,env_steps,qd_score,coverage,max_fitness"
+    head = "iteration,evaluations,env_steps,rejected,qd_score,coverage,max_fitness"
+    assert lines[0] == head
     assert [int(line.split(",")[0]) for line in lines[1:]] == list(range(13))
 
 

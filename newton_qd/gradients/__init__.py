@@ -1,6 +1,7 @@
 """Gradients of fitness and descriptor over whole episodes, and what they are worth.
 
 - ``make_episode_gradient``: of a policy or of open-loop actions
+- ``make_directional_gradient``: of weighted sums of fitness and descriptor alone
 - ``make_mixed_gradient``: the same under noise, of first and zeroth order at once
 - ``GradientOptions``: windows, clipping, discounting, memory
 - ``diagnose_gradients``: over how many steps the gradient can be used
@@ -19,7 +20,11 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from newton_qd.gradients.doctor import diagnose_gradients
     from newton_qd.gradients.episode import Outcome, make_episode
-    from newton_qd.gradients.exact import EpisodeGradients, make_episode_gradient
+    from newton_qd.gradients.exact import (
+        EpisodeGradients,
+        make_directional_gradient,
+        make_episode_gradient,
+    )
     from newton_qd.gradients.flow import GradientOptions
     from newton_qd.gradients.mixed import MixedGradients, make_mixed_gradient
     from newton_qd.gradients.report import GradientReport
@@ -33,6 +38,7 @@ __all__ = [
     "MixedGradients",
     "Outcome",
     "diagnose_gradients",
+    "make_directional_gradient",
     "make_episode",
     "make_episode_gradient",
     "make_mixed_gradient",
@@ -48,6 +54,7 @@ _HOME = {
     "MixedGradients": "mixed",
     "Outcome": "episode",
     "diagnose_gradients": "doctor",
+    "make_directional_gradient": "exact",
     "make_episode": "episode",
     "make_episode_gradient": "exact",
     "make_mixed_gradient": "mixed",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any, TypeAlias
 
@@ -41,6 +42,9 @@ class EpisodeGradients:
 EpisodeGradient: TypeAlias = Callable[[Any, jax.Array], EpisodeGradients]
 """Maps N genotypes and the key of the reset that they share to their gradients."""
 
+DirectionalGradient: TypeAlias = Callable[[Any, jax.Array, jax.Array], EpisodeGradients]
+"""Maps N genotypes, directions (N, R, 1 + D) and a key to R gradients of each."""
+
 
 def make_episode_gradient(
     env: Any,
@@ -78,25 +82,80 @@ def make_episode_gradient(
         unravel=unravel,
         options=options or GradientOptions(),
     )
+    return jax.vmap(functools.partial(_differentiated, run, None), in_axes=(0, None))
 
-    def one(genotype: Any, key: jax.Array) -> EpisodeGradients:
-        def values(genotype: Any) -> tuple[jax.Array, Outcome]:
-            outcome = run(genotype, key)
-            return jnp.append(outcome.fitness, outcome.descriptor), outcome
 
-        rows, pull, outcome = jax.vjp(values, genotype, has_aux=True)
-        (gradients,) = jax.vmap(pull)(jnp.eye(rows.size, dtype=rows.dtype))
-        sound = finite_rows(gradients)
-        zeros = jax.tree.map(jnp.zeros_like, gradients)
-        return EpisodeGradients(
-            fitnesses=jnp.where(outcome.faulty, -jnp.inf, outcome.fitness),
-            descriptors=outcome.descriptor,
-            gradients=select(sound & ~outcome.faulty, gradients, zeros),
-            faulty=outcome.faulty,
-            overflowed=~sound & ~outcome.faulty,
-        )
+def make_directional_gradient(
+    env: Any,
+    policy: Policy | None,
+    descriptor_extractor: Callable[[Any, jax.Array], jax.Array],
+    *,
+    episode_length: int,
+    unravel: Callable[[Any], Any] = lambda genotype: genotype,
+    options: GradientOptions | None = None,
+) -> DirectionalGradient:
+    """Builds the gradient of weighted sums of an episode's fitness and descriptor.
 
-    return jax.vmap(one, in_axes=(0, None))
+    What :func:`make_episode_gradient` gives, multiplied by directions, for the price
+    of as many rows as there are directions: a launch of the physics' adjoint has N R
+    worlds.
+
+    Args:
+        env: As in :func:`make_episode_gradient`; so are all others.
+        policy: Maps parameters and an observation to an action, or ``None``.
+        descriptor_extractor: Reads the descriptor of an episode.
+        episode_length: Control steps.
+        unravel: Maps a genotype to the parameters of the policy.
+        options: Windows, clipping, discounting and memory.
+
+    Returns:
+        Function of genotypes, directions (N, R, 1 + D), whose first column weights the
+        fitness, and one key; the rows (N, R, ...) of its gradients are those of the
+        weighted sums.
+    """
+    run = make_episode(
+        env,
+        policy,
+        descriptor_extractor,
+        episode_length=episode_length,
+        unravel=unravel,
+        options=options or GradientOptions(),
+    )
+
+    def gradient(
+        genotypes: Any, directions: jax.Array, key: jax.Array
+    ) -> EpisodeGradients:
+        one = functools.partial(_differentiated, run)
+        return jax.vmap(one, in_axes=(0, 0, None))(directions, genotypes, key)
+
+    return gradient
+
+
+def _differentiated(
+    run: Callable[[Any, jax.Array], Outcome],
+    directions: jax.Array | None,
+    genotype: Any,
+    key: jax.Array,
+) -> EpisodeGradients:
+    """One episode with its gradient along directions (R, 1 + D); ``None``: each."""
+
+    def values(genotype: Any) -> tuple[jax.Array, Outcome]:
+        outcome = run(genotype, key)
+        return jnp.append(outcome.fitness, outcome.descriptor), outcome
+
+    rows, pull, outcome = jax.vjp(values, genotype, has_aux=True)
+    if directions is None:
+        directions = jnp.eye(rows.size, dtype=rows.dtype)
+    (gradients,) = jax.vmap(pull)(directions.astype(rows.dtype))
+    sound = finite_rows(gradients)
+    zeros = jax.tree.map(jnp.zeros_like, gradients)
+    return EpisodeGradients(
+        fitnesses=jnp.where(outcome.faulty, -jnp.inf, outcome.fitness),
+        descriptors=outcome.descriptor,
+        gradients=select(sound & ~outcome.faulty, gradients, zeros),
+        faulty=outcome.faulty,
+        overflowed=~sound & ~outcome.faulty,
+    )
 
 
 def finite_rows(tree: Any) -> jax.Array:

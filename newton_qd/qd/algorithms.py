@@ -7,7 +7,6 @@ that need the parameters of a network see them through ``_OfParameters``.
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -15,51 +14,10 @@ import jax
 import jax.numpy as jnp
 
 from newton_qd import compat
-from newton_qd.qd.config import ConfigError, EvolveConfig
+from newton_qd.qd.config import ConfigError
+from newton_qd.qd.gradient_algorithms import GRADIENT_ALGORITHMS
+from newton_qd.qd.parts import Algorithm, Parts, isoline, isoline_emitter, settings
 from newton_qd.qd.rollout import Policy
-from newton_qd.qd.task import Task
-
-
-@dataclasses.dataclass(frozen=True)
-class Parts:
-    """What an emitter may be made of.
-
-    Attributes:
-        config: Settings.
-        task: Environment and descriptor.
-        policy: Policy whose weights are the genotypes.
-        score: Scoring function of genotypes (N, size) and a key that is not used:
-            all evaluations of a run begin in one state.
-        centroids: (cells, D) centres of the cells.
-    """
-
-    config: EvolveConfig
-    task: Task
-    policy: Policy
-    score: Callable[[Any, Any], Any]
-    centroids: jax.Array
-
-
-def _batch_size(config: EvolveConfig) -> int:
-    return config.batch_size
-
-
-@dataclasses.dataclass(frozen=True)
-class Algorithm:
-    """One row of ``ALGORITHMS``.
-
-    Attributes:
-        make: Makes the emitter; raises ``ConfigError`` for options that it does not
-            have.
-        transitions: Whether its emitter learns from the steps of the episodes.
-        evaluates: Whether its emitter evaluates individuals by itself.
-        evaluations: Episodes of one generation, given the settings.
-    """
-
-    make: Callable[[Parts], Any]
-    transitions: bool = False
-    evaluates: bool = False
-    evaluations: Callable[[EvolveConfig], int] = _batch_size
 
 
 class _OfParameters:
@@ -110,32 +68,6 @@ class _OfParameters:
         }
 
 
-def _settings(kind: Any, config: EvolveConfig, **defaults: Any) -> Any:
-    """Fills QDax's settings of an emitter with the options of a run."""
-    allowed = {field.name for field in dataclasses.fields(kind)}
-    for name, value in config.options:
-        if name not in allowed:
-            raise ConfigError(
-                f"options: {config.algorithm!r} has no {name!r}; allowed: "
-                f"{', '.join(sorted(allowed)) or 'none'}"
-            )
-        defaults[name] = value
-    return kind(**defaults)
-
-
-def _no_mutation(genotypes: Any, key: jax.Array) -> Any:
-    del key
-    return genotypes
-
-
-def _variation(config: EvolveConfig) -> Any:
-    from qdax.core.emitters.mutation_operators import isoline_variation
-
-    return functools.partial(
-        isoline_variation, iso_sigma=config.iso_sigma, line_sigma=config.line_sigma
-    )
-
-
 @dataclasses.dataclass(frozen=True)
 class _NoOptions:
     """Settings of an algorithm that has no others than those of a run."""
@@ -143,15 +75,8 @@ class _NoOptions:
 
 def _me(parts: Parts) -> Any:
     """MAP-Elites with iso+line variation (Vassiliades and Mouret 2018)."""
-    from qdax.core.emitters.standard_emitters import MixingEmitter
-
-    _settings(_NoOptions, parts.config)
-    return MixingEmitter(
-        mutation_fn=_no_mutation,
-        variation_fn=_variation(parts.config),
-        variation_percentage=1.0,
-        batch_size=parts.config.batch_size,
-    )
+    settings(_NoOptions, parts.config)
+    return isoline_emitter(parts.config, parts.config.batch_size)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -172,7 +97,7 @@ def _cma_me(parts: Parts) -> Any:
     from qdax.core.emitters.cma_improvement_emitter import CMAImprovementEmitter
     from qdax.core.emitters.cma_pool_emitter import CMAPoolEmitter
 
-    options = _settings(CMAMEOptions, parts.config)
+    options = settings(CMAMEOptions, parts.config)
     emitter = CMAImprovementEmitter(
         batch_size=parts.config.batch_size,
         genotype_dim=parts.policy.size,
@@ -193,14 +118,14 @@ def _pga_me(parts: Parts) -> Any:
     from qdax.core.emitters.pga_me_emitter import PGAMEConfig, PGAMEEmitter
     from qdax.core.neuroevolution.buffers.buffer import QDTransition
 
-    options = _settings(
+    options = settings(
         PGAMEConfig,
         parts.config,
         env_batch_size=parts.config.batch_size,
         replay_buffer_size=_REPLAY_BUFFER,
     )
     emitter = PGAMEEmitter(
-        options, parts.policy.network, parts.task.env, _variation(parts.config)
+        options, parts.policy.network, parts.task.env, isoline(parts.config)
     )
     return _OfParameters(emitter, parts.policy, lambda steps: QDTransition(**steps))
 
@@ -214,7 +139,7 @@ def _dcrl_me(parts: Parts) -> Any:
 
     config = parts.config
     quarter = config.batch_size // 4
-    options = _settings(
+    options = settings(
         DCRLMEConfig,
         config,
         ga_batch_size=config.batch_size - 2 * quarter,
@@ -244,7 +169,7 @@ def _dcrl_me(parts: Parts) -> Any:
         )
 
     emitter = DCRLMEEmitter(
-        options, parts.policy.network, actor, parts.task.env, _variation(config)
+        options, parts.policy.network, actor, parts.task.env, isoline(config)
     )
     return _OfParameters(emitter, parts.policy, convert)
 
@@ -268,7 +193,7 @@ def _me_es(parts: Parts) -> Any:
     from qdax.core.emitters.mees_emitter import MEESConfig, MEESEmitter
 
     samples = parts.config.batch_size
-    options = _settings(MEESConfig, parts.config, sample_number=samples)
+    options = settings(MEESConfig, parts.config, sample_number=samples)
     if options.sample_number != samples:
         raise ConfigError(
             f"options: sample_number is batch_size ({samples}), not "
@@ -295,5 +220,6 @@ ALGORITHMS: Mapping[str, Algorithm] = {
     "me-es": Algorithm(
         _me_es, evaluates=True, evaluations=lambda config: config.batch_size + 1
     ),
+    **GRADIENT_ALGORITHMS,
 }
 """The algorithms of ``evolve`` by their names."""

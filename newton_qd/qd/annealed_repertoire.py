@@ -126,10 +126,7 @@ class AnnealedRepertoire(MapElitesRepertoire, kw_only=True):
         Raises:
             ValueError: ``learning_rate`` or ``threshold_min`` is out of its range.
         """
-        if not 0 <= learning_rate <= 1:
-            raise ValueError(f"learning_rate must be in [0, 1], got {learning_rate}")
-        if not math.isfinite(threshold_min):
-            raise ValueError(f"threshold_min must be finite, got {threshold_min}")
+        check_annealing(learning_rate, threshold_min)
         empty = MapElitesRepertoire.init_default(
             jax.tree.map(lambda leaf: leaf[0], genotypes),
             centroids,
@@ -150,3 +147,15 @@ class AnnealedRepertoire(MapElitesRepertoire, kw_only=True):
             learning_rate=learning_rate,
         )
         return repertoire.add(genotypes, descriptors, fitnesses, extra_scores)
+
+
+def check_annealing(learning_rate: float, threshold_min: float) -> None:
+    """Checks the settings of the thresholds.
+
+    Raises:
+        ValueError: A setting is out of its range.
+    """
+    if not 0 <= learning_rate <= 1:
+        raise ValueError(f"learning_rate must be in [0, 1], got {learning_rate}")
+    if not math.isfinite(threshold_min):
+        raise ValueError(f"threshold_min must be finite, got {threshold_min}")

@@ -47,11 +47,12 @@ COLUMNS = (
     "iteration",
     "evaluations",
     "env_steps",
+    "rejected",
     "qd_score",
     "coverage",
     "max_fitness",
 )
-_WHOLE_COLUMNS = 3
+_WHOLE_COLUMNS = 4
 
 
 class RunFolder:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from newton_qd.qd.algorithms import ALGORITHMS, Parts
+from newton_qd.qd.algorithms import ALGORITHMS
 from newton_qd.qd.archive import Archive
 from newton_qd.qd.cells import cell_centroids
 from newton_qd.qd.checkpoint import Checkpoint, CheckpointError
@@ -19,6 +19,7 @@ from newton_qd.qd.config import ConfigError, EvolveConfig, settings_text
 from newton_qd.qd.corrected import Corrected, correct
 from newton_qd.qd.extras import require_extra
 from newton_qd.qd.folder import COLUMNS
+from newton_qd.qd.parts import Parts
 from newton_qd.qd.rollout import ScoringFunction, make_policy, make_scoring_function
 from newton_qd.qd.sharding import on_mesh, shard_scoring
 from newton_qd.qd.task import Task
@@ -84,13 +85,14 @@ class Search:
         self._key_emitter = jax.random.fold_in(self._key_generations, 0)
         self._policy = make_policy(task.env, config.hidden)
         self._centroids = cell_centroids(config, task.limits, key_centroids)
-        score = self._scoring(transitions=self._algorithm.transitions)
+        score = self._scoring()
         self._emitter = self._algorithm.make(
             Parts(
                 config,
                 task,
                 self._policy,
                 lambda genotypes, _: score(genotypes, self._key_reset),
+                self._key_reset,
                 self._centroids,
             )
         )
@@ -171,7 +173,7 @@ class Search:
             return None
         return correct(
             archive,
-            self._compiled(self._scoring()),
+            self._compiled(self._plain_scoring()),
             self._key_corrected,
             reevaluations=self._config.reevaluations,
             offset=self._task.reward_offset * self._config.episode_length,
@@ -201,7 +203,7 @@ class Search:
         """Puts the leaves of a checkpoint where they belong."""
         shape = (self._config.batch_size, self._policy.size)
         genotypes = jax.ShapeDtypeStruct(shape, jnp.float32)
-        score = self._scoring(transitions=self._algorithm.transitions)
+        score = self._scoring()
         scores = jax.eval_shape(score, genotypes, self._key_reset)
         repertoire = self.empty().repertoire
         example = jax.eval_shape(self._begun, repertoire, genotypes, scores)[1]
@@ -222,12 +224,24 @@ class Search:
                 )
         return jax.tree.unflatten(structure, restored)
 
-    def _scoring(self, transitions: bool = False) -> ScoringFunction:
-        """Scoring function of this task, split over the mesh."""
-        length = self._config.episode_length
-        score = make_scoring_function(
-            self._task, self._policy, length, transitions=transitions
+    def _scoring(self) -> ScoringFunction:
+        """The scoring function of the loop, split over the mesh."""
+        if self._algorithm.scoring is None:
+            return self._plain_scoring(self._algorithm.transitions)
+        return self._split(
+            self._algorithm.scoring(self._config, self._task, self._policy)
         )
+
+    def _plain_scoring(self, transitions: bool = False) -> ScoringFunction:
+        """A scoring function without gradients, split over the mesh."""
+        length = self._config.episode_length
+        return self._split(
+            make_scoring_function(
+                self._task, self._policy, length, transitions=transitions
+            )
+        )
+
+    def _split(self, score: ScoringFunction) -> ScoringFunction:
         return score if self._mesh is None else shard_scoring(score, self._mesh)
 
     def _compiled(self, function: Callable[..., Any], evaluates: bool = True) -> Any:
@@ -247,7 +261,7 @@ class Search:
         """Archive, emitter's state and metrics after the initial population."""
         repertoire, told = self._added(repertoire, genotypes, scores)
         emitter = self._emitter.init(key=self._key_emitter, **told)
-        return repertoire, emitter, self._measured(repertoire)
+        return repertoire, emitter, self._measured(repertoire, scores)
 
     def _told(
         self,
@@ -261,29 +275,33 @@ class Search:
         repertoire, told = self._added(repertoire, genotypes, scores)
         told["extra_scores"] = {**told["extra_scores"], **remembered}
         emitter = self._emitter.state_update(emitter, **told)
-        return repertoire, emitter, self._measured(repertoire)
+        return repertoire, emitter, self._measured(repertoire, scores)
 
     def _added(self, repertoire: Any, genotypes: Any, scores: Any) -> tuple[Any, dict]:
         """The archive with a generation in it, and what the emitter hears of that."""
         fitnesses, found, extra = scores
         kept = _break_ties(fitnesses, found, repertoire.centroids)
         repertoire = repertoire.add(genotypes, found, kept, {})
-        # Emitters take no infinite fitness: a faulty individual has the worst one.
-        worst = -self._task.reward_offset * self._config.episode_length
+        if not self._algorithm.takes_faulty:
+            worst = -self._task.reward_offset * self._config.episode_length
+            fitnesses = jnp.where(jnp.isfinite(fitnesses), fitnesses, worst)
         return repertoire, {
             "repertoire": repertoire,
             "genotypes": genotypes,
-            "fitnesses": jnp.where(jnp.isfinite(fitnesses), fitnesses, worst),
+            "fitnesses": fitnesses,
             "descriptors": found,
             "extra_scores": extra,
         }
 
-    def _measured(self, repertoire: Any) -> Any:
-        """QD score, coverage [%] and best fitness."""
+    def _measured(self, repertoire: Any, scores: Any) -> Any:
+        """QD score, coverage [%], best fitness and what a generation had rejected."""
         from qdax.utils.metrics import default_qd_metrics
 
         offset = self._task.reward_offset * self._config.episode_length
-        return default_qd_metrics(repertoire, qd_offset=offset)
+        fitnesses, found, _ = scores
+        finite = jnp.isfinite(fitnesses) & jnp.all(jnp.isfinite(found), axis=1)
+        metrics = default_qd_metrics(repertoire, qd_offset=offset)
+        return {**metrics, "rejected": jnp.sum(~finite)}
 
 
 def _leaf_to_host(leaf: Any) -> np.ndarray:

@@ -4,10 +4,12 @@
 - ``CMAMEGAEmitter``: CMA-ES searches for the steps along the gradients of a solution
   point
 - ``CMAMAEGAEmitter``: the same on an annealed archive, ``AnnealedRepertoire``
+- ``GradientLineEmitter``: several offspring along one gradient of each parent
 - ``GradientVariationEmitter``: elites climb their fitness, or move along descriptors
 - ``SteeringEmitter``: elites move towards empty cells
 
-All of them read ``extra_scores["gradients"]`` as ``gradients.py`` describes, run under
+``GradientLineEmitter`` evaluates its own gradients; all others read
+``extra_scores["gradients"]`` as ``gradients.py`` describes. All of them run under
 ``jax.jit`` and ``jax.lax.scan``, and mix with QDax's emitters in its ``MultiEmitter``.
 """
 
@@ -21,6 +23,7 @@ from newton_qd.qd.extras import require_extra
 if TYPE_CHECKING:
     from newton_qd.qd.emitters.cma_maega import CMAMAEGAEmitter
     from newton_qd.qd.emitters.cma_mega import CMAMEGAEmitter
+    from newton_qd.qd.emitters.gradient_line import GradientLineEmitter
     from newton_qd.qd.emitters.gradient_variation import GradientVariationEmitter
     from newton_qd.qd.emitters.gradients import GradientsError
     from newton_qd.qd.emitters.omg_mega import OMGMEGAEmitter
@@ -30,6 +33,7 @@ if TYPE_CHECKING:
 __all__ = [
     "CMAMAEGAEmitter",
     "CMAMEGAEmitter",
+    "GradientLineEmitter",
     "GradientVariationEmitter",
     "GradientsError",
     "OMGMEGAEmitter",
@@ -40,6 +44,7 @@ __all__ = [
 _HOME = {
     "CMAMAEGAEmitter": "cma_maega",
     "CMAMEGAEmitter": "cma_mega",
+    "GradientLineEmitter": "gradient_line",
     "GradientVariationEmitter": "gradient_variation",
     "GradientsError": "gradients",
     "OMGMEGAEmitter": "omg_mega",

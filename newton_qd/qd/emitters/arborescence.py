@@ -15,7 +15,7 @@ Any number of points search in parallel; their states carry a leading axis E.
 from __future__ import annotations
 
 import abc
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -77,7 +77,13 @@ class ArborescenceState(EmitterState):
 
 
 class ArborescenceEmitter(Emitter, abc.ABC):
-    """Emitter of E solution points; subclasses say how offspring rank."""
+    """Emitter of E solution points; subclasses say how offspring rank.
+
+    Attributes:
+        default_restart_rule: When a point restarts, if nothing else is asked for.
+    """
+
+    default_restart_rule: ClassVar[RestartRule]
 
     def __init__(
         self,
@@ -87,7 +93,7 @@ class ArborescenceEmitter(Emitter, abc.ABC):
         batch_size: int = 36,
         num_emitters: int = 1,
         optimizer: optax.GradientTransformation | None = None,
-        restart_rule: RestartRule,
+        restart_rule: RestartRule | None = None,
         restart_period: int | None = None,
         start: ArrayLike | None = None,
     ) -> None:
@@ -104,7 +110,7 @@ class ArborescenceEmitter(Emitter, abc.ABC):
             optimizer: Takes the gradient steps of the points, such as
                 ``optax.adam(0.002)``. None is gradient ascent with rate 1, which
                 moves a point to the weighted mean of its best offspring.
-            restart_rule: When a point restarts.
+            restart_rule: When a point restarts; None is the rule of the paper.
             restart_period: Restart after this many updates in any case.
             start: (size,) first solution point. None draws elites of the initial
                 repertoire.
@@ -126,7 +132,7 @@ class ArborescenceEmitter(Emitter, abc.ABC):
         self._population = batch_size
         self._num_emitters = num_emitters
         self._optimizer = optax.sgd(1.0) if optimizer is None else optimizer
-        self._restart_rule = restart_rule
+        self._restart_rule = restart_rule or self.default_restart_rule
         self._restart_period = restart_period
         self._start = start
 
@@ -258,10 +264,7 @@ class ArborescenceEmitter(Emitter, abc.ABC):
         strategy = self._strategy(descriptors.shape[-1])
         age = state.age + 1
         restart = flat | ~state.finite | jax.vmap(strategy.stopped)(cma_es)
-        if self._restart_rule is RestartRule.NO_IMPROVEMENT:
-            restart |= ~improved
-        if self._restart_period is not None:
-            restart |= age >= self._restart_period
+        restart |= self._given_up(improved, age)
 
         key, elite_key, score_key, sample_key = jax.random.split(state.key, 4)
         elites = repertoire.select(elite_key, self._num_emitters).genotypes
@@ -277,6 +280,15 @@ class ArborescenceEmitter(Emitter, abc.ABC):
             restarts=state.restarts + jnp.sum(restart, dtype=jnp.int32),
             rejected=state.rejected + jnp.sum(~finite, dtype=jnp.int32),
         )
+
+    def _given_up(self, improved: jax.Array, age: jax.Array) -> jax.Array:
+        """(E,) whether points restart by the rule or by their age."""
+        restart = jnp.zeros_like(improved)
+        if self._restart_rule is RestartRule.NO_IMPROVEMENT:
+            restart |= ~improved
+        if self._restart_period is not None:
+            restart |= age >= self._restart_period
+        return restart
 
     def _strategy(self, descriptor_length: int) -> CMAES:
         return CMAES(1 + descriptor_length, self._population - 1, self._sigma_g)

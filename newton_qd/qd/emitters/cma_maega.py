@@ -6,12 +6,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import optax
-from jax.typing import ArrayLike
 
 from newton_qd.qd.annealed_repertoire import AnnealedRepertoire
 from newton_qd.qd.emitters.arborescence import ArborescenceEmitter
-from newton_qd.qd.emitters.gradients import ScoringFunction
 from newton_qd.qd.emitters.restarts import RestartRule
 
 
@@ -23,29 +20,7 @@ class CMAMAEGAEmitter(ArborescenceEmitter):
     fitness above the threshold of their cell. Needs an ``AnnealedRepertoire``.
     """
 
-    def __init__(
-        self,
-        scoring_function: ScoringFunction,
-        *,
-        sigma_g: float,
-        batch_size: int = 36,
-        num_emitters: int = 1,
-        optimizer: optax.GradientTransformation | None = None,
-        restart_rule: RestartRule = RestartRule.BASIC,
-        restart_period: int | None = None,
-        start: ArrayLike | None = None,
-    ) -> None:
-        """Sets up the search as ``ArborescenceEmitter`` describes."""
-        super().__init__(
-            scoring_function,
-            sigma_g=sigma_g,
-            batch_size=batch_size,
-            num_emitters=num_emitters,
-            optimizer=optimizer,
-            restart_rule=restart_rule,
-            restart_period=restart_period,
-            start=start,
-        )
+    default_restart_rule = RestartRule.BASIC
 
     def _bars(self, repertoire: Any) -> jax.Array:
         if not isinstance(repertoire, AnnealedRepertoire):

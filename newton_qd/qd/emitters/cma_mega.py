@@ -6,8 +6,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import optax
-from jax.typing import ArrayLike
 
 from newton_qd.qd.emitters.arborescence import (
     IMPROVED,
@@ -15,7 +13,6 @@ from newton_qd.qd.emitters.arborescence import (
     WORSE,
     ArborescenceEmitter,
 )
-from newton_qd.qd.emitters.gradients import ScoringFunction
 from newton_qd.qd.emitters.restarts import RestartRule
 
 
@@ -27,29 +24,7 @@ class CMAMEGAEmitter(ArborescenceEmitter):
     each ordered by improvement (two-stage improvement ranking, Fontaine et al. 2020).
     """
 
-    def __init__(
-        self,
-        scoring_function: ScoringFunction,
-        *,
-        sigma_g: float,
-        batch_size: int = 36,
-        num_emitters: int = 1,
-        optimizer: optax.GradientTransformation | None = None,
-        restart_rule: RestartRule = RestartRule.NO_IMPROVEMENT,
-        restart_period: int | None = None,
-        start: ArrayLike | None = None,
-    ) -> None:
-        """Sets up the search as ``ArborescenceEmitter`` describes."""
-        super().__init__(
-            scoring_function,
-            sigma_g=sigma_g,
-            batch_size=batch_size,
-            num_emitters=num_emitters,
-            optimizer=optimizer,
-            restart_rule=restart_rule,
-            restart_period=restart_period,
-            start=start,
-        )
+    default_restart_rule = RestartRule.NO_IMPROVEMENT
 
     def _bars(self, repertoire: Any) -> jax.Array:
         return repertoire.fitnesses[:, 0]

@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from newton_qd.qd.emitters.cells import empty_targets, nearest_cells
 from newton_qd.qd.emitters.elite_gradients import EliteGradientEmitter
 from newton_qd.qd.emitters.gradients import ScoringFunction, read_scores
 
@@ -81,11 +82,9 @@ class SteeringEmitter(EliteGradientEmitter):
                 shape.
         """
         target_key, score_key = jax.random.split(key)
-        targets = self._targets(repertoire, target_key)
+        targets = empty_targets(repertoire, target_key, self._batch_size)
         known = emitter_state.known(repertoire)
-        parents = jax.vmap(_nearest, (None, None, 0))(
-            repertoire.descriptors, known, targets
-        )
+        parents = nearest_cells(repertoire.descriptors, known, targets)
         genotypes = repertoire.genotypes[parents]
         gradients = emitter_state.at(repertoire, parents)
         genotypes += self._step(
@@ -103,15 +102,6 @@ class SteeringEmitter(EliteGradientEmitter):
             genotypes, _ = jax.lax.scan(step, genotypes, keys)
         return genotypes, {}
 
-    def _targets(self, repertoire: Any, key: jax.Array) -> jax.Array:
-        """(batch_size, D) centres of empty cells."""
-        empty = repertoire.fitnesses[:, 0] == -jnp.inf
-        weights = (empty | ~jnp.any(empty)).astype(repertoire.centroids.dtype)
-        cells = jax.random.choice(
-            key, empty.shape[0], (self._batch_size,), p=weights / jnp.sum(weights)
-        )
-        return repertoire.centroids[cells]
-
     def _step(self, jacobian: jax.Array, error: jax.Array) -> jax.Array:
         """(N, size) steps that reduce errors (N, D), for Jacobians (N, D, size)."""
         size = jacobian.shape[1]
@@ -123,9 +113,3 @@ class SteeringEmitter(EliteGradientEmitter):
         step = jnp.einsum("nd,nds->ns", weights, jacobian)
         length = jnp.linalg.norm(step, axis=1, keepdims=True)
         return step * (self._max_step / jnp.maximum(length, self._max_step))
-
-
-def _nearest(descriptors: jax.Array, known: jax.Array, target: jax.Array) -> jax.Array:
-    """() cell of the known elite whose descriptor is nearest to a target (D,)."""
-    distances = jnp.sum((descriptors - target) ** 2, axis=-1)
-    return jnp.argmin(jnp.where(known, distances, jnp.inf))

@@ -1,0 +1,325 @@
+"""Compare gradient-based emitters with gradient-free ones on the environments.
+
+Every run, of one task, algorithm and seed, has the same budget of seconds: processor
+seconds on a CPU, which do not depend on what else the machine does, and wall-clock
+seconds on a GPU. Compilation is left out: all functions run once on a state that is
+thrown away before the clock starts. What evaluates the elites again, for corrected
+metrics, runs after the clock has stopped.
+
+A run is a process of its own and writes one csv file when it is finished; runs whose
+file exists are left out, so that a study can be stopped and continued. Settings of
+tasks are in ``study/TASK.toml``, those of algorithms, as many of each, in
+``study/variants.toml``. Which variant is best on a task is found first, with another
+seed:
+
+    python benchmarks/study.py --tune --seconds 20 --workers 2 --out tuning
+    python benchmarks/study.py --tuned tuning --seconds 60 --workers 2 --out runs
+    python benchmarks/study_report.py runs --out benchmarks/results/study.csv
+
+With ``--workers N`` N runs go on at once, on a CPU each with its share of the cores, on
+GPUs in turn on each of them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import dataclasses
+import itertools
+import math
+import os
+import subprocess
+import sys
+import time
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+FOLDER = Path(__file__).resolve().parent / "study"
+TASKS = (
+    "ant_uni",
+    "ant_omni",
+    "halfcheetah_uni",
+    "walker2d_uni",
+    "hopper_uni",
+    "anttrap",
+    "pointmaze",
+)
+ALGORITHMS = ("me", "cma-me", "pga-me", "me-gradient", "cma-maega")
+# Rows of a file: enough for a curve.
+POINTS = 200
+TUNING_SEED = 1000
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """A run of the study.
+
+    Attributes:
+        task: Name of the environment.
+        variant: Key of ``variants.toml``, such as ``me@1``.
+        seed: Seed of every random number.
+    """
+
+    task: str
+    variant: str
+    seed: int
+
+    @property
+    def algorithm(self) -> str:
+        """Name of the algorithm, such as ``me``."""
+        return self.variant.split("@")[0]
+
+    def file(self, folder: Path, name: str) -> Path:
+        """Where its csv file is, under the name of its variant or algorithm."""
+        return folder / f"{self.task}.{name}.{self.seed}.csv"
+
+
+def read(name: str) -> dict[str, Any]:
+    """Reads a file of settings."""
+    with (FOLDER / f"{name}.toml").open("rb") as file:
+        return tomllib.load(file)
+
+
+def config_of(run: Run) -> Any:
+    """Settings of a run: those of the task and those of the variant."""
+    from newton_qd.qd import EvolveConfig
+
+    given = {**read(run.task), **read("variants")[run.variant]}
+    return EvolveConfig(
+        env_name=run.task,
+        algorithm=run.algorithm,
+        seed=run.seed,
+        iterations=10**6,
+        **given,
+    )
+
+
+def best_variant(tuning: Path, task: str, algorithm: str) -> str:
+    """The variant with the highest final QD score.
+
+    Raises:
+        FileNotFoundError: None was tried.
+    """
+    scores = {}
+    for path in tuning.glob(f"{task}.{algorithm}@*.csv"):
+        with path.open(newline="", encoding="utf-8") as file:
+            *_, last = csv.DictReader(file)
+        scores[path.name.split(".")[1]] = float(last["qd_score"])
+    if not scores:
+        raise FileNotFoundError(f"{tuning} holds no run of {algorithm} on {task}")
+    return max(scores, key=lambda name: scores[name])
+
+
+def curve(search: Any, gradients: int, seconds: float, wall: bool) -> Iterator[dict]:
+    """Searches until the time is up, and yields what it has found on the way.
+
+    Args:
+        search: A ``Search``.
+        gradients: Episodes of a generation that are differentiated.
+        seconds: Budget [s].
+        wall: Whether the budget is wall-clock time.
+    """
+    from newton_qd.qd.folder import COLUMNS
+
+    state = search.empty()
+    for _ in range(3):  # compiles, and runs what is compiled
+        state = search.advance(state)
+    state = search.empty()
+    begin = time.perf_counter(), time.process_time()
+    due, spent = 0.0, 0.0
+    while spent < seconds:
+        state = search.advance(state)
+        wall_s = time.perf_counter() - begin[0]
+        processor_s = time.process_time() - begin[1]
+        spent = wall_s if wall else processor_s
+        if spent >= due or spent >= seconds:
+            due = spent + seconds / POINTS
+            row = dict(zip(COLUMNS, state.metrics[-1], strict=True))
+            each = row["env_steps"] / row["evaluations"]
+            yield {
+                "wall_s": wall_s,
+                "processor_s": processor_s,
+                **row,
+                "gradient_steps": row["iteration"] * gradients * each,
+                "rejected": state.metrics[:, COLUMNS.index("rejected")].sum(),
+                "state": state,
+            }
+
+
+def execute(run: Run, seconds: float, device: str, file: Path) -> None:
+    """Carries out a run and writes its file."""
+    import newton_qd.compat
+    from newton_qd.qd import make_task
+    from newton_qd.qd.algorithms import ALGORITHMS as TABLE
+    from newton_qd.qd.archive import Archive
+    from newton_qd.qd.search import Search
+
+    if run.algorithm == "pga-me":
+        newton_qd.compat.install()
+    config = config_of(run)
+    task = make_task(config)
+    config = config.resolve(task.descriptor_length)
+    search = Search(config, task)
+    gradients = TABLE[run.algorithm].gradients(config)
+    rows: list[dict] = []
+    state: Any = None
+    for row in curve(search, gradients, seconds, device == "cuda"):
+        state = row.pop("state")
+        rows.append(row)
+    held = search.checkpoint(state)
+    names = [field.name for field in dataclasses.fields(Archive)]
+    archive = Archive(**{name: getattr(held, name) for name in names})
+    corrected = search.correct(archive)
+    empty = dict.fromkeys(("qd_score", "coverage", "max_fitness"), math.nan)
+    for row in rows:
+        values = vars(corrected) if corrected and row is rows[-1] else empty
+        row.update({f"corrected_{name}": values[name] for name in empty})
+    write(file, rows)
+
+
+def write(path: Path, rows: list[dict]) -> None:
+    """Writes a csv file that is whole if it exists."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_suffix(".unfinished")
+    with unfinished.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, rows[0], lineterminator="\n")
+        writer.writeheader()
+        for row in rows:
+            writer.writerow({name: f"{value:.9g}" for name, value in row.items()})
+    unfinished.replace(path)
+
+
+@dataclasses.dataclass
+class Pool:
+    """Processes, one in each slot.
+
+    Attributes:
+        args: Arguments of the command.
+        slots: The process of each slot, or ``None``.
+        gpus: Number of GPUs.
+    """
+
+    args: argparse.Namespace
+    slots: list[subprocess.Popen | None]
+    gpus: int
+
+    def free(self) -> int | None:
+        """A slot whose process has ended; says so if it has failed."""
+        for slot, process in enumerate(self.slots):
+            if process is None or process.poll() is not None:
+                if process is not None and process.returncode:
+                    print(f"failed: {process.args}", file=sys.stderr, flush=True)
+                self.slots[slot] = None
+                return slot
+        return None
+
+    def start(self, slot: int, *what: str) -> None:
+        """Starts this file again with other arguments."""
+        args = self.args
+        common = ["--seconds", str(args.seconds), "--device", args.device]
+        command = [sys.executable, __file__, *common, *what]
+        variables = {**os.environ, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
+        if args.device == "cuda":
+            variables["CUDA_VISIBLE_DEVICES"] = str(slot % self.gpus)
+        else:
+            variables.update(JAX_PLATFORMS="cpu", CUDA_VISIBLE_DEVICES="")
+            cores = sorted(os.sched_getaffinity(0))
+            share = cores[slot % len(cores) :: len(self.slots)]
+            command += ["--cores", *map(str, share)]
+        self.slots[slot] = subprocess.Popen(command, env=variables)
+
+    def wait(self) -> int:
+        """Waits for a free slot."""
+        while (slot := self.free()) is None:
+            time.sleep(0.2)
+        return slot
+
+    def drain(self) -> None:
+        """Waits for all processes."""
+        for process in self.slots:
+            if process is not None:
+                process.wait()
+        while any(self.slots):
+            self.free()
+
+
+def arguments() -> argparse.Namespace:
+    """Reads the command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path("runs"))
+    parser.add_argument("--tasks", nargs="*", choices=TASKS, default=list(TASKS))
+    parser.add_argument("--algorithms", nargs="*", default=list(ALGORITHMS))
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
+    parser.add_argument("--gpus", type=int, default=1)
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument(
+        "--start-until",
+        type=float,
+        default=math.inf,
+        help="start no run later than so many seconds after the command",
+    )
+    parser.add_argument(
+        "--tune", action="store_true", help="run every variant, with a seed of its own"
+    )
+    parser.add_argument("--tuned", type=Path, help="folder of what --tune has found")
+    parser.add_argument("--cores", type=int, nargs="*", help=argparse.SUPPRESS)
+    parser.add_argument("--run", nargs=4, help=argparse.SUPPRESS)
+    return parser.parse_args()
+
+
+def planned(args: argparse.Namespace) -> list[tuple[Run, Path]]:
+    """Runs and their files.
+
+    Seeds come first, so that a study that was stopped has all tasks and algorithms.
+    """
+    kinds = list(itertools.product(args.tasks, args.algorithms))
+    if args.tune:
+        variants = read("variants")
+        runs = [
+            Run(task, variant, TUNING_SEED)
+            for task, algorithm in kinds
+            for variant in variants
+            if variant.split("@")[0] == algorithm
+        ]
+        return [(run, run.file(args.out, run.variant)) for run in runs]
+    chosen = {
+        kind: best_variant(args.tuned, *kind) if args.tuned else f"{kind[1]}@1"
+        for kind in kinds
+    }
+    runs = [
+        Run(task, variant, seed)
+        for seed in range(args.seeds)
+        for (task, _), variant in chosen.items()
+    ]
+    return [(run, run.file(args.out, run.algorithm)) for run in runs]
+
+
+def main() -> None:
+    """Runs what is missing."""
+    begin, args = time.monotonic(), arguments()
+    if args.cores:
+        os.sched_setaffinity(0, args.cores)
+    if args.run:
+        task, variant, seed, file = args.run
+        run = Run(task, variant, int(seed))
+        execute(run, args.seconds, args.device, Path(file))
+        return
+    missing = [(run, file) for run, file in planned(args) if not file.exists()]
+    pool = Pool(args, [None] * args.workers, args.gpus)
+    for number, (run, file) in enumerate(missing):
+        slot = pool.wait()
+        spent = time.monotonic() - begin
+        if spent > args.start_until:
+            print(f"{len(missing) - number} runs are left", flush=True)
+            break
+        print(f"{spent:5.0f} s: {run}, {number + 1} of {len(missing)}", flush=True)
+        pool.start(slot, "--run", run.task, run.variant, str(run.seed), str(file))
+    pool.drain()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,75 @@
+"""CMA-MEGA, fed with exact gradients through the physics, as an emitter of QDax.
+
+python examples/gradient_qd.py
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+
+import jax
+from qdax.core.containers.mapelites_repertoire import compute_euclidean_centroids
+from qdax.core.map_elites import MAPElites
+from qdax.utils.metrics import default_qd_metrics
+
+from newton_qd.gradients import GradientOptions
+from newton_qd.qd import (
+    EvolveConfig,
+    make_gradient_scoring_function,
+    make_policy,
+    make_scoring_function,
+    make_task,
+)
+from newton_qd.qd.emitters import CMAMEGAEmitter
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--env", default="ant_omni")
+    parser.add_argument("--iterations", type=int, default=100)
+    parser.add_argument("--points", type=int, default=4, help="solution points")
+    parser.add_argument("--batch-size", type=int, default=32, help="of each point")
+    parser.add_argument("--episode-length", type=int, default=100)
+    options = parser.parse_args()
+
+    config = EvolveConfig(env_name=options.env, episode_length=options.episode_length)
+    task = make_task(config)
+    policy = make_policy(task.env, (32,))
+    start, key = jax.random.key(0), jax.random.key(1)
+    # The loop evaluates all offspring without gradients, the emitter four points with.
+    plain = make_scoring_function(task, policy, config.episode_length)
+    exact = make_gradient_scoring_function(
+        task, policy, config.episode_length, GradientOptions(clip=10.0)
+    )
+    emitter = CMAMEGAEmitter(
+        lambda genotypes, _: exact(genotypes, start),
+        sigma_g=0.5,
+        batch_size=options.batch_size,
+        num_emitters=options.points,
+    )
+    offset = task.reward_offset * config.episode_length
+    search = MAPElites(
+        lambda genotypes, _: plain(genotypes, start),
+        emitter,
+        functools.partial(default_qd_metrics, qd_offset=offset),
+    )
+    low, high = (limit.tolist() for limit in task.limits)
+    cells = compute_euclidean_centroids((32, 32), low, high)
+    population = jax.vmap(policy.init)(jax.random.split(key, emitter.batch_size))
+    repertoire, state, metrics = jax.jit(search.init)(population, cells, key)
+    update = jax.jit(search.update)
+    for iteration in range(options.iterations + 1):
+        if iteration % 10 == 0 or iteration == options.iterations:
+            print(
+                f"iteration {iteration}: QD score {metrics['qd_score']:,.0f}, "
+                f"coverage {metrics['coverage']:.1f} %, "
+                f"best {metrics['max_fitness']:.1f}, rejected {state.rejected}"
+            )
+        if iteration < options.iterations:
+            key, step_key = jax.random.split(key)
+            repertoire, state, metrics = update(repertoire, state, step_key)
+
+
+if __name__ == "__main__":
+    main()

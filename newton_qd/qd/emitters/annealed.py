@@ -1,0 +1,101 @@
+"""Emitters of an annealed archive in a loop that keeps an elitist one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+from qdax.core.emitters.emitter import Emitter, EmitterState
+
+from newton_qd.qd.annealed_repertoire import AnnealedRepertoire, check_annealing
+
+
+class AnnealedState(EmitterState):
+    """An annealed archive, and the state of the emitter that searches on it.
+
+    Attributes:
+        repertoire: The archive.
+        emitter: State of the emitter.
+    """
+
+    repertoire: AnnealedRepertoire
+    emitter: Any
+
+
+class OnAnnealedRepertoire(Emitter):
+    """Shows an emitter an annealed archive of its own in place of the loop's.
+
+    The loop's archive stays elitist: it is the ``result`` of the annealed one.
+    """
+
+    def __init__(
+        self, emitter: Emitter, *, learning_rate: float, threshold_min: float
+    ) -> None:
+        """Sets the annealing.
+
+        Args:
+            emitter: Emitter that needs an annealed archive.
+            learning_rate: Learning rate of the thresholds, in [0, 1].
+            threshold_min: First threshold of every cell, in units of the fitness.
+
+        Raises:
+            ValueError: A setting of the thresholds is out of its range.
+        """
+        check_annealing(learning_rate, threshold_min)
+        self._emitter = emitter
+        self._annealing = {
+            "learning_rate": learning_rate,
+            "threshold_min": threshold_min,
+        }
+
+    @property
+    def batch_size(self) -> int:
+        """Individuals emitted in one iteration."""
+        return self._emitter.batch_size
+
+    def init(
+        self,
+        key: jax.Array,
+        repertoire: Any,
+        genotypes: Any,
+        fitnesses: jax.Array,
+        descriptors: jax.Array,
+        extra_scores: Any,
+    ) -> AnnealedState:
+        """Makes the annealed archive of the initial population."""
+        annealed = AnnealedRepertoire.init(
+            genotypes, fitnesses, descriptors, repertoire.centroids, **self._annealing
+        )
+        state = self._emitter.init(
+            key, annealed, genotypes, fitnesses, descriptors, extra_scores
+        )
+        return AnnealedState(annealed, state)
+
+    def emit(
+        self, repertoire: Any, emitter_state: Any, key: jax.Array
+    ) -> tuple[Any, dict[str, Any]]:
+        """Lets the emitter emit from the annealed archive."""
+        del repertoire
+        return self._emitter.emit(emitter_state.repertoire, emitter_state.emitter, key)
+
+    def state_update(
+        self,
+        emitter_state: Any,
+        repertoire: Any = None,
+        genotypes: Any = None,
+        fitnesses: Any = None,
+        descriptors: Any = None,
+        extra_scores: Any = None,
+    ) -> AnnealedState:
+        """Adds a generation to the annealed archive and tells the emitter of it."""
+        del repertoire
+        annealed = emitter_state.repertoire.add(genotypes, descriptors, fitnesses)
+        state = self._emitter.state_update(
+            emitter_state.emitter,
+            annealed,
+            genotypes,
+            fitnesses,
+            descriptors,
+            extra_scores,
+        )
+        return AnnealedState(annealed, state)
