@@ -270,7 +270,8 @@ def test_gradient_of_an_episode(name: str, x64: None) -> None:
     start, _ = thrown(env, 50)
     if name == "pusher":
         start = start.replace(pipeline_state=moving(env, *presses(50)[:2]))
-    actions = np.random.default_rng(1).uniform(-0.9, 0.9, (50, 16, env.action_size))
+    size = 16 * env.action_size
+    actions = np.random.default_rng(1).uniform(-0.9, 0.9, (50, size))
     first = jax.tree.map(lambda x: x[0], start)
 
     def total(q: jax.Array, v: jax.Array, actions: jax.Array) -> jax.Array:
@@ -280,7 +281,7 @@ def test_gradient_of_an_episode(name: str, x64: None) -> None:
 
         physics = newton_qd.physics.initial_state(env.system, q, v)
         state = first.replace(pipeline_state=physics)
-        last, rewards = jax.lax.scan(advance, state, actions)
+        last, rewards = jax.lax.scan(advance, state, actions.reshape(16, -1))
         return rewards.sum() + jnp.sin(last.obs).sum()
 
     physics = start.pipeline_state

@@ -205,7 +205,8 @@ def energy(system: System, q: np.ndarray, v: np.ndarray) -> tuple[float, float]:
         for frame, com in zip(frames, system.com, strict=True)
     ]
     weights = system.mass * system.robot.gravity
-    return 0.5 * v @ reference.mass_matrix(system, q) @ v, float(weights @ heights)
+    kinetic = 0.5 * v @ reference.mass_matrix(system, q) @ v
+    return float(kinetic), float(weights @ heights)
 
 
 @pytest.mark.parametrize("speed", [5.0, 15.0, 30.0])
