@@ -17,10 +17,19 @@ from newton_qd.qd.parts import Algorithm, Parts, isoline_emitter, settings
 from newton_qd.qd.rollout import Policy, ScoringFunction
 from newton_qd.qd.task import Task
 
+# A robot that falls ends its episode, which no gradient sees: short steps only.
+_FALLS: Mapping[str, Any] = {"shortest": 0.001, "longest": 0.1, "sigma_g": 0.02}
+
 TUNED: Mapping[str, Mapping[str, Any]] = {
-    "halfcheetah_uni": {"window": 10, "clip": 1.0},
+    # Its return is chaotic after some ten control steps.
+    "halfcheetah_uni": {"window": 10, "clip": 0.0, "longest": 1.0},
+    "hopper_uni": _FALLS,
+    "walker2d_uni": _FALLS,
+    "humanoid_uni": _FALLS,
+    "humanoid_omni": _FALLS,
+    "humanoidtrap": _FALLS,
 }
-"""Defaults of ``FlowOptions`` for environments with gradients of their own kind."""
+"""Defaults of options that differ for an environment."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -88,7 +97,9 @@ def _options(kind: Any, config: EvolveConfig) -> Any:
     Raises:
         ConfigError: There is no option of this name, or its value is not allowed.
     """
-    options = settings(kind, config, **TUNED.get(config.env_name, {}))
+    names = {field.name for field in dataclasses.fields(kind)}
+    tuned = TUNED.get(config.env_name, {}).items()
+    options = settings(kind, config, **{k: v for k, v in tuned if k in names})
     try:
         options.flow()
     except (TypeError, ValueError) as error:
@@ -131,8 +142,8 @@ class MEGradientOptions(FlowOptions):
 
     share: float = 0.5
     branches: int = 4
-    shortest: float = 0.05
-    longest: float = 2.0
+    shortest: float = 0.02
+    longest: float = 0.5
     steered: float = 0.5
 
     def parents(self, config: EvolveConfig) -> int:
@@ -201,7 +212,7 @@ class OMGMEGAOptions(MixedOptions):
             units of policy weights [-].
     """
 
-    sigma_g: float = 0.5
+    sigma_g: float = 0.1
 
 
 def _omg_mega(parts: Parts) -> Any:
@@ -237,7 +248,7 @@ class CMAMEGAOptions(MixedOptions):
     """
 
     points: int = 4
-    sigma_g: float = 0.5
+    sigma_g: float = 0.1
     adam: float = 0.0
     restart_period: int = 0
 
