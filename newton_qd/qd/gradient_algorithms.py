@@ -42,12 +42,15 @@ class FlowOptions:
         discount: Factor of the adjoint for each control step that it goes back [-].
         smooth_width: Share of a robot's weight over which the reading of a foot has a
             gradient [-]; its value stays 0 or 1.
+        initial_scale: Factor of the weights of the initial population [-]: small
+            feedback keeps gradients small over more control steps.
     """
 
     window: int = 0
     clip: float = 10.0
     discount: float = 1.0
     smooth_width: float = 0.1
+    initial_scale: float = 1.0
 
     def flow(self) -> GradientOptions:
         """The options of a gradient, in the fastest way, that keeps intermediates.
@@ -334,6 +337,10 @@ def _points(kind: Any, config: EvolveConfig) -> int:
     return options.points * options.episodes
 
 
+def _scale(kind: Any, config: EvolveConfig) -> float:
+    return _options(kind, config).initial_scale
+
+
 def _row(make: Any, kind: Any) -> Algorithm:
     """A row for an emitter that evaluates the gradients of its solution points."""
     return Algorithm(
@@ -341,6 +348,7 @@ def _row(make: Any, kind: Any) -> Algorithm:
         evaluations=lambda config: config.batch_size + _points(kind, config),
         gradients=functools.partial(_points, kind),
         takes_faulty=True,
+        initial_scale=functools.partial(_scale, kind),
     )
 
 
@@ -349,6 +357,7 @@ GRADIENT_ALGORITHMS: Mapping[str, Algorithm] = {
         _checked(_me_gradient),
         evaluations=lambda config: config.batch_size + _me_gradients(config),
         gradients=_me_gradients,
+        initial_scale=functools.partial(_scale, MEGradientOptions),
     ),
     "omg-mega": Algorithm(
         _checked(_omg_mega),
@@ -356,6 +365,7 @@ GRADIENT_ALGORITHMS: Mapping[str, Algorithm] = {
         gradients=_omg_mega_gradients,
         scoring=_omg_mega_scoring,
         takes_faulty=True,
+        initial_scale=functools.partial(_scale, OMGMEGAOptions),
     ),
     "cma-mega": _row(_cma_mega, CMAMEGAOptions),
     "cma-maega": _row(_cma_maega, CMAMAEGAOptions),

@@ -94,7 +94,7 @@ class Search:
         self._ask = jax.jit(self._proposed)
         self._begin = jax.jit(self._begun)
         self._tell = jax.jit(self._told)
-        self._population = jax.jit(jax.vmap(self._policy.init))
+        self._population = jax.jit(jax.vmap(self._initial))
 
     def empty(self) -> SearchState:
         """State before the initial population."""
@@ -215,6 +215,11 @@ class Search:
                 for x, like in zip(leaves, expected, strict=True)
             ],
         )
+
+    def _initial(self, key: jax.Array) -> jax.Array:
+        """Weights (size,) of an individual of the initial population."""
+        scale = self._algorithm.initial_scale(self._config)
+        return scale * self._policy.init(key)
 
     def _scoring_function(self) -> ScoringFunction:
         """The scoring function of the loop."""
