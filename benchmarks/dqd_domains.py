@@ -1,7 +1,7 @@
 """Published domains of differentiable Quality-Diversity, with exact gradients.
 
 Linear projection of sphere and Rastrigin, and the planar arm, exactly as Fontaine &
-Nikolaidis, "Differentiable Quality Diversity", NeurIPS 2021 (section 6), ran them.
+Nikolaidis, "Differentiable Quality Diversity", NeurIPS 2021, ran them.
 """
 
 from __future__ import annotations

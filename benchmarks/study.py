@@ -206,14 +206,18 @@ class Pool:
     gpus: int
 
     def free(self) -> int | None:
-        """A slot whose process has ended; says so if it has failed."""
+        """A slot without a process that still runs."""
         for slot, process in enumerate(self.slots):
             if process is None or process.poll() is not None:
-                if process is not None and process.returncode:
-                    print(f"failed: {process.args}", file=sys.stderr, flush=True)
-                self.slots[slot] = None
+                self._end(slot)
                 return slot
         return None
+
+    def _end(self, slot: int) -> None:
+        """Waits for the process of a slot, and says so if it has failed."""
+        process, self.slots[slot] = self.slots[slot], None
+        if process is not None and process.wait():
+            print(f"failed: {process.args}", file=sys.stderr, flush=True)
 
     def start(self, slot: int, *what: str) -> None:
         """Starts this file again with other arguments."""
@@ -238,11 +242,8 @@ class Pool:
 
     def drain(self) -> None:
         """Waits for all processes."""
-        for process in self.slots:
-            if process is not None:
-                process.wait()
-        while any(self.slots):
-            self.free()
+        for slot in range(len(self.slots)):
+            self._end(slot)
 
 
 def arguments() -> argparse.Namespace:

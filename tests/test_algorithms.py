@@ -151,6 +151,15 @@ def test_options_out_of_range_are_refused(
         run(SMALL.replace(algorithm=name, options=options))
 
 
+def test_initial_weights_are_scaled() -> None:
+    def norm(options: dict[str, Any]) -> float:
+        config = SMALL.replace(algorithm="me-gradient", iterations=0, options=options)
+        archive = run(config.replace(grid=(1, 2))).archive
+        return float(np.linalg.norm(archive.genotypes[archive.filled], axis=1).max())
+
+    assert norm({"initial_scale": 0.01}) < 0.1 < norm({})
+
+
 @pytest.mark.parametrize("name", ["me-gradient", "cma-mega"])
 def test_faulty_individuals_are_counted(name: str) -> None:
     """``PointEnv`` is faulty far right; gradients do not lead out of the archive."""

@@ -44,6 +44,7 @@ def no_trace() -> Iterator[None]:
         ),
         ("gradient_qd", [*TINY, *FEW], r"iteration 2: QD score .* rejected 0"),
         ("ribs_cma_maega", [*TINY, *FEW], r"iteration 1: QD score [\d,]+, coverage"),
+        (
             "plan_hopper",
             ["--plans", "2", "--steps", "4", *FEW],
             r"iteration   2: mean return .*best",

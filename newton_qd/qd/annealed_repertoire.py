@@ -27,9 +27,8 @@ class AnnealedRepertoire(MapElitesRepertoire, kw_only=True):
     .. math:: t \leftarrow (1 - \alpha)^k t + (1 - (1 - \alpha)^k) \bar f
 
     with their mean fitness, and the best of them enters (Fontaine & Nikolaidis,
-    "Covariance Matrix Adaptation MAP-Annealing", GECCO 2023, algorithm 1 and appendix
-    on batches). An elite may be replaced by a worse one, so what was found is in
-    ``result``: report metrics of that one,
+    "Covariance Matrix Adaptation MAP-Annealing", GECCO 2023). An elite may be replaced
+    by a worse one, so what was found is in ``result``: report metrics of that one,
     ``metrics_function=lambda repertoire: default_qd_metrics(repertoire.result, 0.0)``.
 
     Individuals whose fitness or descriptor is not finite never enter.

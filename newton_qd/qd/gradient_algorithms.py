@@ -17,10 +17,19 @@ from newton_qd.qd.parts import Algorithm, Parts, isoline_emitter, settings
 from newton_qd.qd.rollout import Policy, ScoringFunction
 from newton_qd.qd.task import Task
 
+# A robot that falls ends its episode, which no gradient sees: short steps only.
+_FALLS: Mapping[str, Any] = {"shortest": 0.001, "longest": 0.1, "sigma_g": 0.02}
+
 TUNED: Mapping[str, Mapping[str, Any]] = {
-    "halfcheetah_uni": {"window": 10, "clip": 1.0},
+    # Its return is chaotic after some ten control steps.
+    "halfcheetah_uni": {"window": 10, "clip": 0.0, "longest": 1.0},
+    "hopper_uni": _FALLS,
+    "walker2d_uni": _FALLS,
+    "humanoid_uni": _FALLS,
+    "humanoid_omni": _FALLS,
+    "humanoidtrap": _FALLS,
 }
-"""Defaults of ``FlowOptions`` for environments with gradients of their own kind."""
+"""Defaults of options that differ for an environment."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -33,12 +42,15 @@ class FlowOptions:
         discount: Factor of the adjoint for each control step that it goes back [-].
         smooth_width: Share of a robot's weight over which the reading of a foot has a
             gradient [-]; its value stays 0 or 1.
+        initial_scale: Factor of the weights of the initial population [-]: small
+            feedback keeps gradients small over more control steps.
     """
 
     window: int = 0
     clip: float = 10.0
     discount: float = 1.0
     smooth_width: float = 0.1
+    initial_scale: float = 1.0
 
     def flow(self) -> GradientOptions:
         """The options of a gradient, in the fastest way, that keeps intermediates.
@@ -88,7 +100,9 @@ def _options(kind: Any, config: EvolveConfig) -> Any:
     Raises:
         ConfigError: There is no option of this name, or its value is not allowed.
     """
-    options = settings(kind, config, **TUNED.get(config.env_name, {}))
+    names = {field.name for field in dataclasses.fields(kind)}
+    tuned = TUNED.get(config.env_name, {}).items()
+    options = settings(kind, config, **{k: v for k, v in tuned if k in names})
     try:
         options.flow()
     except (TypeError, ValueError) as error:
@@ -131,8 +145,8 @@ class MEGradientOptions(FlowOptions):
 
     share: float = 0.5
     branches: int = 4
-    shortest: float = 0.05
-    longest: float = 2.0
+    shortest: float = 0.02
+    longest: float = 0.5
     steered: float = 0.5
 
     def parents(self, config: EvolveConfig) -> int:
@@ -201,7 +215,7 @@ class OMGMEGAOptions(MixedOptions):
             units of policy weights [-].
     """
 
-    sigma_g: float = 0.5
+    sigma_g: float = 0.1
 
 
 def _omg_mega(parts: Parts) -> Any:
@@ -237,7 +251,7 @@ class CMAMEGAOptions(MixedOptions):
     """
 
     points: int = 4
-    sigma_g: float = 0.5
+    sigma_g: float = 0.1
     adam: float = 0.0
     restart_period: int = 0
 
@@ -323,6 +337,10 @@ def _points(kind: Any, config: EvolveConfig) -> int:
     return options.points * options.episodes
 
 
+def _scale(kind: Any, config: EvolveConfig) -> float:
+    return _options(kind, config).initial_scale
+
+
 def _row(make: Any, kind: Any) -> Algorithm:
     """A row for an emitter that evaluates the gradients of its solution points."""
     return Algorithm(
@@ -330,6 +348,7 @@ def _row(make: Any, kind: Any) -> Algorithm:
         evaluations=lambda config: config.batch_size + _points(kind, config),
         gradients=functools.partial(_points, kind),
         takes_faulty=True,
+        initial_scale=functools.partial(_scale, kind),
     )
 
 
@@ -338,6 +357,7 @@ GRADIENT_ALGORITHMS: Mapping[str, Algorithm] = {
         _checked(_me_gradient),
         evaluations=lambda config: config.batch_size + _me_gradients(config),
         gradients=_me_gradients,
+        initial_scale=functools.partial(_scale, MEGradientOptions),
     ),
     "omg-mega": Algorithm(
         _checked(_omg_mega),
@@ -345,6 +365,7 @@ GRADIENT_ALGORITHMS: Mapping[str, Algorithm] = {
         gradients=_omg_mega_gradients,
         scoring=_omg_mega_scoring,
         takes_faulty=True,
+        initial_scale=functools.partial(_scale, OMGMEGAOptions),
     ),
     "cma-mega": _row(_cma_mega, CMAMEGAOptions),
     "cma-maega": _row(_cma_maega, CMAMAEGAOptions),

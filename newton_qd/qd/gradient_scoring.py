@@ -28,17 +28,15 @@ def make_gradient_scoring_function(
 ) -> ScoringFunction:
     """Builds the function that evaluates a batch of individuals with gradients.
 
-    It is :func:`~newton_qd.qd.make_scoring_function` with more extra scores, laid out
-    for QDax's emitters: the last axis of a gradient has the fitness first, then each
-    component of the descriptor.
+    :func:`~newton_qd.qd.make_scoring_function` with gradients, laid out for QDax's
+    emitters: their last axis has the fitness first, then each descriptor component.
 
     Args:
         task: Environment and descriptor. A descriptor of feet contacts has a gradient
             where :func:`~newton_qd.gradients.with_smooth_descriptor` gave it one.
-        policy: A :class:`~newton_qd.qd.Policy`, whose genotypes are flat; or any
-            function of a pytree genotype and an observation, as the ``apply`` of a
-            module of Flax, or ``lambda module, obs: module(obs)`` for modules of
-            Equinox; ``None``: genotypes are open-loop actions.
+        policy: A :class:`~newton_qd.qd.Policy`, with flat genotypes; any function of a
+            pytree genotype and an observation, as the ``apply`` of a module of Flax or
+            ``lambda module, obs: module(obs)``; ``None``: genotypes are the actions.
         episode_length: Control steps of an evaluation.
         options: Windows, clipping, discounting and memory of the gradients.
         estimator: Builds the gradient, from the arguments of

@@ -55,6 +55,7 @@ class Algorithm:
         scoring: Makes the scoring function of the loop; ``None``: the plain one.
         takes_faulty: Whether the emitter hears of the fitness ``-inf`` of a faulty
             individual; if not, it hears of the worst finite one.
+        initial_scale: Factor of the weights of the initial population.
     """
 
     make: Callable[[Parts], Any]
@@ -64,6 +65,7 @@ class Algorithm:
     gradients: Callable[[EvolveConfig], int] = lambda config: 0
     scoring: Callable[[EvolveConfig, Task, Policy], ScoringFunction] | None = None
     takes_faulty: bool = False
+    initial_scale: Callable[[EvolveConfig], float] = lambda config: 1.0
 
 
 def settings(kind: Any, config: EvolveConfig, **defaults: Any) -> Any:

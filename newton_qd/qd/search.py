@@ -101,7 +101,7 @@ class Search:
         self._ask = jax.jit(self._proposed)
         self._begin = self._compiled(self._begun, learns_on_mesh)
         self._tell = self._compiled(self._told, learns_on_mesh)
-        self._population = jax.jit(jax.vmap(self._policy.init))
+        self._population = jax.jit(jax.vmap(self._initial))
 
     def empty(self) -> SearchState:
         """State before the initial population."""
@@ -223,6 +223,11 @@ class Search:
                     f"shape {x.shape} in the checkpoint, {like.shape} in this version"
                 )
         return jax.tree.unflatten(structure, restored)
+
+    def _initial(self, key: jax.Array) -> jax.Array:
+        """Weights (size,) of an individual of the initial population."""
+        scale = self._algorithm.initial_scale(self._config)
+        return scale * self._policy.init(key)
 
     def _scoring(self) -> ScoringFunction:
         """The scoring function of the loop, split over the mesh."""

@@ -1,7 +1,7 @@
 """Gradient arborescence: CMA-ES searches for steps along the gradients of a point.
 
-What CMA-MEGA (Fontaine & Nikolaidis, "Differentiable Quality Diversity", NeurIPS 2021,
-algorithm 1) and CMA-MAEGA share. A solution point theta has the offspring
+What CMA-MEGA (Fontaine & Nikolaidis, "Differentiable Quality Diversity", NeurIPS 2021)
+and CMA-MAEGA share. A solution point theta has the offspring
 
     theta + c_0 grad f(theta) + sum_j c_j grad m_j(theta),    c ~ N(mu, Sigma)
 

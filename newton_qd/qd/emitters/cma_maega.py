@@ -15,9 +15,9 @@ from newton_qd.qd.emitters.restarts import RestartRule
 class CMAMAEGAEmitter(ArborescenceEmitter):
     """CMA-ES searches for the steps along the gradients that exceed thresholds.
 
-    Fontaine & Nikolaidis, "Covariance Matrix Adaptation MAP-Annealing", GECCO 2023,
-    algorithm 1 and appendix on CMA-MAEGA: offspring are ordered by f - t, their
-    fitness above the threshold of their cell. Needs an ``AnnealedRepertoire``.
+    Fontaine & Nikolaidis, "Covariance Matrix Adaptation MAP-Annealing", GECCO 2023:
+    offspring are ordered by f - t, their fitness above the threshold of their cell.
+    Needs an ``AnnealedRepertoire``.
     """
 
     default_restart_rule = RestartRule.BASIC

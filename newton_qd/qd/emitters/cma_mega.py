@@ -19,9 +19,9 @@ from newton_qd.qd.emitters.restarts import RestartRule
 class CMAMEGAEmitter(ArborescenceEmitter):
     """CMA-ES searches for the steps along the gradients that improve the archive.
 
-    Fontaine & Nikolaidis, "Differentiable Quality Diversity", NeurIPS 2021, algorithm
-    1: offspring that fill an empty cell come first, then those that improve an elite,
-    each ordered by improvement (two-stage improvement ranking, Fontaine et al. 2020).
+    Fontaine & Nikolaidis, "Differentiable Quality Diversity", NeurIPS 2021: offspring
+    that fill an empty cell come first, then those that improve an elite, each ordered
+    by improvement (two-stage improvement ranking, Fontaine et al. 2020).
     """
 
     default_restart_rule = RestartRule.NO_IMPROVEMENT

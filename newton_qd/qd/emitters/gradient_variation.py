@@ -22,9 +22,9 @@ class GradientVariationEmitter(EliteGradientEmitter):
     .. math:: d_0 \nabla f(\theta) + \sum_j d_j \nabla m_j(\theta)
 
     with normalized gradients. This is the policy-gradient variation of PGA-ME (Nilsson
-    & Cully, "Policy Gradient Assisted MAP-Elites", GECCO 2021, algorithm 3) with the
+    & Cully, "Policy Gradient Assisted MAP-Elites", GECCO 2021) with the
     exact gradient of the return in place of a critic's, and with descriptors beside
-    the fitness as in Fontaine & Nikolaidis 2021, eq. 1. Mix it with an emitter of
+    the fitness as in Fontaine & Nikolaidis 2021. Mix it with an emitter of
     random variations, such as QDax's ``MixingEmitter``.
     """
 

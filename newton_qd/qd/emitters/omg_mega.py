@@ -21,10 +21,10 @@ class OMGMEGAEmitter(EliteGradientEmitter):
         \theta + |c_0| \nabla f(\theta) + \sum_j c_j \nabla m_j(\theta),
         \qquad c \sim N(0, \sigma_g^2 I)
 
-    with normalized gradients of fitness f and descriptors m_j (Fontaine & Nikolaidis,
-    "Differentiable Quality Diversity", NeurIPS 2021, section 4, eq. 1). The gradients
-    of the elites are kept, so that no parent is evaluated again: with the same number
-    of evaluations this emits twice as many individuals as the paper's implementation.
+    with normalized gradients of fitness f and descriptors m_j (OMG-MEGA of Fontaine &
+    Nikolaidis, "Differentiable Quality Diversity", NeurIPS 2021). The gradients of the
+    elites are kept, so that no parent is evaluated again: with the same number of
+    evaluations this emits twice as many individuals as the paper's implementation.
     """
 
     def __init__(self, batch_size: int, sigma_g: float, selector: Any = None) -> None:
