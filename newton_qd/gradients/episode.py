@@ -150,7 +150,9 @@ class _Run:
             action = row["action"]
         else:
             action = self.policy(parameters, state.obs)
-        state = self.env.step(state, action, params)
+        # An environment whose worlds have no parameters need not know of them.
+        own = () if params is None else (params,)
+        state = self.env.step(state, action, *own)
         steps = _transition(begin, action, state) if self.transitions else {}
         # The sum runs in time order here, not in a reduction over time, so that a
         # row's return does not depend on the size of the batch.
