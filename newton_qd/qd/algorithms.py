@@ -123,6 +123,14 @@ def _settings(kind: Any, config: EvolveConfig, **defaults: Any) -> Any:
     return kind(**defaults)
 
 
+def _require_batch_size(config: EvolveConfig, name: str, value: Any) -> None:
+    """Refuses an option that would give a generation another size."""
+    if value != config.batch_size:
+        raise ConfigError(
+            f"options: {name} is batch_size ({config.batch_size}), not {value!r}"
+        )
+
+
 def _no_mutation(genotypes: Any, key: jax.Array) -> Any:
     del key
     return genotypes
@@ -199,6 +207,7 @@ def _pga_me(parts: Parts) -> Any:
         env_batch_size=parts.config.batch_size,
         replay_buffer_size=_REPLAY_BUFFER,
     )
+    _require_batch_size(parts.config, "env_batch_size", options.env_batch_size)
     emitter = PGAMEEmitter(
         options, parts.policy.network, parts.task.env, _variation(parts.config)
     )
@@ -269,11 +278,7 @@ def _me_es(parts: Parts) -> Any:
 
     samples = parts.config.batch_size
     options = _settings(MEESConfig, parts.config, sample_number=samples)
-    if options.sample_number != samples:
-        raise ConfigError(
-            f"options: sample_number is batch_size ({samples}), not "
-            f"{options.sample_number}"
-        )
+    _require_batch_size(parts.config, "sample_number", options.sample_number)
     emitter = MEESEmitter(
         options,
         # The archive of its novelty holds one descriptor for each generation.
