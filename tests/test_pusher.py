@@ -272,3 +272,6 @@ def test_reset() -> None:
     # drawn from 0.3 m x 0.4 m; of what was drawn, this share was near enough
     share = 0.5 * np.pi * 0.17**2 / (0.3 * 0.4)
     assert np.mean(radius < 0.17 - 1e-6) == pytest.approx(share, abs=0.03)
+    bent = Pusher(reset_noise_scale=0.2, reset_velocity_noise_scale=0.0)
+    state = bent.reset(jax.random.key(0)).pipeline_state
+    assert 0.1 < np.abs(state.q[:7] - pose).max() <= 0.2 and not state.v.any()

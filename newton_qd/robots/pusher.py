@@ -6,7 +6,7 @@ from newton_qd.robots.row import DEGREE, Contact, Material, Robot
 _CAPSULES = tuple(
     Contact(link, collider=name)
     for link, name in (
-        ("r_forearm_roll_link", "roll"),
+        ("r_forearm_roll_link", "forearm_roll"),
         ("r_forearm_roll_link", "forearm"),
         ("r_wrist_roll_link", "palm"),
         ("r_wrist_roll_link", "right_finger"),
@@ -59,5 +59,5 @@ PUSHER = Robot(
     substeps=10,
     gravity=0.0,
     # no friction, as in the original; half the radius of the tips
-    material=Material(friction=0.0, support=1, smoothing=0.005),
+    material=Material(friction=0.0, support=1, smoothing=0.005, limit_swing=0.3),
 )
