@@ -71,5 +71,5 @@ def test_rows_of_the_jacobian_share_what_is_kept() -> None:
     report("bytes per world beside them, by rows", ends)
     row = (slopes[1 + FEET] - slopes[1]) / FEET
     report("bytes per row, world and control step", row)
-    # a descriptor's own readings, and their adjoint in each row
-    assert row < 2 * FEET * np.dtype(np.float32).itemsize
+    # not the state again: the adjoint of the readings, through the extractor's kernel
+    assert row < 3 * FEET * np.dtype(np.float32).itemsize
