@@ -271,12 +271,13 @@ def test_the_bridge_agrees_with_a_tape(x64: None, device: Any, robot: Robot) -> 
     system = physics.load_system(robot, "float64")
     inputs = random_states(system, np.random.default_rng(0), 6)
     weights = np.random.default_rng(1).normal(size=size_of(system) + 7 * system.nb)
+    kept = jnp.asarray(weights)
 
     def value(q: jax.Array, v: jax.Array, control: jax.Array) -> jax.Array:
         def advance(state: Any, _: None) -> tuple[Any, jax.Array]:
             state, _fault = physics.step(system, state, control)
             parts = (state.q, state.v, state.impulse.ravel(), state.normal_impulse)
-            return state, weights @ jnp.concatenate(parts)
+            return state, kept @ jnp.concatenate(parts)
 
         start = physics.initial_state(system, q, v)
         return jax.lax.scan(advance, start, None, length=STEPS)[1].sum()
