@@ -37,6 +37,16 @@ def no_trace() -> Iterator[None]:
             ["--worlds", "2", "--steps", "4", *FEW],
             r"iteration   2: mean return .*faulty 0",
         ),
+        (
+            "plan_hopper",
+            ["--plans", "2", "--steps", "4", *FEW],
+            r"iteration   2: mean return .*best",
+        ),
+        (
+            "train_ant",
+            ["--worlds", "2", "--steps", "4", *FEW],
+            r"iteration   2: mean return",
+        ),
         ("qdax_map_elites", [*TINY, *FEW], r"iteration 2: QD score [\d,]+, coverage"),
         ("qdax_pga_me", [*TINY, *FEW, "--training-steps", "2"], r"QD score [\d,]+"),
         ("ribs_cma_me", [*TINY, *FEW], r"as a repertoire of QDax: \d+ elites"),
