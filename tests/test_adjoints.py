@@ -71,7 +71,7 @@ def inputs_of(env: Any, worlds: int = WORLDS) -> Inputs:
     else:
         q = system.rest_q + 0.3 * rng.normal(size=(worlds, system.nq))
         v = rng.normal(size=(worlds, system.nv))
-        action = rng.uniform(-1.0, 1.0, (worlds, system.nu))
+        action = rng.uniform(-1.0, 1.0, (worlds, env.action_size))
     params = {name: np.asarray(getattr(env.default_params, name)) for name in FIELDS}
     scales = {
         name: x * rng.uniform(0.7, 1.3, (worlds, *x.shape))
