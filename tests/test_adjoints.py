@@ -166,10 +166,10 @@ def close(found: Any, expected: Any) -> None:
 def test_every_transformation_gives_the_same(x64: None, name: str) -> None:
     """Three steps in a scan; batched, nested, unrolled, remat, alone, Jacobian."""
     env = make(name)
-    inputs = inputs_of(env, 4)
+    inputs, weigh = inputs_of(env, 4), weighted(env)
 
     def value(inputs: Inputs, unrolled: bool = False) -> jax.Array:
-        return weighted(env)(inputs, 3, unrolled)
+        return weigh(inputs, 3, unrolled)
 
     gradient = jax.grad(value)
     inner = jax.jit(jax.vmap(gradient))(inputs)
