@@ -71,7 +71,7 @@ def inputs_of(env: Any, worlds: int = WORLDS) -> Inputs:
     else:
         q = system.rest_q + 0.3 * rng.normal(size=(worlds, system.nq))
         v = rng.normal(size=(worlds, system.nv))
-        action = rng.uniform(-1.0, 1.0, (worlds, system.nu))
+        action = rng.uniform(-1.0, 1.0, (worlds, env.action_size))
     params = {name: np.asarray(getattr(env.default_params, name)) for name in FIELDS}
     scales = {
         name: x * rng.uniform(0.7, 1.3, (worlds, *x.shape))
@@ -166,10 +166,10 @@ def close(found: Any, expected: Any) -> None:
 def test_every_transformation_gives_the_same(x64: None, name: str) -> None:
     """Three steps in a scan; batched, nested, unrolled, remat, alone, Jacobian."""
     env = make(name)
-    inputs = inputs_of(env, 4)
+    inputs, weigh = inputs_of(env, 4), weighted(env)
 
     def value(inputs: Inputs, unrolled: bool = False) -> jax.Array:
-        return weighted(env)(inputs, 3, unrolled)
+        return weigh(inputs, 3, unrolled)
 
     gradient = jax.grad(value)
     inner = jax.jit(jax.vmap(gradient))(inputs)
