@@ -153,7 +153,7 @@ def execute(run: Run, seconds: float, device: str, file: Path) -> None:
     import newton_qd.compat
     from newton_qd.qd import make_task
     from newton_qd.qd.algorithms import ALGORITHMS as TABLE
-    from newton_qd.qd.folder import Archive
+    from newton_qd.qd.archive import Archive
     from newton_qd.qd.search import Search
 
     if run.algorithm == "pga-me":

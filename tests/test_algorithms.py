@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from test_evolve import SMALL, interrupt_after, point_task, run
+from test_steady import compiled
 
 import newton_qd.compat
 from newton_qd import cli
@@ -16,6 +17,9 @@ from newton_qd.qd.algorithms import ALGORITHMS
 from newton_qd.qd.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
 from newton_qd.qd.config import ConfigError, EvolveConfig, read_config
 from newton_qd.qd.evolve import evolve
+from newton_qd.qd.search import Search
+
+__all__ = ["compiled"]  # a fixture
 
 # QDax and what it imports warn about their own use of other packages.
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
@@ -31,12 +35,29 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "me": {},
     "cma-me": {"emitters": 2},
     "pga-me": CRITIC,
+    "dcrl-me": CRITIC,
     "me-es": {"num_optimizer_steps": 2, "sample_sigma": 0.1, "learning_rate": 0.1},
     "me-gradient": {},
     "omg-mega": {},
     "cma-mega": {"points": 2},
     "cma-maega": {"points": 2, "adam": 0.05},
 }
+
+
+def count_after_generations(
+    patch: pytest.MonkeyPatch, compiled: list[str]
+) -> list[int]:
+    """List of the number of compiled programs after each generation to come."""
+    counts: list[int] = []
+    advance = Search.advance
+
+    def advance_and_count(self: Search, state: Any) -> Any:
+        state = advance(self, state)
+        counts.append(len(compiled))
+        return state
+
+    patch.setattr(Search, "advance", advance_and_count)
+    return counts
 
 
 def test_every_algorithm_is_tested() -> None:
@@ -46,7 +67,7 @@ def test_every_algorithm_is_tested() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", OPTIONS)
 def test_a_stop_changes_nothing(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compiled: list[str]
 ) -> None:
     config = EvolveConfig(
         env_name="pointmaze",
@@ -61,7 +82,9 @@ def test_a_stop_changes_nothing(
     )
     common: dict[str, Any] = {"progress": False, "checkpoint_seconds": 1e9}
     try:
-        whole = evolve(config, out=tmp_path / "whole", **common)
+        with monkeypatch.context() as patch:
+            counts = count_after_generations(patch, compiled)
+            whole = evolve(config, out=tmp_path / "whole", **common)
         with monkeypatch.context() as patch:
             interrupt_after(patch, 3)
             assert evolve(config, out=tmp_path / "parts", **common).interrupted
@@ -71,6 +94,8 @@ def test_a_stop_changes_nothing(
     for file in ("checkpoint.bin", "archive.npz", "metrics.csv"):
         left, right = (tmp_path / run / file for run in ("whole", "parts"))
         assert left.read_bytes() == right.read_bytes(), file
+    # Nothing is compiled after the first generation.
+    assert counts[0] < counts[1] and counts[1:] == counts[1:2] * config.iterations
     metrics = whole.metrics
     for column in ("qd_score", "coverage", "max_fitness"):
         assert metrics[column][-1] > metrics[column][0], column
@@ -142,8 +167,16 @@ def test_faulty_individuals_are_counted(name: str) -> None:
     assert np.isfinite(archive.fitnesses[archive.filled]).all()
 
 
+def test_shares_of_a_batch_that_do_not_fit_are_refused() -> None:
+    for options in ({"ga_batch_size": 9}, {"dcrl_batch_size": 0, "ga_batch_size": 12}):
+        config = SMALL.replace(algorithm="dcrl-me", options=options)
+        with pytest.raises(ConfigError, match=r"must .* add up to batch_size \(16\)"):
+            run(config)
+    newton_qd.compat.uninstall()
+
+
 @pytest.mark.slow
-def test_a_checkpoint_without_the_emitter_is_refused(
+def test_a_checkpoint_of_another_emitter_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = SMALL.replace(algorithm="cma-me", options={"emitters": 2}, iterations=2)
@@ -154,11 +187,14 @@ def test_a_checkpoint_without_the_emitter_is_refused(
     path = out / "checkpoint.bin"
     whole = load_checkpoint(path)
     assert whole.emitter
-    save_checkpoint(path, type(whole)(**{**vars(whole), "emitter": ()}))
-    with pytest.raises(
-        CheckpointError, match="holds 0 arrays of the algorithm 'cma-me'"
+    longer = (np.append(whole.emitter[0], 0), *whole.emitter[1:])
+    for emitter, message in (
+        ((), "holds 0 arrays of the algorithm 'cma-me'"),
+        (longer, r"array 0 of the algorithm 'cma-me' has shape \(\d+,\)"),
     ):
-        run(config, out=out, resume=True)
+        save_checkpoint(path, type(whole)(**{**vars(whole), "emitter": emitter}))
+        with pytest.raises(CheckpointError, match=message):
+            run(config, out=out, resume=True)
 
 
 @pytest.mark.slow

@@ -15,8 +15,8 @@ from test_evolve import SMALL, point_task
 
 import newton_qd
 from newton_qd import cli
+from newton_qd.qd.archive import load_archive
 from newton_qd.qd.config import EvolveConfig
-from newton_qd.qd.folder import load_archive
 from newton_qd.qd.task import Task
 
 # QDax and what it imports warn about their own use of other packages.

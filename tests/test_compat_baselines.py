@@ -178,43 +178,35 @@ def test_training_raises_the_return(make: Any) -> None:
     assert after[0] > before[0]
 
 
-def test_populations_train_in_map_elites() -> None:
-    from qdax.baselines.td3_pbt import PBTTD3, PBTTD3Config
-    from qdax.core.containers.mapelites_repertoire import compute_cvt_centroids
-    from qdax.core.distributed_map_elites import DistributedMAPElites
+TRAINED, VARIED, EACH = 2, 6, 5  # agents that learn, that vary, and worlds of one
+
+
+def pbt_emitter(agent: Any, env: Any) -> Any:
     from qdax.core.emitters.pbt_me_emitter import PBTEmitter, PBTEmitterConfig
     from qdax.core.emitters.pbt_variation_operators import td3_pbt_variation_fn
-    from qdax.tasks.brax.v1 import create, descriptor_extractor, reward_offset
-    from qdax.utils.metrics import default_qd_metrics
 
-    trained, varied, worlds = 2, 6, 5
-    env = create("pointmaze", episode_length=EPISODE, batch_size=worlds * trained)
+    config = PBTEmitterConfig(
+        buffer_size=1_000,
+        num_training_iterations=4,
+        env_batch_size=EACH,
+        grad_updates_per_step=1.0,
+        pg_population_size_per_device=TRAINED,
+        ga_population_size_per_device=VARIED,
+        num_devices=1,
+        fraction_best_to_replace_from=0.5,
+        fraction_to_replace_from_best=0.5,
+        fraction_to_replace_from_samples=0.5,
+        fraction_sort_exchange=0.1,
+    )
+    variation = functools.partial(td3_pbt_variation_fn, iso_sigma=0.05, line_sigma=0.1)
+    return PBTEmitter(agent, config, env, variation)
+
+
+def pbt_score(agent: Any) -> Any:
+    from qdax.tasks.brax.v1 import create, descriptor_extractor
+
     single = create("pointmaze", episode_length=EPISODE, batch_size=1)
     first = jax.jit(single.reset)(rng=jax.random.key(1))
-    agent = PBTTD3(
-        PBTTD3Config(episode_length=EPISODE, **_without(SMALL, "discount")),
-        env.action_size,
-    )
-    emitter = PBTEmitter(
-        pbt_agent=agent,
-        config=PBTEmitterConfig(
-            buffer_size=1_000,
-            num_training_iterations=4,
-            env_batch_size=worlds,
-            grad_updates_per_step=1.0,
-            pg_population_size_per_device=trained,
-            ga_population_size_per_device=varied,
-            num_devices=1,
-            fraction_best_to_replace_from=0.5,
-            fraction_to_replace_from_best=0.5,
-            fraction_to_replace_from_samples=0.5,
-            fraction_sort_exchange=0.1,
-        ),
-        env=env,
-        variation_fn=functools.partial(
-            td3_pbt_variation_fn, iso_sigma=0.05, line_sigma=0.1
-        ),
-    )
     evaluate = agent.get_eval_qd_fn(single, descriptor_extractor["pointmaze"])
 
     def score(genotypes: Any, key: Any) -> Any:
@@ -223,26 +215,41 @@ def test_populations_train_in_map_elites() -> None:
         returns, descriptors, _, _ = evaluate(genotypes, states)
         return returns, descriptors, {}
 
+    return score
+
+
+def pbt_population(agent: Any, env: Any, keys: Any, devices: Any) -> Any:
+    make = agent.get_init_fn(
+        TRAINED + VARIED, env.action_size, env.observation_size, 1000
+    )
+    agents, _ = jax.pmap(make, axis_name="p", devices=devices)(keys)
+    empty = jax.vmap(type(agents).empty_optimizers_states)
+    return jax.pmap(empty, axis_name="p", devices=devices)(agents)
+
+
+def test_populations_train_in_map_elites() -> None:
+    from qdax.baselines.td3_pbt import PBTTD3, PBTTD3Config
+    from qdax.core.containers.mapelites_repertoire import compute_cvt_centroids
+    from qdax.core.distributed_map_elites import DistributedMAPElites
+    from qdax.tasks.brax.v1 import create, reward_offset
+    from qdax.utils.metrics import default_qd_metrics
+
+    env = create("pointmaze", episode_length=EPISODE, batch_size=EACH * TRAINED)
+    settings = {name: value for name, value in SMALL.items() if name != "discount"}
+    agent = PBTTD3(PBTTD3Config(episode_length=EPISODE, **settings), env.action_size)
     metrics = functools.partial(
         default_qd_metrics, qd_offset=reward_offset["pointmaze"] * EPISODE
     )
+    map_elites = DistributedMAPElites(
+        pbt_score(agent), pbt_emitter(agent, env), metrics
+    )
     devices = jax.devices("cpu")[:1]
-    map_elites = DistributedMAPElites(score, emitter, metrics)
     keys = jax.random.key_data(jax.random.split(jax.random.key(2), 1))
-    agents, _ = jax.pmap(
-        agent.get_init_fn(
-            trained + varied, env.action_size, env.observation_size, 1000
-        ),
-        axis_name="p",
-        devices=devices,
-    )(keys)
-    agents = jax.pmap(
-        jax.vmap(type(agents).empty_optimizers_states), axis_name="p", devices=devices
-    )(agents)
     centroids = compute_cvt_centroids(2, 1000, 64, -1.0, 1.0, jax.random.key(3))
-    repertoire, state, begin = map_elites.get_distributed_init_fn(
-        devices=devices, centroids=centroids
-    )(genotypes=agents, key=keys)
+    init = map_elites.get_distributed_init_fn(devices=devices, centroids=centroids)
+    repertoire, state, begin = init(
+        genotypes=pbt_population(agent, env, keys, devices), key=keys
+    )
     update = map_elites.get_distributed_update_fn(num_iterations=1, devices=devices)
     end = begin
     for _ in range(10):
@@ -300,7 +307,3 @@ def test_aurora_fills_an_archive_without_descriptors() -> None:
         repertoire, state, last = update(repertoire, state, key, aurora_extra_info=info)
     assert last["coverage"] > first["coverage"]
     assert last["max_fitness"] > first["max_fitness"]
-
-
-def _without(settings: dict[str, Any], name: str) -> dict[str, Any]:
-    return {key: value for key, value in settings.items() if key != name}

@@ -29,10 +29,11 @@ from newton_qd.errors import MissingExtra, UnknownEnvironment
 from newton_qd.extractors import get_feet_contact_proportion
 from newton_qd.qd import checkpoint as checkpoint_module
 from newton_qd.qd import plot, search
+from newton_qd.qd.archive import Archive, load_archive
 from newton_qd.qd.checkpoint import CheckpointError
 from newton_qd.qd.config import ConfigError, EvolveConfig, read_config
 from newton_qd.qd.evolve import EvolveResult, evolve
-from newton_qd.qd.folder import Archive, RunFolder, load_archive
+from newton_qd.qd.folder import RunFolder
 from newton_qd.qd.interrupt import INTERRUPTED, graceful_stop
 from newton_qd.qd.progress import Progress
 from newton_qd.qd.rollout import make_policy, make_scoring_function
@@ -119,10 +120,10 @@ def compile_once() -> Iterator[None]:
     """Share compiled functions between runs with the same settings."""
     made: dict[tuple[EvolveConfig, bool], Search] = {}
 
-    def search(config: EvolveConfig, task: Task) -> Search:
+    def search(config: EvolveConfig, task: Task, mesh: Any) -> Search:
         key = (config, bool(jax.config.read("jax_enable_x64")))
-        if type(task.env) is not PointEnv:
-            return Search(config, task)
+        if type(task.env) is not PointEnv or mesh is not None:
+            return Search(config, task, mesh)
         return made.setdefault(key, made.get(key) or Search(config, task))
 
     with pytest.MonkeyPatch.context() as patch:
@@ -296,6 +297,32 @@ def test_a_run_in_which_everything_is_faulty_ends() -> None:
             progress=False,
             task_factory=lambda config: point_task(config, Faulty()),
         )
+
+
+def test_descriptors_out_of_bounds_go_to_the_nearest_cell() -> None:
+    class Narrow(PointEnv):
+        pass
+
+    limits = np.full(2, 0.4, np.float32), np.full(2, 0.6, np.float32)
+    task = dataclasses.replace(point_task(SMALL, Narrow()), limits=limits)
+    config = SMALL.replace(iterations=1)
+    archive = evolve(config, progress=False, task_factory=lambda _: task).archive
+    filled = archive.filled
+    found = archive.descriptors[filled]
+    assert np.any((found < 0.4) | (found > 0.6))
+    distance = np.square(found[:, None] - archive.centroids).sum(-1)
+    np.testing.assert_array_equal(distance.argmin(1), np.flatnonzero(filled))
+
+
+def test_genotypes_of_another_policy_are_refused() -> None:
+    task = point_task(SMALL)
+    policy = make_policy(task.env, SMALL.hidden)
+    score = make_scoring_function(task, policy, SMALL.episode_length)
+    for shape in ((5, policy.size + 1), (policy.size,)):
+        with pytest.raises(
+            ValueError, match=rf"genotypes: shape .* allowed: \(N, {policy.size}\)"
+        ):
+            jax.eval_shape(score, jnp.zeros(shape), jax.random.key(0))
 
 
 def test_equal_individuals_of_a_cell_do_not_compete() -> None:
@@ -724,14 +751,17 @@ def test_missing_config_file(tmp_path: Path) -> None:
         read_config(tmp_path / "config.json")
 
 
-@pytest.mark.parametrize(("package", "extra"), [("qdax", "qd"), ("matplotlib", "viz")])
+@pytest.mark.parametrize(
+    ("package", "extra"),
+    [("qdax", "qd"), ("matplotlib", "viz"), ("tensorboardX", "tensorboard")],
+)
 def test_missing_extras(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, package: str, extra: str
 ) -> None:
     monkeypatch.setitem(sys.modules, package, None)
     out = tmp_path / "run"
     with pytest.raises(MissingExtra, match=rf"{package}.*newton_qd\[{extra}\]"):
-        run(out=out)
+        run(out=out, tensorboard=True)
     assert not out.exists()
 
 

@@ -71,6 +71,7 @@ HEAVY = {
     "newton.viewer",
     "qdax",
     "ribs",
+    "tensorboardX",
     "tqdm",
 }
 CORE_DEPENDENCIES = {"jax", "newton", "numpy", "warp-lang"}

@@ -13,7 +13,10 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from test_algorithms import CRITIC
 
+from newton_qd.qd.config import ConfigError, EvolveConfig
+from newton_qd.qd.evolve import evolve
 from newton_qd.qd.sharding import device_mesh
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -51,6 +54,16 @@ def answer(process: subprocess.Popen[str]) -> Any:
     return json.loads(output.splitlines()[-1])
 
 
+def two_processes_and_one(code: str) -> list[Any]:
+    """Answers of two processes of one JAX, and of a process of its own."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    join = f"jax.distributed.initialize({address!r}, 2, %d)\n"
+    runs = [start(join % 0 + code), start(join % 1 + code), start(code)]
+    return [answer(process) for process in runs]
+
+
 FOUR_DEVICES = {"XLA_FLAGS": "--xla_force_host_platform_device_count=4"}
 
 
@@ -62,9 +75,10 @@ def test_a_mesh_has_the_devices_that_exist() -> None:
 
 
 @pytest.mark.slow
-def test_results_do_not_depend_on_the_number_of_devices() -> None:
+@pytest.mark.parametrize("name", ["ant_uni", "pointmaze"])
+def test_results_do_not_depend_on_the_number_of_devices(name: str) -> None:
     code = """
-score, genotypes = problem("ant_uni", 22)
+score, genotypes = problem("NAME", 22)
 key = jax.random.key(2)
 expected = jax.jit(score)(genotypes, key)
 shapes = []
@@ -81,7 +95,8 @@ for count in (1, 2, 4):
 print(json.dumps(shapes))
 """
     # 22 individuals on 4 devices are 24 with the copies that fill up.
-    assert answer(start(code, **FOUR_DEVICES)) == [22, 11, 6]
+    process = start(code.replace("NAME", name), **FOUR_DEVICES)
+    assert answer(process) == [22, 11, 6]
 
 
 @pytest.mark.slow
@@ -110,14 +125,8 @@ print(json.dumps([worlds for name, worlds in launched if name == step]))
 
 @pytest.mark.slow
 def test_two_processes_agree_with_one() -> None:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        address = f"127.0.0.1:{free.getsockname()[1]}"
     code = """
 from jax.sharding import NamedSharding, PartitionSpec
-address, index = "ADDRESS", INDEX
-if index is not None:
-    jax.distributed.initialize(address, num_processes=2, process_id=index)
 score, genotypes = problem("ant_uni", 16, 5)
 mesh = device_mesh()
 data = np.asarray(jax.random.key_data(jax.random.key(2)))
@@ -129,10 +138,95 @@ everywhere = NamedSharding(mesh, PartitionSpec())
 found = jax.jit(run)(*jax.device_put((genotypes, data), everywhere))
 print(json.dumps([mesh.size, *(np.asarray(x).tolist() for x in found[:2])]))
 """
-    code = code.replace("ADDRESS", address)
-    runs = [start(code.replace("INDEX", text)) for text in ("0", "1", "None")]
-    first, second, alone = (answer(process) for process in runs)
+    first, second, alone = two_processes_and_one(code)
     assert (first[0], alone[0]) == (2, 1)
     assert first == second
     np.testing.assert_array_equal(first[1], alone[1])
     np.testing.assert_array_equal(first[2], alone[2])
+
+
+def test_devices_that_do_not_exist_are_refused(tmp_path: Path) -> None:
+    count = len(jax.devices())
+    with pytest.raises(ConfigError, match=rf"devices: count=99: allowed: 1 to {count}"):
+        evolve(EvolveConfig(), out=tmp_path / "run", devices=99)
+    assert not list(tmp_path.iterdir())
+
+
+EVOLVE = """
+import warnings
+warnings.simplefilter("ignore")
+import newton_qd.qd
+
+def evolved(name, algorithm="me", options=(), **arguments):
+    config = EvolveConfig(
+        env_name=name, algorithm=algorithm, options=options, iterations=3,
+        batch_size=10, episode_length=10, hidden=(8,), centroids=32, reevaluations=2,
+    )
+    found = newton_qd.qd.evolve(config, progress=False, **arguments)
+    archive, corrected = found.archive, found.corrected
+    names = ("genotypes", "fitnesses", "descriptors")
+    return [str(corrected), *(np.asarray(getattr(archive, x)).tolist() for x in names)]
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "algorithm", "options"),
+    [
+        ("ant_uni", "me", {}),
+        ("pointmaze", "pga-me", CRITIC),
+        ("pointmaze", "me-es", {"num_optimizer_steps": 2}),
+    ],
+)
+def test_an_archive_does_not_depend_on_the_number_of_devices(
+    name: str, algorithm: str, options: dict[str, Any]
+) -> None:
+    code = f"""
+task = {name!r}, {algorithm!r}, {options!r}
+alone = evolved(*task)
+print(json.dumps([evolved(*task, devices=count) == alone for count in (1, 3, 4)]))
+"""
+    assert answer(start(EVOLVE + code, **FOUR_DEVICES)) == [True] * 3
+
+
+@pytest.mark.slow
+def test_two_processes_evolve_one_archive() -> None:
+    code = """
+found = evolved("pointmaze", devices=jax.device_count())
+try:
+    evolved("pointmaze", resume=True)
+    refused = ""
+except newton_qd.qd.ConfigError as error:
+    refused = str(error)
+print(json.dumps([found, refused]))
+"""
+    first, second, alone = two_processes_and_one(EVOLVE + code)
+    assert first[0] == second[0] == alone[0]
+    assert first[1].startswith("resume: a run of 2 processes") and alone[1] == ""
+
+
+def check_devices(**variables: str) -> None:
+    """Runs the benchmark, which compares one device with all of them."""
+    arguments = ["--batch-size", "30", "--episode-length", "10"]
+    done = subprocess.run(
+        [sys.executable, "benchmarks/devices.py", *arguments],
+        cwd=ROOT,
+        env={**os.environ, **variables},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=540,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.slow
+def test_virtual_devices_share_the_worlds() -> None:
+    check_devices(JAX_PLATFORMS="cpu", **FOUR_DEVICES)
+
+
+@pytest.mark.gpu
+def test_gpus_share_the_worlds() -> None:
+    if len(jax.devices("gpu")) < 2:
+        pytest.skip("needs two GPUs")
+    check_devices()

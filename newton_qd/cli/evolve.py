@@ -72,6 +72,17 @@ def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="least time between two checkpoints (default: 5)",
     )
+    parser.add_argument(
+        "--tensorboard",
+        action="store_true",
+        help="write the metrics as event files for TensorBoard too",
+    )
+    parser.add_argument(
+        "--devices",
+        type=int,
+        metavar="N",
+        help="devices that share each evaluation; does not change the result",
+    )
     parser.add_argument("--quiet", action="store_true", help="show no progress")
 
 
@@ -95,8 +106,8 @@ def _add_setting_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--algorithm",
         metavar="NAME",
-        help="me, cma-me, pga-me, me-es, or, with gradients, me-gradient, omg-mega, "
-        f"cma-mega or cma-maega (default: {_DEFAULTS.algorithm})",
+        help="me, cma-me, pga-me, dcrl-me, me-es, or, with gradients, me-gradient, "
+        f"omg-mega, cma-mega or cma-maega (default: {_DEFAULTS.algorithm})",
     )
     group.add_argument(
         "--option",
@@ -176,7 +187,9 @@ def run(
             out=out,
             resume=arguments.resume,
             progress=not arguments.quiet,
+            tensorboard=arguments.tensorboard,
             checkpoint_seconds=arguments.checkpoint_seconds,
+            devices=arguments.devices,
             task_factory=make_task if task_factory is None else task_factory,
         )
     except SearchError as error:

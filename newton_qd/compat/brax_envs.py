@@ -11,13 +11,12 @@ import jax
 from newton_qd import registry
 from newton_qd.compat.scoring import (
     Extractor,
-    default_policy,
+    default_task,
+    evaluate,
     get_mask_from_transitions,
     make_policy_network_play_step_fn_brax,
     population_size,
     reset_function,
-    scores,
-    unroll,
 )
 from newton_qd.envs.base import Env
 from newton_qd.envs.state import State
@@ -66,12 +65,14 @@ def scoring_function_brax_envs(
         Fitnesses (N,), descriptors (N, D), ``{"transitions": ...}`` and a new key.
     """
     random_key, step_key = jax.random.split(random_key)
-
-    def episode(state: State, params: Any) -> Any:
-        return unroll(play_step_fn, (state, params, step_key), episode_length)
-
-    data = jax.vmap(episode)(init_states, policies_params)
-    return *scores(data, behavior_descriptor_extractor), random_key
+    found = evaluate(
+        play_step_fn,
+        (init_states, policies_params, step_key),
+        (0, 0, None),
+        episode_length,
+        behavior_descriptor_extractor,
+    )
+    return *found, random_key
 
 
 @functools.partial(
@@ -108,13 +109,14 @@ def scoring_actor_dc_function_brax_envs(
         Fitnesses (N,), descriptors (N, D), ``{"transitions": ...}`` and a new key.
     """
     random_key, step_key = jax.random.split(random_key)
-
-    def episode(state: State, desc: jax.Array, params: Any) -> Any:
-        carry = (state, desc, params, step_key)
-        return unroll(play_step_actor_dc_fn, carry, episode_length)
-
-    data = jax.vmap(episode)(init_states, descs, actors_dc_params)
-    return *scores(data, behavior_descriptor_extractor), random_key
+    found = evaluate(
+        play_step_actor_dc_fn,
+        (init_states, descs, actors_dc_params, step_key),
+        (0, 0, 0, None),
+        episode_length,
+        behavior_descriptor_extractor,
+    )
+    return *found, random_key
 
 
 def reset_based_scoring_function_brax_envs(
@@ -232,8 +234,9 @@ def create_default_brax_task_components(
     Returns:
         Environment, policy, scoring function and a new key.
     """
-    env = registry.create(env_name, episode_length=episode_length)
-    policy_network = default_policy(env, mlp_policy_hidden_layer_sizes)
+    env, policy_network = default_task(
+        env_name, episode_length, mlp_policy_hidden_layer_sizes
+    )
     scoring_fn, random_key = create_brax_scoring_fn(
         env,
         policy_network,

@@ -12,13 +12,12 @@ from newton_qd import registry
 from newton_qd.compat.scoring import (
     Extractor,
     Scores,
-    default_policy,
+    default_task,
+    evaluate,
     get_mask_from_transitions,
     make_policy_network_play_step_fn_brax,
     population_size,
     reset_function,
-    scores,
-    unroll,
 )
 from newton_qd.envs.base import Env
 from newton_qd.envs.state import State
@@ -97,12 +96,10 @@ def scoring_function_brax_envs(
     key, reset_key = jax.random.split(key)
     states = jax.vmap(play_reset_fn)(jax.random.split(reset_key, count))
     keys = jax.random.split(key, count)
-
-    def episode(*carry: Any) -> Any:
-        return unroll(play_step_fn, carry, episode_length)
-
-    data = jax.vmap(episode)(states, policies_params, keys)
-    return scores(data, descriptor_extractor)
+    carry = (states, policies_params, keys)
+    return evaluate(
+        play_step_fn, carry, (0, 0, 0), episode_length, descriptor_extractor
+    )
 
 
 def create_brax_scoring_fn(
@@ -155,8 +152,9 @@ def create_default_brax_task_components(
         mlp_policy_hidden_layer_sizes: Widths of the policy's hidden layers.
         deterministic: Whether all evaluations begin in one state.
     """
-    env = registry.create(env_name, episode_length=episode_length)
-    policy_network = default_policy(env, mlp_policy_hidden_layer_sizes)
+    env, policy_network = default_task(
+        env_name, episode_length, mlp_policy_hidden_layer_sizes
+    )
     scoring_fn = create_brax_scoring_fn(
         env,
         policy_network,

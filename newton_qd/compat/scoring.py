@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from newton_qd import registry
 from newton_qd.envs.base import Env
 from newton_qd.envs.state import State
 from newton_qd.extractors import folded_sum
@@ -62,38 +63,37 @@ def get_mask_from_transitions(data: Any) -> jax.Array:
     return jnp.concatenate([jnp.zeros_like(ended[:, :1]), ended[:, :-1]], axis=1)
 
 
-def unroll(
-    play_step: Callable[..., tuple], carry: tuple[Any, ...], episode_length: int
-) -> Any:
-    """Takes the steps of one episode.
+def evaluate(
+    play_step: Callable[..., tuple],
+    carry: tuple[Any, ...],
+    in_axes: tuple[int | None, ...],
+    episode_length: int,
+    descriptor_extractor: Extractor,
+) -> Scores:
+    """Lets N policies play an episode each, side by side.
 
     Args:
         play_step: Maps the carry, as arguments, to the carry and a transition.
-        carry: State, parameters and what else ``play_step`` takes.
+        carry: States, parameters and what else ``play_step`` takes.
+        in_axes: 0 for each part of the carry of which every policy has its own,
+            ``None`` for the others.
         episode_length: Number of steps T.
-
-    Returns:
-        Transitions (T, ...).
-    """
-
-    def body(carry: tuple[Any, ...], _: None) -> tuple[tuple[Any, ...], Any]:
-        *carry_list, transition = play_step(*carry)
-        return tuple(carry_list), transition
-
-    return jax.lax.scan(body, carry, None, length=episode_length)[1]
-
-
-def scores(data: Any, descriptor_extractor: Extractor) -> Scores:
-    """Reads fitnesses and descriptors from transitions.
-
-    Args:
-        data: Transitions (N, T, ...).
-        descriptor_extractor: Maps transitions and their mask to descriptors (N, D).
+        descriptor_extractor: Maps transitions (N, T, ...) and their mask to
+            descriptors (N, D).
 
     Returns:
         Fitnesses (N,), summed so that a row does not depend on N; descriptors
-        (N, D); and the transitions.
+        (N, D); and ``{"transitions": ...}``.
     """
+
+    def episode(*carry: Any) -> Any:
+        def body(carry: tuple[Any, ...], _: None) -> tuple[tuple[Any, ...], Any]:
+            *carry_list, transition = play_step(*carry)
+            return tuple(carry_list), transition
+
+        return jax.lax.scan(body, carry, None, length=episode_length)[1]
+
+    data = jax.vmap(episode, in_axes=in_axes)(*carry)
     mask = get_mask_from_transitions(data)
     fitnesses = folded_sum(data.rewards * (1.0 - mask), 1)
     return fitnesses, descriptor_extractor(data, mask), {"transitions": data}
@@ -117,12 +117,16 @@ def reset_function(
     return env.reset if play_reset_fn is None else play_reset_fn
 
 
-def default_policy(env: Env, hidden: tuple[int, ...]) -> Any:
-    """Returns the perceptron that QDax gives to a task."""
+def default_task(
+    env_name: str, episode_length: int, hidden: tuple[int, ...]
+) -> tuple[Env, Any]:
+    """Makes an environment, and the perceptron that QDax gives to it."""
     from qdax.core.neuroevolution.networks.networks import MLP
 
-    return MLP(
+    env = registry.create(env_name, episode_length=episode_length)
+    policy_network = MLP(
         layer_sizes=(*hidden, env.action_size),
         kernel_init=jax.nn.initializers.lecun_uniform(),
         final_activation=jnp.tanh,
     )
+    return env, policy_network

@@ -11,7 +11,7 @@ import numpy as np
 from newton_qd.envs.base import QDEnv
 from newton_qd.envs.inputs import checked_action, refuse_params, require_precision
 from newton_qd.envs.state import State
-from newton_qd.envs.vectors import length
+from newton_qd.envs.vectors import length, rounded
 from newton_qd.types import Action, Params, RNGKey
 
 _WALL_THICKNESS = 0.01
@@ -133,7 +133,8 @@ class PointMaze(QDEnv):
     def _moved(self, old: jax.Array, action: jax.Array) -> jax.Array:
         """Returns where (2,) an action takes the point (2,)."""
         low, high = self._array(self._low), self._array(self._high)
-        new = old + jnp.clip(action, low, high) / self._scale
+        move = rounded(jnp.clip(action, low, high) / self._scale)
+        new = old + move
         new = new.at[1].set(self._stopped_by_lower(old, new))
         new = new.at[1].set(self._stopped_by_upper(old, new))
         return jnp.clip(new, low, high)
@@ -263,7 +264,7 @@ def _crossing(
     x, y = new
     # a path that keeps its y would divide 0 by 0
     rise = jnp.where(crosses, y - y_old, jnp.ones_like(y))
-    return (height - y_old) / rise * (x - x_old) + x_old
+    return rounded((height - y_old) / rise * (x - x_old)) + x_old
 
 
 def _require_numbers(positive: bool = False, **settings: float) -> None:

@@ -21,10 +21,10 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from newton_qd.qd.annealed_repertoire import AnnealedRepertoire
+    from newton_qd.qd.archive import Archive, ArchiveError, load_archive
     from newton_qd.qd.checkpoint import CheckpointError
     from newton_qd.qd.config import ConfigError, EvolveConfig
     from newton_qd.qd.evolve import EvolveResult, evolve
-    from newton_qd.qd.folder import Archive, load_archive
     from newton_qd.qd.gradient_scoring import make_gradient_scoring_function
     from newton_qd.qd.plot import plot_archive
     from newton_qd.qd.rollout import Policy, make_policy, make_scoring_function
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 __all__ = [
     "AnnealedRepertoire",
     "Archive",
+    "ArchiveError",
     "CheckpointError",
     "ConfigError",
     "EvolveConfig",
@@ -52,7 +53,8 @@ __all__ = [
 
 _HOME = {
     "AnnealedRepertoire": "annealed_repertoire",
-    "Archive": "folder",
+    "Archive": "archive",
+    "ArchiveError": "archive",
     "CheckpointError": "checkpoint",
     "ConfigError": "config",
     "EvolveConfig": "config",
@@ -61,7 +63,7 @@ _HOME = {
     "SearchError": "search",
     "Task": "task",
     "evolve": "evolve",
-    "load_archive": "folder",
+    "load_archive": "archive",
     "make_gradient_scoring_function": "gradient_scoring",
     "make_policy": "rollout",
     "make_scoring_function": "rollout",

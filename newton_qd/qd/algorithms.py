@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 from newton_qd import compat
 from newton_qd.qd.config import ConfigError
@@ -129,6 +130,50 @@ def _pga_me(parts: Parts) -> Any:
     return _OfParameters(emitter, parts.policy, lambda steps: QDTransition(**steps))
 
 
+def _dcrl_me(parts: Parts) -> Any:
+    """DCRL-ME: a critic and an actor that know the descriptor (Faldor et al. 2024)."""
+    compat.install()  # as above
+    from qdax.core.emitters.dcrl_me_emitter import DCRLMEConfig, DCRLMEEmitter
+    from qdax.core.neuroevolution.buffers.buffer import DCRLTransition
+    from qdax.core.neuroevolution.networks.networks import MLPDC
+
+    config = parts.config
+    quarter = config.batch_size // 4
+    options = settings(
+        DCRLMEConfig,
+        config,
+        ga_batch_size=config.batch_size - 2 * quarter,
+        dcrl_batch_size=quarter,
+        ai_batch_size=quarter,
+        replay_buffer_size=_REPLAY_BUFFER,
+    )
+    shares = options.ga_batch_size, options.dcrl_batch_size, options.ai_batch_size
+    if min(shares) < 1 or sum(shares) != config.batch_size:
+        raise ConfigError(
+            "options: ga_batch_size, dcrl_batch_size and ai_batch_size must be at "
+            f"least 1 and add up to batch_size ({config.batch_size}), got {shares}"
+        )
+    actor = MLPDC(
+        layer_sizes=(*config.hidden, parts.task.env.action_size),
+        kernel_init=jax.nn.initializers.lecun_uniform(),
+        final_activation=jnp.tanh,
+    )
+
+    def convert(steps: dict[str, jax.Array]) -> Any:
+        # It weighs rewards by the distance of descriptors, so none may be negative.
+        rewards = jnp.maximum(steps["rewards"] + parts.task.reward_offset, 0.0)
+        shape = (*rewards.shape, parts.task.descriptor_length)
+        unknown = jnp.full(shape, jnp.nan, rewards.dtype)  # the emitter fills it in
+        return DCRLTransition(
+            **{**steps, "rewards": rewards}, desc=unknown, desc_prime=unknown
+        )
+
+    emitter = DCRLMEEmitter(
+        options, parts.policy.network, actor, parts.task.env, isoline(config)
+    )
+    return _OfParameters(emitter, parts.policy, convert)
+
+
 class _FromOne:
     """ME-ES, which grows from one individual, in a population of any size."""
 
@@ -170,8 +215,11 @@ ALGORITHMS: Mapping[str, Algorithm] = {
     "me": Algorithm(_me),
     "cma-me": Algorithm(_cma_me),
     "pga-me": Algorithm(_pga_me, transitions=True),
+    "dcrl-me": Algorithm(_dcrl_me, transitions=True),
     # The samples of a gradient, and the individual that they lead to.
-    "me-es": Algorithm(_me_es, evaluations=lambda config: config.batch_size + 1),
+    "me-es": Algorithm(
+        _me_es, evaluates=True, evaluations=lambda config: config.batch_size + 1
+    ),
     **GRADIENT_ALGORITHMS,
 }
 """The algorithms of ``evolve`` by their names."""

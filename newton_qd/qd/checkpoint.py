@@ -6,6 +6,7 @@ then a NumPy archive. The digest turns every kind of damage into one clear error
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import io
@@ -57,14 +58,24 @@ def write_atomically(path: Path, content: bytes) -> None:
     Args:
         path: File to write or replace.
         content: Everything that the file shall hold.
+
+    Raises:
+        OSError: The disk is full, or the folder cannot be written to; the old file
+            is as it was.
     """
     temporary = temporary_name(path)
-    with open(temporary, "wb") as file:
-        file.write(content)
-        file.flush()
-        # Without this a power cut after the rename can leave an empty file.
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
+    try:
+        with open(temporary, "wb") as file:
+            file.write(content)
+            file.flush()
+            # Without this a power cut after the rename can leave an empty file.
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+        # The system's message, which does not always say for which file.
+        raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 def npz_bytes(**arrays: np.ndarray) -> bytes:

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from newton_qd.qd.folder import Archive
+from newton_qd.qd.archive import Archive
 from newton_qd.qd.rollout import ScoringFunction
 
 
@@ -47,7 +47,7 @@ def correct(
 
     Args:
         archive: Archive with at least one elite.
-        score: Scoring function; all elites share a start state in each call.
+        score: Compiled scoring function; all elites share a start state in each call.
         key: Split into a key for each call.
         reevaluations: Number of calls.
         offset: Added to each elite's fitness in the QD score.
@@ -57,12 +57,11 @@ def correct(
         The metrics; ``None`` if ``stop`` said so.
     """
     genotypes = jnp.asarray(archive.genotypes[archive.filled])
-    run = jax.jit(score)
     fitnesses, descriptors = [], []
     for call_key in jax.random.split(key, reevaluations):
         if stop():
             return None
-        fitness, descriptor, _ = run(genotypes, call_key)
+        fitness, descriptor, _ = score(genotypes, call_key)
         fitnesses.append(np.asarray(fitness, np.float64))
         descriptors.append(np.asarray(descriptor, np.float64))
     fitness = np.median(fitnesses, axis=0)

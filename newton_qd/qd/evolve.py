@@ -5,23 +5,28 @@ from __future__ import annotations
 import dataclasses
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from pathlib import Path
 
+import jax
 import numpy as np
+from jax.sharding import Mesh
 
 from newton_qd.physics import interrupts
+from newton_qd.qd.archive import Archive
 from newton_qd.qd.checkpoint import Checkpoint
-from newton_qd.qd.config import EvolveConfig, environment_facts
+from newton_qd.qd.config import ConfigError, EvolveConfig, environment_facts
 from newton_qd.qd.corrected import Corrected
 from newton_qd.qd.extras import require_extra
-from newton_qd.qd.folder import COLUMNS, Archive, RunFolder
+from newton_qd.qd.folder import COLUMNS, EVENTS, RunFolder
 from newton_qd.qd.interrupt import StopFlag, graceful_stop
 from newton_qd.qd.plot import archive_png
 from newton_qd.qd.progress import Progress
 from newton_qd.qd.search import Search, SearchState
+from newton_qd.qd.sharding import device_mesh
 from newton_qd.qd.task import Task, make_task
+from newton_qd.qd.tensorboard import EventLog
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,10 +62,12 @@ def evolve(
     out: str | os.PathLike[str] | None = None,
     resume: bool = False,
     progress: bool = True,
+    tensorboard: bool = False,
     checkpoint_seconds: float = 5.0,
+    devices: int | None = None,
     task_factory: Callable[[EvolveConfig], Task] = make_task,
 ) -> EvolveResult:
-    """Evolves an archive of policies with MAP-Elites.
+    """Evolves an archive of policies with an algorithm of MAP-Elites' family.
 
     SIGINT and SIGTERM end the run after the current generation; its state is saved
     and ``interrupted`` is true in the result.
@@ -70,8 +77,11 @@ def evolve(
         out: Results folder to create; ``None`` writes no files.
         resume: Continue the run in ``out``; starts it if there is none yet.
         progress: Whether to show progress on standard error.
+        tensorboard: Whether to write the metrics for TensorBoard too.
         checkpoint_seconds: Least time between two checkpoints [s]; does not change
             the result.
+        devices: Devices that share each evaluation, which does not change the result
+            either; ``None``: the default device alone.
         task_factory: Makes the task; the default takes registered environments.
 
     Returns:
@@ -81,43 +91,80 @@ def evolve(
         ConfigError: A setting is wrong, the folder is not free, or the run to resume
             has other settings.
         CheckpointError: The checkpoint of the run to resume is damaged.
-        MissingExtra: QDax or matplotlib is not installed.
+        MissingExtra: QDax, matplotlib or tensorboardX is not installed.
         SearchError: No individual of the initial population can be kept.
     """
     begin = time.monotonic()
-    folder = None if out is None else RunFolder(out)
-    if folder is not None:
-        folder.check(resume=resume)
-        require_extra("matplotlib", "viz")
-    require_extra("qdax", "qd")
+    folder = _folder(out, resume, tensorboard)
+    mesh = _mesh(devices, resume)
     interrupts.install()  # before the handlers below, so that it outlives them
     with ExitStack() as stack:
         stop = stack.enter_context(graceful_stop())
         task = task_factory(config)
         config = config.resolve(task.descriptor_length)
-        search = Search(config, task)
+        search = Search(config, task, mesh)
         display = Progress(config.env_name, config.iterations, enabled=progress)
         stack.callback(display.close)
-        checkpoint = None
         if folder is not None:
             stack.enter_context(folder.lock())
-            checkpoint = _open(folder, config, resume, display)
-        state = search.empty() if checkpoint is None else search.restore(checkpoint)
+        state = _first(search, folder, config, resume, display)
+        watchers = [display.update]
+        if folder is not None and tensorboard:
+            log = EventLog(folder.path / EVENTS, state.iteration + 1)
+            watchers.append(stack.enter_context(log).write)
         save = _Saver(search, folder, checkpoint_seconds)
-        state = _loop(search, state, config.iterations, display, stop, save)
-        save.now(state)
+        state = _loop(search, state, config.iterations, watchers, stop, save)
         result = _result(config, search.checkpoint(state), folder, begin)
-        if not result.interrupted:
-            display.note("evaluating the elites again, for corrected metrics")
-            corrected = search.correct(result.archive, lambda: stop.requested)
-            seconds = time.monotonic() - begin
-            result = dataclasses.replace(result, corrected=corrected, seconds=seconds)
-        if folder is not None and state.iteration >= 0:
-            picture = archive_png(result.archive, config, task, state.iteration)
-            folder.save_archive(result.archive, picture)
-        if folder is not None and result.corrected is not None:
-            folder.save_corrected(dataclasses.asdict(result.corrected))
-        return result
+        return _finished(result, search, task, folder, display, stop, begin)
+
+
+def _folder(
+    out: str | os.PathLike[str] | None, resume: bool, tensorboard: bool
+) -> RunFolder | None:
+    """Checks folder and packages before anything takes time."""
+    require_extra("qdax", "qd")
+    if out is None:
+        if tensorboard:
+            raise ConfigError("tensorboard: needs a results folder (out)")
+        return None
+    folder = RunFolder(out)
+    folder.check(resume=resume)
+    require_extra("matplotlib", "viz")
+    if tensorboard:
+        require_extra("tensorboardX", "tensorboard")
+    return folder
+
+
+def _mesh(devices: int | None, resume: bool) -> Mesh | None:
+    """Devices that share the evaluations; ``None`` for the default one."""
+    if resume and jax.process_count() > 1:
+        raise ConfigError(
+            f"resume: a run of {jax.process_count()} processes cannot be resumed, "
+            "only one of a single process"
+        )
+    if devices is None:
+        return None
+    try:
+        return device_mesh(devices)
+    except ValueError as error:
+        raise ConfigError(f"devices: {error}") from error
+
+
+def _first(
+    search: Search,
+    folder: RunFolder | None,
+    config: EvolveConfig,
+    resume: bool,
+    display: Progress,
+) -> SearchState:
+    """The state in which this call begins."""
+    checkpoint = None
+    if folder is not None:
+        checkpoint = _open(folder, config, resume, display)
+    state = search.empty() if checkpoint is None else search.restore(checkpoint)
+    if state.iteration < config.iterations:
+        display.note("compiling the physics and the rollout (longer on a first start)")
+    return state
 
 
 def _open(
@@ -169,19 +216,17 @@ def _loop(
     search: Search,
     state: SearchState,
     iterations: int,
-    display: Progress,
+    watchers: Iterable[Callable[[int, dict[str, float]], None]],
     stop: StopFlag,
     save: _Saver,
 ) -> SearchState:
-    """Advances until the last generation or a signal."""
-    if state.iteration < iterations:
-        display.note("compiling the physics and the rollout (longer on a first start)")
+    """Advances until the last generation or a signal, and saves."""
     while state.iteration < iterations and not stop.requested:
         state = search.advance(state)
-        display.update(
-            state.iteration, dict(zip(COLUMNS, state.metrics[-1], strict=True))
-        )
+        for watch in watchers:
+            watch(state.iteration, dict(zip(COLUMNS, state.metrics[-1], strict=True)))
         save.sometimes(state)
+    save.now(state)
     return state
 
 
@@ -206,3 +251,26 @@ def _result(
         out=None if folder is None else folder.path,
         seconds=time.monotonic() - begin,
     )
+
+
+def _finished(
+    result: EvolveResult,
+    search: Search,
+    task: Task,
+    folder: RunFolder | None,
+    display: Progress,
+    stop: StopFlag,
+    begin: float,
+) -> EvolveResult:
+    """Adds the corrected metrics, and writes what is known at the end."""
+    if not result.interrupted:
+        display.note("evaluating the elites again, for corrected metrics")
+        corrected = search.correct(result.archive, lambda: stop.requested)
+        seconds = time.monotonic() - begin
+        result = dataclasses.replace(result, corrected=corrected, seconds=seconds)
+    if folder is not None and result.iteration >= 0:
+        picture = archive_png(result.archive, result.config, task, result.iteration)
+        folder.save_archive(result.archive, picture)
+    if folder is not None and result.corrected is not None:
+        folder.save_corrected(dataclasses.asdict(result.corrected))
+    return result

@@ -3,12 +3,12 @@
 ``config.json`` (settings), ``checkpoint.bin`` (state to resume from),
 ``metrics.csv`` (one row per generation), ``archive.npz``, ``archive.png`` and
 ``corrected.json`` (metrics of the finished run, from evaluating its elites again).
+``tensorboard`` holds event files, if they are asked for.
 """
 
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import json
 import os
 from collections.abc import Iterator
@@ -17,11 +17,11 @@ from typing import Any
 
 import numpy as np
 
+from newton_qd.qd.archive import ARCHIVE, Archive, archive_bytes
 from newton_qd.qd.checkpoint import (
     Checkpoint,
     CheckpointError,
     load_checkpoint,
-    npz_bytes,
     save_checkpoint,
     temporary_name,
     write_atomically,
@@ -38,9 +38,9 @@ from newton_qd.qd.config import (
 CONFIG = "config.json"
 CHECKPOINT = "checkpoint.bin"
 METRICS = "metrics.csv"
-ARCHIVE = "archive.npz"
 PICTURE = "archive.png"
 CORRECTED = "corrected.json"
+EVENTS = "tensorboard"
 _FILES = (CONFIG, CHECKPOINT, METRICS, ARCHIVE, PICTURE, CORRECTED)
 
 COLUMNS = (
@@ -53,38 +53,6 @@ COLUMNS = (
     "max_fitness",
 )
 _WHOLE_COLUMNS = 4
-
-
-@dataclasses.dataclass(frozen=True)
-class Archive:
-    """The individuals that an evolution has kept, one row per cell.
-
-    Attributes:
-        genotypes: (cells, parameters) policy weights, zero in empty cells.
-        fitnesses: (cells,) returns, ``-inf`` in empty cells.
-        descriptors: (cells, D) descriptors, zero in empty cells.
-        centroids: (cells, D) centres of the cells.
-    """
-
-    genotypes: np.ndarray
-    fitnesses: np.ndarray
-    descriptors: np.ndarray
-    centroids: np.ndarray
-
-    @property
-    def filled(self) -> np.ndarray:
-        """(cells,) whether a cell holds an individual."""
-        return np.isfinite(self.fitnesses)
-
-
-def load_archive(folder: str | os.PathLike[str]) -> Archive:
-    """Reads ``archive.npz`` of a results folder.
-
-    Args:
-        folder: Results folder of ``evolve``.
-    """
-    with np.load(Path(folder) / ARCHIVE, allow_pickle=False) as arrays:
-        return Archive(**{f.name: arrays[f.name] for f in dataclasses.fields(Archive)})
 
 
 class RunFolder:
@@ -222,8 +190,7 @@ class RunFolder:
 
     def save_archive(self, archive: Archive, picture: bytes) -> None:
         """Writes the archive and its picture."""
-        arrays = {f.name: getattr(archive, f.name) for f in dataclasses.fields(archive)}
-        write_atomically(self.path / ARCHIVE, npz_bytes(**arrays))
+        write_atomically(self.path / ARCHIVE, archive_bytes(archive))
         write_atomically(self.path / PICTURE, picture)
 
     def save_corrected(self, corrected: dict[str, Any]) -> None:

@@ -48,6 +48,7 @@ class Algorithm:
         make: Makes the emitter; raises ``ConfigError`` for options that it does not
             have.
         transitions: Whether its emitter learns from the steps of the episodes.
+        evaluates: Whether its emitter evaluates individuals by ``Parts.score``.
         evaluations: Episodes of one generation, given the settings; an episode that
             is differentiated counts as one, too.
         gradients: Those of them that are differentiated.
@@ -59,6 +60,7 @@ class Algorithm:
 
     make: Callable[[Parts], Any]
     transitions: bool = False
+    evaluates: bool = False
     evaluations: Callable[[EvolveConfig], int] = _batch_size
     gradients: Callable[[EvolveConfig], int] = lambda config: 0
     scoring: Callable[[EvolveConfig, Task, Policy], ScoringFunction] | None = None

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from newton_qd.qd.archive import Archive
 from newton_qd.qd.config import EvolveConfig
 from newton_qd.qd.extras import require_extra
-from newton_qd.qd.folder import Archive
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -102,7 +102,8 @@ def make_scoring_function(
         (N,), descriptors (N, D) and a dict, which is empty or holds ``transitions``:
         the fields of QDax's ``QDTransition`` by name, (N, T, ...) each. An individual
         whose world was faulty or whose result is not finite has fitness ``-inf``:
-        archives do not take it.
+        archives do not take it. It raises ``ValueError`` for genotypes that are not
+        weights of this policy.
     """
     episode = make_episode(
         task.env,
@@ -116,6 +117,11 @@ def make_scoring_function(
     def score(
         genotypes: jax.Array, key: jax.Array
     ) -> tuple[jax.Array, jax.Array, dict[str, Any]]:
+        if genotypes.shape[1:] != (policy.size,):
+            raise ValueError(
+                f"genotypes: shape {genotypes.shape}: allowed: (N, {policy.size}), "
+                "the weights of this policy"
+            )
         outcome = jax.vmap(episode, in_axes=(0, None))(genotypes, key)
         fitness = jnp.where(outcome.faulty, -jnp.inf, outcome.fitness)
         extra = {"transitions": outcome.transitions} if transitions else {}

@@ -9,19 +9,20 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
 from newton_qd.qd.algorithms import ALGORITHMS
+from newton_qd.qd.archive import Archive
+from newton_qd.qd.cells import cell_centroids
 from newton_qd.qd.checkpoint import Checkpoint, CheckpointError
 from newton_qd.qd.config import ConfigError, EvolveConfig, settings_text
 from newton_qd.qd.corrected import Corrected, correct
 from newton_qd.qd.extras import require_extra
-from newton_qd.qd.folder import COLUMNS, Archive
+from newton_qd.qd.folder import COLUMNS
 from newton_qd.qd.parts import Parts
 from newton_qd.qd.rollout import ScoringFunction, make_policy, make_scoring_function
+from newton_qd.qd.sharding import on_mesh, shard_scoring
 from newton_qd.qd.task import Task
-
-_CVT_SAMPLES_PER_CELL = 50
-_CVT_MIN_SAMPLES = 10_000
 
 
 class SearchError(RuntimeError):
@@ -52,12 +53,16 @@ class Search:
     after it depends on the settings only.
     """
 
-    def __init__(self, config: EvolveConfig, task: Task) -> None:
+    def __init__(
+        self, config: EvolveConfig, task: Task, mesh: Mesh | None = None
+    ) -> None:
         """Builds the parts; compiles and evaluates nothing.
 
         Args:
             config: Settings with the grid filled in.
             task: Task to solve.
+            mesh: Devices that share each evaluation; everything else happens on the
+                default one. ``None``: evaluations too.
 
         Raises:
             MissingExtra: QDax is not installed.
@@ -72,14 +77,15 @@ class Search:
         self._algorithm = ALGORITHMS[config.algorithm]
         self._config = config
         self._task = task
+        self._mesh = mesh
         keys = jax.random.split(jax.random.key(config.seed), 4)
-        self._key_centroids, self._key_reset = keys[0], keys[1]
+        key_centroids, self._key_reset = keys[0], keys[1]
         self._key_initial, self._key_generations = keys[2], keys[3]
         self._key_corrected = jax.random.fold_in(self._key_reset, 1)
         self._key_emitter = jax.random.fold_in(self._key_generations, 0)
         self._policy = make_policy(task.env, config.hidden)
-        self._centroids = self._make_centroids()
-        score = self._scoring_function()
+        self._centroids = cell_centroids(config, task.limits, key_centroids)
+        score = self._loop_scoring()
         self._emitter = self._algorithm.make(
             Parts(
                 config,
@@ -90,10 +96,11 @@ class Search:
                 self._centroids,
             )
         )
-        self._score = jax.jit(score)
+        learns_on_mesh = self._algorithm.evaluates
+        self._score = self._compiled(score)
         self._ask = jax.jit(self._proposed)
-        self._begin = jax.jit(self._begun)
-        self._tell = jax.jit(self._told)
+        self._begin = self._compiled(self._begun, learns_on_mesh)
+        self._tell = self._compiled(self._told, learns_on_mesh)
         self._population = jax.jit(jax.vmap(self._initial))
 
     def empty(self) -> SearchState:
@@ -164,12 +171,9 @@ class Search:
         """Evaluates the elites of an archive again; ``None`` where none are asked."""
         if not self._config.reevaluations:
             return None
-        score = make_scoring_function(
-            self._task, self._policy, self._config.episode_length
-        )
         return correct(
             archive,
-            score,
+            self._compiled(self._scoring()),
             self._key_corrected,
             reevaluations=self._config.reevaluations,
             offset=self._task.reward_offset * self._config.episode_length,
@@ -199,38 +203,55 @@ class Search:
         """Puts the leaves of a checkpoint where they belong."""
         shape = (self._config.batch_size, self._policy.size)
         genotypes = jax.ShapeDtypeStruct(shape, jnp.float32)
-        scores = jax.eval_shape(self._score, genotypes, self._key_reset)
+        score = self._scoring(transitions=self._algorithm.transitions)
+        scores = jax.eval_shape(score, genotypes, self._key_reset)
         repertoire = self.empty().repertoire
-        example = jax.eval_shape(self._begin, repertoire, genotypes, scores)[1]
+        example = jax.eval_shape(self._begun, repertoire, genotypes, scores)[1]
         expected, structure = jax.tree.flatten(example)
         if len(leaves) != len(expected):
             raise CheckpointError(
                 f"the checkpoint holds {len(leaves)} arrays of the algorithm "
                 f"{self._config.algorithm!r}; this version of it has {len(expected)}"
             )
-        return jax.tree.unflatten(
-            structure,
-            [
-                _leaf_to_device(x, like)
-                for x, like in zip(leaves, expected, strict=True)
-            ],
+        restored = [
+            _leaf_to_device(x, like) for x, like in zip(leaves, expected, strict=True)
+        ]
+        for index, (x, like) in enumerate(zip(restored, expected, strict=True)):
+            if x.shape != like.shape:
+                raise CheckpointError(
+                    f"array {index} of the algorithm {self._config.algorithm!r} has "
+                    f"shape {x.shape} in the checkpoint, {like.shape} in this version"
+                )
+        return jax.tree.unflatten(structure, restored)
+
+    def _scoring(self, transitions: bool = False) -> ScoringFunction:
+        """Scoring function of this task, split over the mesh."""
+        length = self._config.episode_length
+        score = make_scoring_function(
+            self._task, self._policy, length, transitions=transitions
         )
+        return self._split(score)
+
+    def _loop_scoring(self) -> ScoringFunction:
+        """Scoring function of the loop, split over the mesh."""
+        made = self._algorithm.scoring
+        if made is None:
+            return self._scoring(transitions=self._algorithm.transitions)
+        return self._split(made(self._config, self._task, self._policy))
+
+    def _split(self, score: ScoringFunction) -> ScoringFunction:
+        return score if self._mesh is None else shard_scoring(score, self._mesh)
+
+    def _compiled(self, function: Callable[..., Any], evaluates: bool = True) -> Any:
+        """Compiles a function, for all devices of the mesh if it evaluates."""
+        if self._mesh is None or not evaluates:
+            return jax.jit(function)
+        return on_mesh(function, self._mesh)
 
     def _initial(self, key: jax.Array) -> jax.Array:
         """Weights (size,) of an individual of the initial population."""
         scale = self._algorithm.initial_scale(self._config)
         return scale * self._policy.init(key)
-
-    def _scoring_function(self) -> ScoringFunction:
-        """The scoring function of the loop."""
-        if self._algorithm.scoring is not None:
-            return self._algorithm.scoring(self._config, self._task, self._policy)
-        return make_scoring_function(
-            self._task,
-            self._policy,
-            self._config.episode_length,
-            transitions=self._algorithm.transitions,
-        )
 
     def _proposed(self, repertoire: Any, emitter: Any, key: jax.Array) -> Any:
         """Next genotypes (N, size), and what the emitter wants told with them."""
@@ -284,47 +305,6 @@ class Search:
         finite = jnp.isfinite(fitnesses) & jnp.all(jnp.isfinite(found), axis=1)
         metrics = default_qd_metrics(repertoire, qd_offset=offset)
         return {**metrics, "rejected": jnp.sum(~finite)}
-
-    def _make_centroids(self) -> jax.Array:
-        """(cells, D) centres of the cells."""
-        return jnp.asarray(self._tessellation(), jnp.float32)
-
-    def _tessellation(self) -> np.ndarray:
-        """(cells, D) centres of the cells."""
-        from qdax.core.containers import mapelites_repertoire as qdax_containers
-
-        low, high = self._task.limits
-        if not (np.all(np.isfinite(low)) and np.all(low < high)):
-            raise ConfigError(
-                f"the descriptor of {self._config.env_name!r} has no finite box: "
-                f"{low} to {high}"
-            )
-        if self._config.grid is not None:
-            centroids = qdax_containers.compute_euclidean_centroids(
-                self._config.grid, low.tolist(), high.tolist()
-            )
-            return np.asarray(centroids)
-        return self._voronoi_centroids(low, high)
-
-    def _voronoi_centroids(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        from qdax.core.containers.mapelites_repertoire import compute_cvt_centroids
-        from threadpoolctl import threadpool_limits
-
-        cells = self._config.centroids
-        assert cells is not None
-        # Threads add up the clusters in changing order: one keeps runs equal.
-        with threadpool_limits(limits=1):
-            centroids = compute_cvt_centroids(
-                num_descriptors=len(low),
-                num_init_cvt_samples=max(
-                    _CVT_MIN_SAMPLES, _CVT_SAMPLES_PER_CELL * cells
-                ),
-                num_centroids=cells,
-                minval=low.tolist(),
-                maxval=high.tolist(),
-                key=self._key_centroids,
-            )
-        return np.asarray(centroids)
 
 
 def _leaf_to_host(leaf: Any) -> np.ndarray:

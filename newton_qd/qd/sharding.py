@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -37,9 +38,8 @@ def shard_scoring(score: ScoringFunction, mesh: Mesh) -> ScoringFunction:
 
     Each device evaluates an equal part of the individuals; a batch that does not
     divide is filled up with copies of its last individual, whose results are dropped.
-    Every device then holds all results. Those of simulated robots are bitwise the same
-    for every number of devices; those of ``pointmaze``, which XLA compiles in another
-    way for several devices, up to the last digit.
+    Every device then holds all results, which are bitwise the same for every number of
+    devices.
 
     Args:
         score: Scoring function of genotypes (N, size) or a pytree of (N, ...), and a
@@ -71,3 +71,28 @@ def shard_scoring(score: ScoringFunction, mesh: Mesh) -> ScoringFunction:
         )
 
     return scored
+
+
+def on_mesh(function: Callable[..., Any], mesh: Mesh) -> Callable[..., Any]:
+    """Compiles a function for a mesh, between functions of one device.
+
+    What follows an evaluation then is one program, whatever the number of devices,
+    and its results are the same to the last bit.
+
+    Args:
+        function: Function of pytrees that every device shall have as a whole, made
+            with ``shard_scoring``; every device has its results as a whole.
+        mesh: Devices.
+
+    Returns:
+        Function of pytrees on any device, with results on the first device of this
+        process.
+    """
+    everywhere = NamedSharding(mesh, PartitionSpec())
+    run = jax.jit(function, out_shardings=everywhere)
+
+    def called(*arguments: Any) -> Any:
+        results = run(*jax.device_put(arguments, everywhere))
+        return jax.tree.map(lambda leaf: leaf.addressable_data(0), results)
+
+    return called

@@ -1,0 +1,91 @@
+"""What an evolution has kept, and its file, which later versions read too."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import os
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from newton_qd.qd.checkpoint import npz_bytes
+
+ARCHIVE = "archive.npz"
+FORMAT = 1
+"""Number of the file's format. Who changes it keeps a reader for each earlier one."""
+
+
+class ArchiveError(RuntimeError):
+    """The file of an archive is damaged, or of a format that is not known."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Archive:
+    """The individuals that an evolution has kept, one row per cell.
+
+    Attributes:
+        genotypes: (cells, parameters) policy weights, zero in empty cells.
+        fitnesses: (cells,) returns, ``-inf`` in empty cells.
+        descriptors: (cells, D) descriptors, zero in empty cells.
+        centroids: (cells, D) centres of the cells.
+    """
+
+    genotypes: np.ndarray
+    fitnesses: np.ndarray
+    descriptors: np.ndarray
+    centroids: np.ndarray
+
+    @property
+    def filled(self) -> np.ndarray:
+        """(cells,) whether a cell holds an individual."""
+        return np.isfinite(self.fitnesses)
+
+
+def archive_bytes(archive: Archive) -> bytes:
+    """Packs an archive into the bytes of ``archive.npz``."""
+    arrays = {f.name: getattr(archive, f.name) for f in dataclasses.fields(archive)}
+    return npz_bytes(format=np.asarray(FORMAT), **arrays)
+
+
+def load_archive(folder: str | os.PathLike[str]) -> Archive:
+    """Reads ``archive.npz`` of a results folder.
+
+    Args:
+        folder: Results folder of ``evolve``, of this or an earlier version.
+
+    Raises:
+        ArchiveError: The file is damaged, or was written by a later version.
+        FileNotFoundError: There is none.
+    """
+    path = Path(folder) / ARCHIVE
+    try:
+        # NumPy leaves a file that it cannot read open.
+        content = io.BytesIO(path.read_bytes())
+        with np.load(content, allow_pickle=False) as arrays:
+            found = {name: arrays[name] for name in arrays.files}
+    except (AttributeError, EOFError, ValueError, zipfile.BadZipFile) as error:
+        raise ArchiveError(f"{path} is damaged: {error}") from error
+    # The first files of format 1 carry no number.
+    version = int(found.pop("format", FORMAT))
+    if version != FORMAT:
+        raise ArchiveError(
+            f"{path} has format {version}; this version of newton_qd reads format "
+            f"{FORMAT}"
+        )
+    return _from_arrays(path, found)
+
+
+def _from_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> Archive:
+    """Makes an archive of the arrays of a file of format 1."""
+    names = [field.name for field in dataclasses.fields(Archive)]
+    if sorted(arrays) != sorted(names):
+        raise ArchiveError(
+            f"{path} holds the arrays {sorted(arrays)}, not {sorted(names)}"
+        )
+    rows = {name: len(arrays[name]) for name in names}
+    if len(set(rows.values())) != 1:
+        raise ArchiveError(f"{path} holds arrays of different lengths: {rows}")
+    return Archive(**arrays)

@@ -1,0 +1,146 @@
+"""The file of an archive: versions, damage, and a disk that is full."""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from test_evolve import (
+    SMALL,
+    assert_same_results,
+    compile_once,
+    damage,
+    point_task,
+    reference,
+    run,
+    writes_of,
+)
+
+from newton_qd import cli
+from newton_qd.qd import checkpoint as checkpoint_module
+from newton_qd.qd.archive import Archive, ArchiveError, archive_bytes, load_archive
+from newton_qd.qd.config import read_config
+
+__all__ = ["compile_once", "reference"]  # fixtures
+
+# QDax and what it imports warn about their own use of other packages.
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
+
+STORED = Path(__file__).resolve().parent / "data" / "archive_format_1"
+NAMES = ("genotypes", "fitnesses", "descriptors", "centroids")
+
+
+def test_an_archive_that_was_written_once_can_be_read() -> None:
+    archive = load_archive(STORED)
+    assert archive.genotypes.shape == (16, 26)
+    assert archive.filled.sum() == 13
+    assert archive.fitnesses.max() == np.float32(7.9464636)
+    assert np.all(archive.genotypes[~archive.filled] == 0)
+    distance = np.abs(archive.descriptors[:, None] - archive.centroids).max(-1)
+    assert np.array_equal(
+        distance.argmin(1)[archive.filled], np.flatnonzero(archive.filled)
+    )
+    config, facts = read_config(STORED / "config.json")
+    assert (config.env_name, config.hidden, config.grid) == ("point", (4,), (4, 4))
+    assert facts["packages"]["newton_qd"] == "0.1.0"
+
+
+def small() -> Archive:
+    rows = np.arange(6, dtype=np.float32).reshape(3, 2)
+    return Archive(rows, np.array([1.0, -np.inf, 2.0], np.float32), rows, rows)
+
+
+def write(folder: Path, content: bytes) -> Path:
+    (folder / "archive.npz").write_bytes(content)
+    return folder
+
+
+def test_an_archive_comes_back(tmp_path: Path) -> None:
+    archive = load_archive(write(tmp_path, archive_bytes(small())))
+    for name in NAMES:
+        assert np.array_equal(getattr(archive, name), getattr(small(), name))
+    assert archive.filled.tolist() == [True, False, True]
+
+
+def test_archives_without_a_number_have_the_first_format(tmp_path: Path) -> None:
+    arrays = {name: getattr(small(), name) for name in NAMES}
+    np.savez(tmp_path / "archive.npz", **arrays)
+    assert np.array_equal(load_archive(tmp_path).fitnesses, small().fitnesses)
+
+
+def test_what_is_no_archive_is_refused(tmp_path: Path) -> None:
+    arrays = {name: getattr(small(), name) for name in NAMES}
+    with pytest.raises(FileNotFoundError, match=r"archive\.npz"):
+        load_archive(tmp_path)
+    for change, message in (
+        ({"format": np.asarray(2)}, r"has format 2; this version .* reads format 1"),
+        ({"colours": np.zeros(3)}, r"holds the arrays .*'colours'"),
+        ({"fitnesses": np.zeros(2)}, r"arrays of different lengths: .*'fitnesses': 2"),
+    ):
+        np.savez(tmp_path / "archive.npz", **{**arrays, **change})
+        with pytest.raises(ArchiveError, match=message):
+            load_archive(tmp_path)
+
+
+def test_every_damage_of_an_archive_is_found(tmp_path: Path) -> None:
+    content = archive_bytes(small())
+    for name in ("empty", "half", "other file"):
+        with pytest.raises(ArchiveError, match=r"archive\.npz is damaged"):
+            load_archive(write(tmp_path, damage(content)[name]))
+    data = content.find(small().fitnesses.tobytes())
+    flipped = content[:data] + b"\xff" + content[data + 1 :]
+    with pytest.raises(ArchiveError, match=r"archive\.npz is damaged.*CRC"):
+        load_archive(write(tmp_path, flipped))
+
+
+# --- folders that cannot be written to -------------------------------------
+
+
+def fail_at(patch: pytest.MonkeyPatch, moment: int) -> None:
+    """The disk is full in write number ``moment`` and from then on."""
+    fsync, calls = os.fsync, iter(range(10**6))
+
+    def full(descriptor: int) -> None:
+        if next(calls) >= moment:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        fsync(descriptor)
+
+    patch.setattr(checkpoint_module.os, "fsync", full)
+
+
+def test_a_full_disk_loses_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = SMALL.replace(iterations=2)
+    expected = tmp_path / "expected"
+    writes = len(writes_of(config, expected, monkeypatch))
+    for moment in range(0, writes, 2):
+        out = tmp_path / f"run{moment}"
+        with (
+            monkeypatch.context() as patch,
+            pytest.raises(OSError, match=rf"No space left.*{out.name}") as caught,
+        ):
+            fail_at(patch, moment)
+            run(config, out=out)
+        assert caught.value.errno == errno.ENOSPC
+        assert not [entry for entry in out.iterdir() if entry.name.endswith(".tmp")]
+        run(config, out=out, resume=True)
+        assert_same_results(out, expected)
+
+
+def test_a_read_only_folder_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refuse(path: Path, mode: str) -> Any:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(path))
+
+    monkeypatch.setattr(checkpoint_module, "open", refuse, raising=False)
+    out = tmp_path / "run"
+    arguments = ["evolve", "point", "--quiet", "--out", str(out)]
+    assert cli.main(arguments, task_factory=point_task) == cli.FAILED
+    assert f"Read-only file system: '{out}/config.json'" in capsys.readouterr().err
+    assert not list(out.iterdir())
