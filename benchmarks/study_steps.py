@@ -92,7 +92,8 @@ def main() -> None:
     state = search.empty()
     for _ in range(GENERATIONS):
         state = search.advance(state)
-    elites, start = state.repertoire, jax.random.key(1)
+    elites = state.repertoire
+    start = jax.random.split(jax.random.key(config.seed), 4)[1]  # as ``Search`` has it
     policy = make_policy(task.env, config.hidden)
     score = jax.jit(make_scoring_function(task, policy, args.steps))
     filled = elites.fitnesses[:, 0] > -jnp.inf
