@@ -172,6 +172,10 @@ def test_shares_of_a_batch_that_do_not_fit_are_refused() -> None:
         config = SMALL.replace(algorithm="dcrl-me", options=options)
         with pytest.raises(ConfigError, match=r"must .* add up to batch_size \(16\)"):
             run(config)
+    for algorithm, name in (("pga-me", "env_batch_size"), ("me-es", "sample_number")):
+        config = SMALL.replace(algorithm=algorithm, options={name: 8})
+        with pytest.raises(ConfigError, match=rf"{name} is batch_size \(16\), not 8"):
+            run(config)
     newton_qd.compat.uninstall()
 
 

@@ -25,7 +25,7 @@ def compiled() -> Iterator[list[str]]:
     """List that grows with every program that XLA compiles."""
     seen: list[str] = []
 
-    def listen(event: str, seconds: float, **_: object) -> None:
+    def listen(event: str, duration_secs: float, **_: object) -> None:
         if event.endswith("backend_compile_duration"):
             seen.append(event)
 

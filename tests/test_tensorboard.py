@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,12 +21,11 @@ pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
 
 def events(path: Path) -> Iterator[Any]:
     """Events of a file of records: length, its checksum, the event, its checksum."""
-    from tensorboardX.proto.event_pb2 import Event
-
+    messages: Any = importlib.import_module("tensorboardX.proto.event_pb2")
     content = path.read_bytes()
     while content:
         (length,) = struct.unpack("<Q", content[:8])
-        yield Event.FromString(content[12 : 12 + length])
+        yield messages.Event.FromString(content[12 : 12 + length])
         content = content[16 + length :]
 
 

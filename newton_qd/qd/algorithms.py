@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from newton_qd import compat
-from newton_qd.qd.config import ConfigError
+from newton_qd.qd.config import ConfigError, EvolveConfig
 from newton_qd.qd.gradient_algorithms import GRADIENT_ALGORITHMS
 from newton_qd.qd.parts import Algorithm, Parts, isoline, isoline_emitter, settings
 from newton_qd.qd.rollout import Policy
@@ -66,6 +66,14 @@ class _OfParameters:
                 "transitions": self._convert(extra["transitions"]),
             },
         }
+
+
+def _require_batch_size(config: EvolveConfig, name: str, value: Any) -> None:
+    """Refuses an option that would give a generation another size."""
+    if value != config.batch_size:
+        raise ConfigError(
+            f"options: {name} is batch_size ({config.batch_size}), not {value!r}"
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -124,6 +132,7 @@ def _pga_me(parts: Parts) -> Any:
         env_batch_size=parts.config.batch_size,
         replay_buffer_size=_REPLAY_BUFFER,
     )
+    _require_batch_size(parts.config, "env_batch_size", options.env_batch_size)
     emitter = PGAMEEmitter(
         options, parts.policy.network, parts.task.env, isoline(parts.config)
     )
@@ -194,11 +203,7 @@ def _me_es(parts: Parts) -> Any:
 
     samples = parts.config.batch_size
     options = settings(MEESConfig, parts.config, sample_number=samples)
-    if options.sample_number != samples:
-        raise ConfigError(
-            f"options: sample_number is batch_size ({samples}), not "
-            f"{options.sample_number}"
-        )
+    _require_batch_size(parts.config, "sample_number", options.sample_number)
     emitter = MEESEmitter(
         options,
         # The archive of its novelty holds one descriptor for each generation.

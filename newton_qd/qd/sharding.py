@@ -92,7 +92,18 @@ def on_mesh(function: Callable[..., Any], mesh: Mesh) -> Callable[..., Any]:
     run = jax.jit(function, out_shardings=everywhere)
 
     def called(*arguments: Any) -> Any:
-        results = run(*jax.device_put(arguments, everywhere))
+        given = jax.tree.map(lambda leaf: _copied(leaf, everywhere), arguments)
+        results = run(*given)
         return jax.tree.map(lambda leaf: leaf.addressable_data(0), results)
 
     return called
+
+
+def _copied(leaf: jax.Array, everywhere: NamedSharding) -> jax.Array:
+    """Gives an array to all devices; those of other processes take NumPy's only."""
+    if jax.process_count() == 1:
+        return jax.device_put(leaf, everywhere)
+    if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+        numbers = np.asarray(jax.random.key_data(leaf))
+        return jax.random.wrap_key_data(jax.device_put(numbers, everywhere))
+    return jax.device_put(np.asarray(leaf), everywhere)
