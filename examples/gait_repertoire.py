@@ -2,14 +2,14 @@
 
     python examples/gait_repertoire.py
 
-Genotypes are the actions of every control step. Half of a generation lies along
-gradients: of the return, and towards cells of feet contact that are empty.
+Genotypes are the actions of every control step; half of them lie along gradients.
 """
 
 from __future__ import annotations
 
 import argparse
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -27,16 +27,16 @@ from newton_qd.qd.emitters import GradientLineEmitter
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser()
     parser.add_argument("--env", default="hopper_uni")
     parser.add_argument("--steps", type=int, default=100)
     parser.add_argument("--iterations", type=int, default=100)
     parser.add_argument("--batch-size", type=int, default=64)
     options = parser.parse_args()
 
-    env = newton_qd.create(options.env, auto_reset=False)
+    env: Any = newton_qd.create(options.env, auto_reset=False)
     task = None, newton_qd.descriptor_extractor[options.env]  # without a policy
-    common = {"episode_length": options.steps, "unravel": jnp.tanh}
+    common: Any = {"episode_length": options.steps, "unravel": jnp.tanh}
     episode = gradients.make_episode(env, *task, **common)
     gradient = gradients.make_directional_gradient(
         gradients.with_smooth_descriptor(env, 0.1, straight_through=True),
@@ -46,7 +46,7 @@ def main() -> None:
     )
     start, key = jax.random.split(jax.random.key(0))
 
-    def score(plans: jax.Array, _: jax.Array) -> tuple:
+    def score(plans: Any, _: Any) -> tuple[Any, Any, dict]:
         found = jax.vmap(episode, in_axes=(0, None))(plans, start)
         return jnp.where(found.faulty, -jnp.inf, found.fitness), found.descriptor, {}
 
@@ -56,9 +56,9 @@ def main() -> None:
         **{"branches": 4, "shortest": 0.05, "longest": 5.0},
     )
     variation = functools.partial(isoline_variation, iso_sigma=0.05, line_sigma=0.2)
-    mixing = MixingEmitter(lambda x, _: x, variation, 1.0, options.batch_size // 2)
+    parts: Any = (lambda x, _: x, variation, 1.0, options.batch_size // 2)
     metrics = functools.partial(default_qd_metrics, qd_offset=0.0)
-    search = MAPElites(score, MultiEmitter((line, mixing)), metrics)
+    search = MAPElites(score, MultiEmitter((line, MixingEmitter(*parts))), metrics)
     shape = options.batch_size, options.steps * env.action_size
     plans = jax.random.normal(key, shape, jnp.float32)
     low, high = (limit.tolist() for limit in env.descriptor_limits)

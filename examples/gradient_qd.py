@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import functools
+from typing import Any
 
 import jax
 from qdax.core.containers.mapelites_repertoire import compute_euclidean_centroids
@@ -38,7 +39,7 @@ def main() -> None:
     policy = make_policy(task.env, (32,))
     start, key = jax.random.key(0), jax.random.key(1)
     # The loop evaluates all offspring without gradients, the emitter four points with.
-    plain = make_scoring_function(task, policy, config.episode_length)
+    plain: Any = make_scoring_function(task, policy, config.episode_length)
     exact = make_gradient_scoring_function(
         task, policy, config.episode_length, GradientOptions(clip=10.0)
     )

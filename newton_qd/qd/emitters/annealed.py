@@ -43,10 +43,8 @@ class OnAnnealedRepertoire(Emitter):
         """
         check_annealing(learning_rate, threshold_min)
         self._emitter = emitter
-        self._annealing = {
-            "learning_rate": learning_rate,
-            "threshold_min": threshold_min,
-        }
+        self._learning_rate = learning_rate
+        self._threshold_min = threshold_min
 
     @property
     def batch_size(self) -> int:
@@ -64,7 +62,12 @@ class OnAnnealedRepertoire(Emitter):
     ) -> AnnealedState:
         """Makes the annealed archive of the initial population."""
         annealed = AnnealedRepertoire.init(
-            genotypes, fitnesses, descriptors, repertoire.centroids, **self._annealing
+            genotypes,
+            fitnesses,
+            descriptors,
+            repertoire.centroids,
+            learning_rate=self._learning_rate,
+            threshold_min=self._threshold_min,
         )
         state = self._emitter.init(
             key, annealed, genotypes, fitnesses, descriptors, extra_scores
