@@ -189,20 +189,20 @@ def test_colliders_that_touch() -> None:
 def presses(worlds: int) -> tuple[np.ndarray, ...]:
     """Moving arms, each with an end of a collider 1 to 5 mm deep in the object."""
     system, rng = physics.load_system(PUSHER), np.random.default_rng(0)
-    pushed, tries = system.body_names.index("object"), 4000
+    pushed, tries = system.body_names.index("object"), 2000
     q = np.tile(system.rest_q, (tries, 1))
     q[:, :7] = rng.uniform(system.limit_lower[:7], system.limit_upper[:7], (tries, 7))
     look = jax.jit(jax.vmap(functools.partial(physics.forward_kinematics, system)))
     seen = look(q.astype(np.float32), np.zeros_like(q, np.float32))
+    position, rotation = np.asarray(seen.position), np.asarray(seen.rotation)
     found = []
     for pair in system.contact_pairs:
         arm = next(row for row in pair if system.contact_body[row] < pushed)
         body = system.contact_body[arm]
-        turn = np.array([reference.rotation_matrix(r) for r in seen.rotation[:, body]])
+        turn = np.array([reference.rotation_matrix(r) for r in rotation[:, body]])
         half = turn @ system.contact_segment[arm]
         half *= -np.sign(half[:, 2:] + 1e-12)  # to the lower end
-        end = np.asarray(seen.position[:, body])
-        end = end + turn @ system.contact_position[arm] + half
+        end = position[:, body] + turn @ system.contact_position[arm] + half
         low = np.flatnonzero(np.abs(end[:, 2] - 0.05) < 0.03)[: -(-worlds // 7)]
         apart = system.contact_radius[pair].sum() - rng.uniform(1e-3, 5e-3, len(low))
         aside = np.sqrt(np.maximum(apart**2 - (end[low, 2] - 0.05) ** 2, 0.0))
