@@ -189,8 +189,7 @@ class Line:
         del rng
         return self._state(jnp.zeros((1,), jnp.float32))
 
-    def step(self, state: State, action: jax.Array, params: Any = None) -> State:
-        del params
+    def step(self, state: State, action: jax.Array) -> State:
         return self._state(self.growth * state.pipeline_state + action)
 
     def _state(self, x: jax.Array) -> State:

@@ -29,8 +29,8 @@ class Landscape:
         del rng
         return self._state(jnp.zeros((), jnp.float32))
 
-    def step(self, state: State, action: jax.Array, params: Any = None) -> State:
-        del state, params
+    def step(self, state: State, action: jax.Array) -> State:
+        del state
         return self._state(self.reward(action))
 
     def _state(self, reward: jax.Array) -> State:

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from newton_qd.envs.state import State, select
 from newton_qd.extractors import Trajectories
@@ -116,7 +117,8 @@ class _Run:
     ) -> Outcome:
         """Runs the episode."""
         parameters = self.unravel(genotype)
-        first = start if isinstance(start, State) else self.env.reset(start)
+        is_key = isinstance(start, (jax.Array, np.ndarray))
+        first = self.env.reset(start) if is_key else start
         dtype, steps = first.reward.dtype, self.episode_length
         rows: dict[str, Any] = {}
         if not self.options.exact:
@@ -150,7 +152,7 @@ class _Run:
             action = row["action"]
         else:
             action = self.policy(parameters, state.obs)
-        # An environment whose worlds have no parameters need not know of them.
+        # an environment of one's own may have a step without parameters
         own = () if params is None else (params,)
         state = self.env.step(state, action, *own)
         steps = _transition(begin, action, state) if self.transitions else {}
