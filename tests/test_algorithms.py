@@ -170,7 +170,9 @@ def test_faulty_individuals_are_counted(name: str) -> None:
     config = SMALL.replace(
         algorithm=name,
         iterations=6,
-        options={"longest": 9.0} if name == "me-gradient" else {"points": 2},
+        options={"longest": 9.0}
+        if name == "me-gradient"
+        else {"points": 2, "sigma_g": 2.0},
     )
     result = run(config)
     assert result.metrics["rejected"].sum() > 0
