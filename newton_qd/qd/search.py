@@ -203,8 +203,7 @@ class Search:
         """Puts the leaves of a checkpoint where they belong."""
         shape = (self._config.batch_size, self._policy.size)
         genotypes = jax.ShapeDtypeStruct(shape, jnp.float32)
-        score = self._scoring(transitions=self._algorithm.transitions)
-        scores = jax.eval_shape(score, genotypes, self._key_reset)
+        scores = jax.eval_shape(self._loop_scoring(), genotypes, self._key_reset)
         repertoire = self.empty().repertoire
         example = jax.eval_shape(self._begun, repertoire, genotypes, scores)[1]
         expected, structure = jax.tree.flatten(example)
