@@ -77,15 +77,20 @@ def seconds(function: Callable[..., Any], *values: Any) -> float:
     return time.process_time() - begin
 
 
-def main() -> None:
-    """Measures one task."""
+def arguments() -> argparse.Namespace:
+    """Reads the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("task")
     parser.add_argument("--steps", type=int, default=100)
     parser.add_argument("--flows", nargs="*", default=["0,10,1"])
     lengths = [0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 4.0]
     parser.add_argument("--lengths", nargs="*", type=float, default=lengths)
-    args = parser.parse_args()
+    return parser.parse_args()
+
+
+def main() -> None:
+    """Measures one task."""
+    args = arguments()
     config = EvolveConfig(env_name=args.task, episode_length=args.steps)
     task = make_task(config)
     search = Search(config.resolve(task.descriptor_length), task)

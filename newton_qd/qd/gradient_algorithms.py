@@ -18,7 +18,7 @@ from newton_qd.qd.rollout import Policy, ScoringFunction
 from newton_qd.qd.task import Task
 
 # A robot that falls ends its episode, which no gradient sees: short steps only.
-_FALLS: Mapping[str, Any] = {"shortest": 0.001, "longest": 0.1, "sigma_g": 0.02}
+_FALLS: Mapping[str, Any] = {"shortest": 0.0005, "longest": 0.02, "sigma_g": 0.02}
 
 TUNED: Mapping[str, Mapping[str, Any]] = {
     # Its return is chaotic after some ten control steps.

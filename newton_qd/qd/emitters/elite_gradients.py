@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from qdax.core.containers.mapelites_repertoire import get_cells_indices
 from qdax.core.emitters.emitter import Emitter, EmitterState
 
-from newton_qd.qd.emitters.gradients import Scores, read_scores
+from newton_qd.qd.emitters.gradients import Scores, ScoringFunction, read_scores
 
 _ROUNDINGS = 16
 
@@ -159,3 +159,15 @@ class EliteGradientEmitter(Emitter, abc.ABC):
         """
         scores = read_scores(genotypes, fitnesses, descriptors, extra_scores)
         return emitter_state.add(repertoire, scores)
+
+
+def check_steps(steps: int, scoring_function: ScoringFunction | None) -> None:
+    """Checks the number of gradient steps of an offspring.
+
+    Raises:
+        ValueError: It is below 1, or needs a scoring function that is not given.
+    """
+    if steps < 1:
+        raise ValueError(f"steps must be at least 1, got {steps}")
+    if steps > 1 and scoring_function is None:
+        raise ValueError(f"steps = {steps} needs a scoring_function")

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from newton_qd.qd.emitters.elite_gradients import EliteGradientEmitter
+from newton_qd.qd.emitters.elite_gradients import EliteGradientEmitter, check_steps
 from newton_qd.qd.emitters.gradients import ScoringFunction, normalize, read_scores
 
 
@@ -57,10 +57,7 @@ class GradientVariationEmitter(EliteGradientEmitter):
                 not a finite matrix, or a number is out of its range.
         """
         super().__init__(batch_size, selector)
-        if steps < 1:
-            raise ValueError(f"steps must be at least 1, got {steps}")
-        if steps > 1 and scoring_function is None:
-            raise ValueError(f"steps = {steps} needs a scoring_function")
+        check_steps(steps, scoring_function)
         if directions is not None:
             directions = np.asarray(directions)
             if directions.ndim != 2 or not np.all(np.isfinite(directions)):

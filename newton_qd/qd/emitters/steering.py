@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from newton_qd.qd.emitters.cells import empty_targets, nearest_cells
-from newton_qd.qd.emitters.elite_gradients import EliteGradientEmitter
+from newton_qd.qd.emitters.elite_gradients import EliteGradientEmitter, check_steps
 from newton_qd.qd.emitters.gradients import ScoringFunction, read_scores
 
 # Keeps the system regular where no descriptor has a gradient.
@@ -56,10 +56,7 @@ class SteeringEmitter(EliteGradientEmitter):
                 of its range.
         """
         super().__init__(batch_size)
-        if steps < 1:
-            raise ValueError(f"steps must be at least 1, got {steps}")
-        if steps > 1 and scoring_function is None:
-            raise ValueError(f"steps = {steps} needs a scoring_function")
+        check_steps(steps, scoring_function)
         for name, value in (("max_step", max_step), ("damping", damping)):
             if not value > 0:
                 raise ValueError(f"{name} must be positive, got {value}")
