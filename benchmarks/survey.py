@@ -46,6 +46,11 @@ TAIL = """
 The limits are the original's. Those of the position tasks are wide, for robots that
 run: an untrained one falls near its start and reaches few cells, least of all a
 humanoid.
+
+The original is no different. Of 500 such policies on its `humanoid_omni`
+(`benchmarks/original_spread.py`) the quantiles are -0.36 and 0.54 m in x, -0.50 and
+0.51 m in y; of 500 here -0.37 and 0.54 m, -0.54 and 0.51 m: in both suites the four
+cells of 1.9 m that meet at the start, 0.4 %.
 """
 
 Act = Callable[[jax.Array, jax.Array], jax.Array]

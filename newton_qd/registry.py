@@ -158,9 +158,7 @@ def create(
         TypeError: A keyword argument is unknown.
         ValueError: A value or a combination is not allowed.
     """
-    row = _ROWS.get(env_name) if isinstance(env_name, str) else None
-    if row is None:
-        raise UnknownEnvironment(env_name, registered_envs())
+    row = _row(env_name)
     options = _wrapper_options(env_name, row, qdax_wrappers_kwargs)
     if episode_length is None and (action_repeat != 1 or eval_metrics):
         raise ValueError(
@@ -189,6 +187,14 @@ def create(
 def create_fn(env_name: str, **kwargs: Any) -> Callable[..., Env]:
     """Returns ``create`` with its arguments filled in; nothing is built yet."""
     return functools.partial(create, env_name, **kwargs)
+
+
+def _row(env_name: str) -> EnvironmentRow:
+    """Returns the row of an environment; raises where there is none."""
+    row = _ROWS.get(env_name) if isinstance(env_name, str) else None
+    if row is None:
+        raise UnknownEnvironment(env_name, registered_envs())
+    return row
 
 
 def _require_keywords(

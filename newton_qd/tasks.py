@@ -19,6 +19,7 @@ from newton_qd.envs.humanoid_standup import HumanoidStandup
 from newton_qd.envs.humanoid_trap import HumanoidTrap
 from newton_qd.envs.inverted_pendulum import InvertedDoublePendulum, InvertedPendulum
 from newton_qd.envs.pointmaze import PointMaze
+from newton_qd.envs.pusher import Pusher
 from newton_qd.envs.reacher import Reacher, ReacherAngle
 from newton_qd.envs.swimmer import Swimmer
 from newton_qd.envs.walker2d import Walker2d
@@ -191,6 +192,7 @@ ROWS: dict[str, EnvironmentRow] = {
         InvertedDoublePendulum, "inverted_double_pendulum"
     ),
     "inverted_pendulum": EnvironmentRow(InvertedPendulum, "inverted_pendulum"),
+    "pusher": EnvironmentRow(Pusher, "pusher"),
     "reacher": EnvironmentRow(Reacher, "reacher"),
     "reacherangle": EnvironmentRow(ReacherAngle, "reacherangle"),
     "swimmer": EnvironmentRow(Swimmer, "swimmer"),

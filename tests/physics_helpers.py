@@ -22,10 +22,10 @@ from newton_qd.robots import ROBOTS, Contact, Material, Robot
 
 Arrays = tuple[np.ndarray, ...]
 
-# One robot of each URDF file, and those of them that touch the ground.
+# One robot of each URDF file, and those of them that stand on the ground.
 DISTINCT = list({row.urdf: name for name, row in reversed(ROBOTS.items())}.values())
 DISTINCT.reverse()
-TOUCHING = [name for name in DISTINCT if ROBOTS[name].contacts]
+STANDING = [name for name in DISTINCT if ROBOTS[name].feet]
 
 
 def variant(robot: Robot, dtype: str, **changes: Any) -> System:

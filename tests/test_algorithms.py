@@ -122,6 +122,18 @@ def test_what_does_not_exist_is_refused(tmp_path: Path) -> None:
     assert not out.exists()
 
 
+def test_shares_of_a_batch_that_do_not_fit_are_refused() -> None:
+    for options in ({"ga_batch_size": 9}, {"dcrl_batch_size": 0, "ga_batch_size": 12}):
+        config = SMALL.replace(algorithm="dcrl-me", options=options)
+        with pytest.raises(ConfigError, match=r"must .* add up to batch_size \(16\)"):
+            run(config)
+    for algorithm, name in (("pga-me", "env_batch_size"), ("me-es", "sample_number")):
+        config = SMALL.replace(algorithm=algorithm, options={name: 8})
+        with pytest.raises(ConfigError, match=rf"{name} is batch_size \(16\), not 8"):
+            run(config)
+    newton_qd.compat.uninstall()
+
+
 @pytest.mark.parametrize(
     ("name", "options", "message"),
     [
@@ -165,18 +177,6 @@ def test_faulty_individuals_are_counted(name: str) -> None:
     archive = result.archive
     assert np.isfinite(archive.genotypes).all()
     assert np.isfinite(archive.fitnesses[archive.filled]).all()
-
-
-def test_shares_of_a_batch_that_do_not_fit_are_refused() -> None:
-    for options in ({"ga_batch_size": 9}, {"dcrl_batch_size": 0, "ga_batch_size": 12}):
-        config = SMALL.replace(algorithm="dcrl-me", options=options)
-        with pytest.raises(ConfigError, match=r"must .* add up to batch_size \(16\)"):
-            run(config)
-    for algorithm, name in (("pga-me", "env_batch_size"), ("me-es", "sample_number")):
-        config = SMALL.replace(algorithm=algorithm, options={name: 8})
-        with pytest.raises(ConfigError, match=rf"{name} is batch_size \(16\), not 8"):
-            run(config)
-    newton_qd.compat.uninstall()
 
 
 @pytest.mark.slow

@@ -174,40 +174,6 @@ def test_worlds_and_runs_are_independent(hoppers: Any, device: Any) -> None:
     assert not result.overflowed.any()
 
 
-def memory(worlds: int, steps: int, every: int | None) -> int:
-    """Bytes that XLA allocates for a gradient of ants beside arguments and results."""
-    env = make("ant_uni", "float32")
-    run = make_episode_gradient(
-        env,
-        feedback,
-        get_feet_contact_proportion,
-        episode_length=steps,
-        options=GradientOptions(checkpoint_every=every),
-    )
-    many = jax.tree.map(
-        lambda x: jax.ShapeDtypeStruct((worlds, *x.shape[1:]), x.dtype),
-        feedback_weights(env, 1),
-    )
-    compiled = jax.jit(run).lower(many, jax.random.key(0)).compile()
-    analysis = compiled.memory_analysis()
-    assert analysis is not None
-    return analysis.temp_size_in_bytes
-
-
-@pytest.mark.slow
-def test_memory_is_a_state_per_control_step() -> None:
-    """What docs/gradients.md states, of 1,000 steps; nothing is run."""
-    short, long = (memory(1024, steps, 1) for steps in (100, 1000))
-    slope = (long - short) / (900 * 1024)
-    report("bytes per world and control step", slope)
-    assert slope < 700
-    report("GiB for 1,024 worlds", long / 2**30)
-    assert long < 24 * 2**30
-    many = memory(65536, 1000, 32)
-    report("GiB for 65,536 worlds, a state every 32", many / 2**30)
-    assert many < 64 * 2**30
-
-
 class Line:
     """x' = growth x + action; the reward is x', the state descriptor x.
 

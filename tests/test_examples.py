@@ -44,6 +44,16 @@ def no_trace() -> Iterator[None]:
         ),
         ("gradient_qd", [*TINY, *FEW], r"iteration 2: QD score .* rejected 0"),
         ("ribs_cma_maega", [*TINY, *FEW], r"iteration 1: QD score [\d,]+, coverage"),
+        (
+            "plan_hopper",
+            ["--plans", "2", "--steps", "4", *FEW],
+            r"iteration   2: mean return .*best",
+        ),
+        (
+            "train_ant",
+            ["--worlds", "2", "--steps", "4", *FEW],
+            r"iteration   2: mean return",
+        ),
         ("qdax_map_elites", [*TINY, *FEW], r"iteration 2: QD score [\d,]+, coverage"),
         ("qdax_pga_me", [*TINY, *FEW, "--training-steps", "2"], r"QD score [\d,]+"),
         ("ribs_cma_me", [*TINY, *FEW], r"as a repertoire of QDax: \d+ elites"),

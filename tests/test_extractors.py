@@ -132,8 +132,15 @@ def test_final_position_has_a_gradient() -> None:
     assert found[0].tolist() == [[0, 0], [1, 0], [0, 0]]
 
 
+def division_error(device: Any) -> float:
+    """Relative error of XLA's division in float32: correctly rounded on CPUs alone."""
+    return 0.0 if device.platform == "cpu" else 3e-7
+
+
 @pytest.mark.parametrize("compiled", [False, True])
-def test_a_foot_that_always_touches_has_proportion_one(compiled: bool) -> None:
+def test_a_foot_that_always_touches_has_proportion_one(
+    compiled: bool, device: Any
+) -> None:
     steps = 128
     mask = jnp.asarray(np.arange(steps) > np.arange(steps)[:, None], np.float32)
 
@@ -142,7 +149,7 @@ def test_a_foot_that_always_touches_has_proportion_one(compiled: bool) -> None:
 
     touching = jnp.ones((steps, steps, 3), np.float32)
     found = (jax.jit(proportion) if compiled else proportion)(touching)
-    assert np.array_equal(found, np.ones((steps, 3)))
+    np.testing.assert_allclose(found, 1.0, rtol=division_error(device), atol=0)
 
 
 @pytest.mark.parametrize("steps", [1, 2, 7, 1000])
@@ -154,9 +161,9 @@ def test_a_foot_that_always_touches_has_proportion_one(compiled: bool) -> None:
     ],
 )
 def test_kernels_reduce_as_the_extractors_do(
-    extractor: Any, kernel: Any, steps: int
+    extractor: Any, kernel: Any, steps: int, device: Any
 ) -> None:
-    """Bitwise, with their gradients; one episode in a batch and by itself."""
+    """Bitwise on CPUs, with their gradients; one episode in a batch and by itself."""
     rng = np.random.default_rng(steps)
     described = jnp.asarray(rng.uniform(size=(5, steps, 3)), np.float32)
     ends = rng.integers(1, steps + 1, 5)
@@ -168,7 +175,8 @@ def test_kernels_reduce_as_the_extractors_do(
         return extractor(Transitions(described), mask)
 
     found = reduce(described, mask)
-    np.testing.assert_array_equal(found, jax.jit(extract)(described))
+    expected = jax.jit(extract)(described)
+    np.testing.assert_allclose(found, expected, rtol=division_error(device), atol=0)
     np.testing.assert_array_equal(found[3], kernel(described[3], mask[3]))
     gradients = (
         jax.jit(jax.grad(lambda x, f=function: (weights * f(x)).sum()))(described)

@@ -60,6 +60,7 @@ HOMES = {
     ),
 }
 LEAF_HOMES = ("qd/", "viewers/", "compat/", "cli/")
+# the gradient doctor's report draws itself
 HOMES["matplotlib"] = (*LEAF_HOMES, "gradients/report.py")
 # Never loaded by `import newton_qd`.
 HEAVY = {

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from contract import EVERY_NAME, outline, zero_action
+from contract import EVERY_NAME, NAMES, outline, zero_action
 
 import newton_qd
 from newton_qd import registry
@@ -29,6 +29,11 @@ PRODUCT = [
     for values in itertools.product(*OPTIONS.values())
 ]
 KEY = jax.random.key(0)
+OTHERS = [
+    pytest.param(name, marks=pytest.mark.slow)
+    for name in newton_qd.registered_envs()
+    if name not in NAMES
+]
 
 
 def allowed(options: dict[str, Any]) -> bool:
@@ -49,7 +54,7 @@ def shared_base(monkeypatch: pytest.MonkeyPatch, request: Any) -> str:
     return name
 
 
-@pytest.mark.parametrize("shared_base", EVERY_NAME, indirect=True)
+@pytest.mark.parametrize("shared_base", [*EVERY_NAME, *OTHERS], indirect=True)
 def test_shapes(shared_base: str) -> None:
     for options in PRODUCT:
         if not allowed(options):

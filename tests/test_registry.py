@@ -92,6 +92,7 @@ ROBOTS = {
     "humanoidstandup": (227, 17),
     "inverted_double_pendulum": (8, 1),
     "inverted_pendulum": (4, 1),
+    "pusher": (23, 7),
     "reacher": (11, 2),
     "reacherangle": (11, 2),
     "swimmer": (8, 2),

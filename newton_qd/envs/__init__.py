@@ -11,6 +11,7 @@ from newton_qd.envs.humanoid_trap import HumanoidTrap
 from newton_qd.envs.inverted_pendulum import InvertedDoublePendulum, InvertedPendulum
 from newton_qd.envs.locomotion import Locomotion
 from newton_qd.envs.pointmaze import PointMaze
+from newton_qd.envs.pusher import Pusher
 from newton_qd.envs.reacher import Reacher, ReacherAngle
 from newton_qd.envs.state import State, check
 from newton_qd.envs.swimmer import Swimmer
@@ -30,6 +31,7 @@ __all__ = [
     "Locomotion",
     "PhysicsEnv",
     "PointMaze",
+    "Pusher",
     "QDEnv",
     "Reacher",
     "ReacherAngle",

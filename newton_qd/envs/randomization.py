@@ -54,13 +54,7 @@ def randomize_params(
         ValueError: The environment has no physical parameters, or a range is not one;
             names it and what is allowed.
     """
-    default = env.unwrapped.default_params
-    if not isinstance(default, PhysicsParams):
-        raise ValueError(
-            f"env: {env.name} has no physical parameters; allowed: simulated robots"
-        )
-    if worlds is not None and (isinstance(worlds, bool) or worlds < 1):
-        raise ValueError(f"worlds={worlds!r}; allowed: None, or integers from 1")
+    default = _default(env, worlds)
     given = {
         "gravity": gravity,
         "friction": friction,
@@ -80,6 +74,18 @@ def randomize_params(
         return _draw(key, default, bounds)
     keys = jax.random.split(key, batch)
     return jax.vmap(_draw, (0, None, None))(keys, default, bounds)
+
+
+def _default(env: Env, worlds: int | None) -> PhysicsParams:
+    """Returns the parameters of one world as in the files."""
+    default = env.unwrapped.default_params
+    if not isinstance(default, PhysicsParams):
+        raise ValueError(
+            f"env: {env.name} has no physical parameters; allowed: simulated robots"
+        )
+    if worlds is not None and (isinstance(worlds, bool) or worlds < 1):
+        raise ValueError(f"worlds={worlds!r}; allowed: None, or integers from 1")
+    return default
 
 
 def _bounds(name: str, limits: Any, default: jax.Array) -> tuple[np.ndarray, ...]:

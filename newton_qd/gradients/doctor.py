@@ -114,36 +114,45 @@ def diagnose_gradients(
     Raises:
         ValueError: A setting is out of its range, or the environment in float32.
     """
-    _check(
-        horizons,
-        policy,
-        genotypes,
-        sigma,
-        worlds=worlds,
-        directions=directions,
-        samples=samples,
-    )
+    counts = {"worlds": worlds, "directions": directions, "samples": samples}
+    _check(horizons, policy, genotypes, sigma, **counts)
     with jax.enable_x64(True):
         made = _made(env)
-        keys = jax.random.split(jax.random.key(seed), 4)
-        steps, ends = int(horizons[-1]), np.asarray(horizons, np.int32)
-        subject = _Subject(made, policy, steps, keys[0])
+        reset_key, plan_key, *keys = jax.random.split(jax.random.key(seed), 4)
+        subject = _Subject(made, policy, int(horizons[-1]), reset_key)
         if genotypes is None:
-            shape = (worlds, steps, made.action_size)
-            genotypes = jax.random.uniform(keys[1], shape, made.dtype, -1, 1)
-        difference, gradients = _differences(subject, genotypes, keys[2], directions)
-        centre = jax.tree.map(lambda x: x[:, ends - 1], gradients)
-        noise = jax.tree.map(lambda x: sigma * x, _normal(keys[3], genotypes, samples))
-        mixed, slopes = _sampled(subject, genotypes, centre, noise, sigma, ends)
-        rows = _rows(ends, made.dt, difference, mixed, slopes)
+            shape = (worlds, subject.steps, made.action_size)
+            genotypes = jax.random.uniform(plan_key, shape, made.dtype, -1, 1)
+        rows, contacts = _found(
+            subject, genotypes, keys, horizons, directions, samples, sigma
+        )
         return GradientReport(
             name=env if isinstance(env, str) else made.name,
             dt=made.dt,
             open_loop=policy is None,
             sigma=sigma,
             horizons=rows,
-            contacts=_contacts(made, difference),
+            contacts=contacts,
         )
+
+
+def _found(
+    subject: _Subject,
+    genotypes: Any,
+    keys: Sequence[jax.Array],
+    horizons: Sequence[int],
+    directions: int,
+    samples: int,
+    sigma: float,
+) -> tuple[tuple[HorizonRow, ...], tuple[ContactRow, ...]]:
+    """The rows of a report; the keys are those of the directions and of the noise."""
+    ends = np.asarray(horizons, np.int32)
+    difference, gradients = _differences(subject, genotypes, keys[0], directions)
+    centre = jax.tree.map(lambda x: x[:, ends - 1], gradients)
+    noise = jax.tree.map(lambda x: sigma * x, _normal(keys[1], genotypes, samples))
+    mixed, slopes = _sampled(subject, genotypes, centre, noise, sigma, ends)
+    rows = _rows(ends, subject.env.dt, difference, mixed, slopes)
+    return rows, _contacts(subject.env, difference)
 
 
 def _check(

@@ -5,14 +5,16 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from newton_qd.envs.state import select
+from newton_qd.envs.state import State, select
 from newton_qd.extractors import Trajectories
 from newton_qd.gradients.flow import GradientOptions, passed_back
+from newton_qd.types import Params
 
 Policy = Callable[[Any, jax.Array], jax.Array]
 """Maps the parameters of a policy and an observation (no,) to an action (nu,)."""
@@ -38,27 +40,47 @@ class Outcome:
     transitions: dict[str, jax.Array] = dataclasses.field(default_factory=dict)
 
 
+class Episode(Protocol):
+    """Runs one episode of one world; see :func:`make_episode`."""
+
+    def __call__(
+        self, genotype: Any, start: jax.Array | State, params: Params = None, /
+    ) -> Outcome:
+        """Returns what the episode came to.
+
+        Args:
+            genotype: Whose policy acts, or the actions.
+            start: Key of the reset, or the state that the episode begins from.
+            params: Physical parameters of the world; ``None``: as in its files.
+        """
+        ...
+
+
 def make_episode(
     env: Any,
     policy: Policy | None,
-    descriptor_extractor: Callable[[Any, jax.Array], jax.Array],
+    descriptor_extractor: Callable[[Any, jax.Array], jax.Array] | None,
     *,
     episode_length: int,
     unravel: Callable[[Any], Any] = lambda genotype: genotype,
     options: GradientOptions | None = None,
     transitions: bool = False,
-) -> Callable[[Any, jax.Array], Outcome]:
+) -> Episode:
     """Builds the function that runs one episode.
 
+    It is differentiable in the genotype, in the state that the episode begins from and
+    in the physical parameters of the world.
+
     Args:
-        env: Environment of one world with ``info["state_descriptor"]`` and without
-            auto-reset.
+        env: Environment of one world without auto-reset; with
+            ``info["state_descriptor"]`` where a descriptor is extracted.
         policy: Maps parameters and an observation to an action; ``None``: the
             parameters are the actions themselves, (episode_length, nu) or as many
             numbers in another shape.
         descriptor_extractor: Maps ``(data, mask)`` to descriptors (1, D), with
             ``data.state_desc`` (1, T, nd) and ``mask`` (1, T) equal to 1 after the
             end of the episode; ``newton_qd.descriptor_extractor`` has those of tasks.
+            ``None``: the descriptor is empty.
         episode_length: Control steps.
         unravel: Maps a genotype to the parameters, once an episode.
         options: What becomes of the gradient on its way back; ``None``: no care is
@@ -68,49 +90,83 @@ def make_episode(
             counts for nothing else.
 
     Returns:
-        Function of the genotype and the key of the reset. Under ``jax.vmap`` the
-        worlds share the launches, and so do the rows of a Jacobian.
+        Function of the genotype, of the key of the reset or a first state, and of
+        physical parameters, if any. Under ``jax.vmap`` the worlds share the launches,
+        and so do the rows of a Jacobian.
     """
     kept = options or GradientOptions(checkpoint_every=None)
+    return _Run(
+        env, policy, descriptor_extractor, episode_length, unravel, kept, transitions
+    )
 
-    def run(genotype: Any, key: jax.Array) -> Outcome:
-        parameters = unravel(genotype)
-        first = state = env.reset(key)
-        dtype = state.reward.dtype
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Run:
+    """The function that ``make_episode`` returns, whose arguments its fields are."""
+
+    env: Any
+    policy: Policy | None
+    descriptor_extractor: Callable[[Any, jax.Array], jax.Array] | None
+    episode_length: int
+    unravel: Callable[[Any], Any]
+    options: GradientOptions
+    transitions: bool
+
+    def __call__(
+        self, genotype: Any, start: jax.Array | State, params: Params = None, /
+    ) -> Outcome:
+        """Runs the episode."""
+        parameters = self.unravel(genotype)
+        is_key = isinstance(start, (jax.Array, np.ndarray))
+        first = self.env.reset(start) if is_key else start
+        dtype, steps = first.reward.dtype, self.episode_length
         rows: dict[str, Any] = {}
-        if not kept.exact:
-            rows["factor"] = kept.factors(episode_length).astype(dtype)
-        if policy is None:
-            rows["action"] = parameters.reshape(episode_length, env.action_size)
-
-        def advance(carry: tuple, row: dict[str, jax.Array]) -> tuple[tuple, tuple]:
-            state, fitness, over, bad = carry
-            begin = state
-            if "factor" in row:
-                state = passed_back(state, row["factor"], kept.clip)
-            action = row["action"] if policy is None else policy(parameters, state.obs)
-            state = env.step(state, action)
-            steps = _transition(begin, action, state) if transitions else {}
-            # The sum runs in time order here, not in a reduction over time, so
-            # that a row's return does not depend on the size of the batch.
-            fitness = jnp.where(over, fitness, fitness + state.reward)
-            bad = bad | (~over & _at_fault(state))
-            reading, ended = begin.info["state_descriptor"], state.done > 0
-            if transitions:
-                state = select(ended, first, state)
-            return (state, fitness, over | ended, bad), (reading, over, steps)
-
+        if not self.options.exact:
+            rows["factor"] = self.options.factors(steps).astype(dtype)
+        if self.policy is None:
+            rows["action"] = parameters.reshape(steps, self.env.action_size)
         no = jnp.zeros((), bool)
-        start = (state, jnp.zeros((), dtype), no, no)
-        (_, fitness, _, bad), (readings, over, steps) = _scan(
-            advance, start, rows, episode_length, kept.checkpoint_every
+        (_, fitness, _, bad), (readings, over, taken) = _scan(
+            functools.partial(self._advance, parameters, first, params),
+            (first, jnp.zeros((), dtype), no, no),
+            rows,
+            steps,
+            self.options.checkpoint_every,
         )
-        data = Trajectories(state_desc=readings[None])
-        descriptor = descriptor_extractor(data, over[None].astype(readings.dtype))[0]
+        descriptor = jnp.zeros((0,), dtype)
+        if self.descriptor_extractor is not None:
+            data, mask = Trajectories(readings[None]), over[None].astype(readings.dtype)
+            descriptor = self.descriptor_extractor(data, mask)[0]
         bad = bad | ~jnp.isfinite(fitness) | ~jnp.all(jnp.isfinite(descriptor))
-        return Outcome(fitness, descriptor, bad, steps)
+        return Outcome(fitness, descriptor, bad, taken)
 
-    return run
+    def _advance(
+        self, parameters: Any, first: State, params: Params, carry: tuple, row: Any
+    ) -> tuple[tuple, tuple]:
+        """One control step; hands on state, fitness, whether it is over, and faults."""
+        begin, fitness, over, bad = carry
+        state = begin
+        if "factor" in row:
+            state = passed_back(state, row["factor"], self.options.clip)
+        if self.policy is None:
+            action = row["action"]
+        else:
+            action = self.policy(parameters, state.obs)
+        # an environment of one's own may have a step without parameters
+        own = () if params is None else (params,)
+        state = self.env.step(state, action, *own)
+        steps = _transition(begin, action, state) if self.transitions else {}
+        # The sum runs in time order here, not in a reduction over time, so that a
+        # row's return does not depend on the size of the batch.
+        fitness = jnp.where(over, fitness, fitness + state.reward)
+        bad = bad | (~over & _at_fault(state))
+        reading = None
+        if self.descriptor_extractor is not None:
+            reading = begin.info["state_descriptor"]
+        ended = state.done > 0
+        if self.transitions:
+            state = select(ended, first, state)
+        return (state, fitness, over | ended, bad), (reading, over, steps)
 
 
 def _scan(

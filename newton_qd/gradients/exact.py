@@ -49,7 +49,7 @@ DirectionalGradient: TypeAlias = Callable[[Any, jax.Array, jax.Array], EpisodeGr
 def make_episode_gradient(
     env: Any,
     policy: Policy | None,
-    descriptor_extractor: Callable[[Any, jax.Array], jax.Array],
+    descriptor_extractor: Callable[[Any, jax.Array], jax.Array] | None,
     *,
     episode_length: int,
     unravel: Callable[[Any], Any] = lambda genotype: genotype,
@@ -65,14 +65,16 @@ def make_episode_gradient(
             gradient: see :func:`~newton_qd.gradients.with_smooth_descriptor`.
         policy: As in :func:`~newton_qd.gradients.make_episode`; ``None``: the
             genotypes are the actions, (N, episode_length, nu).
-        descriptor_extractor: Reads the descriptor of an episode.
+        descriptor_extractor: Reads the descriptor of an episode; ``None``: it is empty,
+            and the fitness alone has a gradient.
         episode_length: Control steps; a reward counts up to the first ``done``.
         unravel: Maps a genotype to the parameters of the policy.
         options: Windows, clipping, discounting and memory; ``None``: exact, one state
             kept per control step.
 
     Returns:
-        Function of genotypes, any pytree whose leaves have N in front, and one key.
+        Function of genotypes, any pytree whose leaves have N in front, and of one key
+        of the reset, or one state that all episodes begin from.
     """
     run = make_episode(
         env,

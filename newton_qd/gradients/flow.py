@@ -65,6 +65,7 @@ class GradientOptions:
         factors = np.full(steps, self.discount)
         if self.window is not None:
             factors[:: self.window] = 0.0
+        factors[0] = 1.0  # no step handed the first state on
         return factors
 
 

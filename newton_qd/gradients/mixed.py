@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from newton_qd.envs.state import select
 from newton_qd.gradients.episode import Policy, make_episode
 from newton_qd.gradients.exact import (
+    EpisodeGradient,
     EpisodeGradients,
     make_episode_gradient,
 )
@@ -46,7 +47,7 @@ class MixedGradients(EpisodeGradients):
 def make_mixed_gradient(
     env: Any,
     policy: Policy | None,
-    descriptor_extractor: Callable[[Any, jax.Array], jax.Array],
+    descriptor_extractor: Callable[[Any, jax.Array], jax.Array] | None,
     *,
     episode_length: int,
     unravel: Callable[[Any], Any] = lambda genotype: genotype,
@@ -86,47 +87,44 @@ def make_mixed_gradient(
     Raises:
         ValueError: A setting is out of its range.
     """
-    if isinstance(samples, bool) or not isinstance(samples, int) or samples < 2:
-        raise ValueError(f"samples={samples!r}: allowed: integers from 2")
-    for name, value in (("sigma", sigma), ("tolerance", tolerance)):
-        if not value > 0:
-            raise ValueError(f"{name}={value!r}: allowed: above 0")
-    episode = make_episode(
-        env,
-        policy,
-        descriptor_extractor,
-        episode_length=episode_length,
-        unravel=unravel,
-    )
-    gradient = make_episode_gradient(
-        env,
-        policy,
-        descriptor_extractor,
-        episode_length=episode_length,
-        unravel=unravel,
-        options=options,
-    )
+    _check(samples, sigma=sigma, tolerance=tolerance)
+    subject = (env, policy, descriptor_extractor)
+    common: dict[str, Any] = {"episode_length": episode_length, "unravel": unravel}
+    episode = make_episode(*subject, **common)
+    gradient = make_episode_gradient(*subject, **common, options=options)
+    combine = functools.partial(_combined, sigma=sigma, tolerance=tolerance)
 
     def mixed(genotypes: Any, key: jax.Array) -> MixedGradients:
         noise = _noise(jax.random.fold_in(key, 1), genotypes, samples, sigma)
-        signs = jnp.array([1, -1], jnp.int32)
-        around = jax.tree.map(
-            lambda x, w: x[:, None, None] + w[:, :, None] * _like(signs, w[0]),
-            genotypes,
-            noise,
-        )
-        found = gradient(
-            jax.tree.map(lambda x: x.reshape(-1, *x.shape[3:]), around), key
-        )
-        count = jax.tree.leaves(genotypes)[0].shape[0]
-        found = jax.tree.map(
-            lambda x: x.reshape(count, samples, 2, *x.shape[1:]), found
-        )
+        found = _pairs(gradient, genotypes, noise, key)
         centre = jax.vmap(episode, in_axes=(0, None))(genotypes, key)
-        combine = functools.partial(_combined, sigma=sigma, tolerance=tolerance)
         return jax.vmap(combine)(centre, found, noise)
 
     return mixed
+
+
+def _check(samples: int, **positive: float) -> None:
+    """Raises for settings out of their range."""
+    if isinstance(samples, bool) or not isinstance(samples, int) or samples < 2:
+        raise ValueError(f"samples={samples!r}: allowed: integers from 2")
+    for name, value in positive.items():
+        if not value > 0:
+            raise ValueError(f"{name}={value!r}: allowed: above 0")
+
+
+def _pairs(
+    gradient: EpisodeGradient, genotypes: Any, noise: Any, key: jax.Array
+) -> EpisodeGradients:
+    """Values and gradients at x + w and x - w, leaves (N, samples, 2, ...)."""
+    signs = jnp.array([1, -1], jnp.int32)
+    around = jax.tree.map(
+        lambda x, w: x[:, None, None] + w[:, :, None] * _like(signs, w[0]),
+        genotypes,
+        noise,
+    )
+    shape = jax.tree.leaves(around)[0].shape[:3]
+    found = gradient(jax.tree.map(lambda x: x.reshape(-1, *x.shape[3:]), around), key)
+    return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), found)
 
 
 def _noise(key: jax.Array, genotypes: Any, samples: int, sigma: float) -> Any:

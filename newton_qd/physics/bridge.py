@@ -7,7 +7,7 @@ through DLPack. No other module knows both libraries.
 
 import contextlib
 import functools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -47,27 +47,25 @@ def _errors_contained() -> Iterator[None]:
         raise RuntimeError(f"interrupted inside the physics: {error!r}") from error
 
 
-@functools.cache
-def _kernel_call(system: System, name: str, size: int, parametric: bool = False) -> Any:
-    """A kernel as a function of contiguous rows.
+def _row_call(name: str, dtype: str, module: Any, launch: Callable[..., None]) -> Any:
+    """A launch as a function of contiguous rows.
 
     Args:
-        system: The system.
-        name: Kernel; one that ends in ``_backward`` runs its adjoint, and takes the
-            adjoints of the outputs as a second argument.
-        size: Length of a row of the first argument.
-        parametric: Whether the row ends with the world's parameters.
+        name: Kernel; one that ends in ``_backward`` takes the adjoints of the outputs
+            as a second argument.
+        dtype: Type of the rows.
+        module: Warp module of the kernel; Warp loads it when a call is traced.
+        launch: Runs the kernel on Warp arrays of rows: the inputs, then the outputs.
 
     Returns:
         Function of one world's rows that returns a tuple of one row; its
         ``output_dims`` says how long. Under ``vmap`` the worlds share one launch.
     """
-    real = SCALARS[system.dtype]
+    real = SCALARS[dtype]
 
     def forward(x: wp.array(dtype=real), y: wp.array(dtype=real)):
         with _errors_contained():
-            worlds = x.shape[0] // size
-            launcher(system, x.device, parametric).launch(name, worlds, x, y)
+            launch(x, y)
 
     def backward(
         x: wp.array(dtype=real),
@@ -75,15 +73,11 @@ def _kernel_call(system: System, name: str, size: int, parametric: bool = False)
         x_bar: wp.array(dtype=real),
     ):
         with _errors_contained():
-            worlds, arrays = x.shape[0] // size, (x, y_bar, x_bar)
-            own = launcher(system, x.device, parametric)
-            own.launch(name, worlds, *arrays, adjoint=True)
+            launch(x, y_bar, x_bar)
 
     function = backward if name.endswith("_backward") else forward
     function.__name__ = function.__qualname__ = name
-    # Warp loads the module of the function when a call is traced: the kernels' one
-    default = launcher(system, wp.device_from_jax(jax.devices()[0]), parametric)
-    function.__module__ = default.prepare(name).name
+    function.__module__ = module.name
     call = wp.jax_callable(
         function,
         num_outputs=1,
@@ -93,6 +87,52 @@ def _kernel_call(system: System, name: str, size: int, parametric: bool = False)
     # Warp numbers and keeps every call that it traces, and XLA compiles each number:
     # without jit that would be every eager call
     return jax.jit(call, static_argnames="output_dims", inline=True)
+
+
+def _differentiable(
+    call: Callable[[str], Any], name: str, size: int, output_size: int
+) -> Any:
+    """Reverse-mode function of one row; the adjoint is compiled when first traced.
+
+    Args:
+        call: Makes the function of a kernel, as :func:`_row_call`, from its name.
+        name: Kernels, without ``_forward`` and ``_backward``.
+        size: Length of a row of inputs.
+        output_size: Length of a row of outputs.
+    """
+
+    @jax.custom_vjp
+    def run(x: jax.Array) -> jax.Array:
+        return call(f"{name}_forward")(x, output_dims=output_size)[0]
+
+    def run_forward(x: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return run(x), x
+
+    def run_backward(x: jax.Array, y_bar: jax.Array) -> tuple[jax.Array]:
+        return (call(f"{name}_backward")(x, y_bar, output_dims=size)[0],)
+
+    run.defvjp(run_forward, run_backward)
+    return run
+
+
+@functools.cache
+def _kernel_call(system: System, name: str, size: int, parametric: bool = False) -> Any:
+    """A kernel of a system as a function of rows; see :func:`_row_call`.
+
+    Args:
+        system: The system.
+        name: Kernel; one that ends in ``_backward`` runs its adjoint.
+        size: Length of a row of inputs.
+        parametric: Whether that row ends with the world's parameters.
+    """
+
+    def launch(x: Any, *arrays: Any) -> None:
+        worlds, adjoint = x.shape[0] // size, name.endswith("_backward")
+        own = launcher(system, x.device, parametric)
+        own.launch(name, worlds, x, *arrays, adjoint=adjoint)
+
+    default = launcher(system, wp.device_from_jax(jax.devices()[0]), parametric)
+    return _row_call(name, system.dtype, default.prepare(name), launch)
 
 
 def _row(system: System, **parts: tuple[jax.Array, int]) -> jax.Array:
@@ -113,27 +153,6 @@ def _row(system: System, **parts: tuple[jax.Array, int]) -> jax.Array:
         if array.dtype != system.dtype:
             raise TypeError(f"{name}: dtype {array.dtype} given; {expected}")
     return jnp.concatenate([array for array, _ in parts.values()])
-
-
-def _differentiable(
-    system: System, name: str, size: int, output_size: int, parametric: bool = False
-) -> Any:
-    """Reverse-mode function of one row; the adjoint is compiled when first traced."""
-
-    @jax.custom_vjp
-    def run(x: jax.Array) -> jax.Array:
-        forward = _kernel_call(system, f"{name}_forward", size, parametric)
-        return forward(x, output_dims=output_size)[0]
-
-    def run_forward(x: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return run(x), x
-
-    def run_backward(x: jax.Array, y_bar: jax.Array) -> tuple[jax.Array]:
-        backward = _kernel_call(system, f"{name}_backward", size, parametric)
-        return (backward(x, y_bar, output_dims=size)[0],)
-
-    run.defvjp(run_forward, run_backward)
-    return run
 
 
 @functools.cache
@@ -157,8 +176,11 @@ def control_step(system: System) -> Any:
     nq, nv, nb, nf = system.nq, system.nv, system.nb, len(system.feet)
     size, out = nq + nv + system.nu, output_size(system)
     count = parameter_count(system)
-    step = _differentiable(system, "step", size, out)
-    own_step = _differentiable(system, "step", size + count, out, True)
+    call = functools.partial(_kernel_call, system, size=size)
+    step = _differentiable(call, "step", size, out)
+    size += count
+    call = functools.partial(_kernel_call, system, size=size, parametric=True)
+    own_step = _differentiable(call, "step", size, out)
     ends = np.cumsum([nq, nv, 6 * nb, nb, 1, nf, nf, 2])
 
     def run(
@@ -190,7 +212,8 @@ def _bodies(row: jax.Array) -> Kinematics:
 def kinematics(system: System) -> Any:
     """Differentiable bodies of one world, as a function of ``q`` and ``v``."""
     size = system.nq + system.nv
-    views = _differentiable(system, "kinematics", size, BODY_SIZE * system.nb)
+    call = functools.partial(_kernel_call, system, size=size)
+    views = _differentiable(call, "kinematics", size, BODY_SIZE * system.nb)
 
     def run(q: jax.Array, v: jax.Array) -> Kinematics:
         return _bodies(views(_row(system, q=(q, system.nq), v=(v, system.nv))))
@@ -209,56 +232,22 @@ def dynamics(system: System, q: jax.Array, v: jax.Array) -> tuple[jax.Array, jax
 @functools.cache
 def _episode_call(name: str, dtype: str, steps: int, nd: int) -> Any:
     """A kernel of ``kernels.episodes`` as a function of one episode's row."""
-    real = SCALARS[dtype]
     kernel = getattr(kernels(dtype, 1).episodes, name)
 
     def launch(x: Any, *arrays: Any) -> None:
-        with _errors_contained():
-            episodes = x.shape[0] // (steps * (nd + 1))
-            inputs = [steps, nd, x, *arrays]
-            wp.launch(kernel, dim=episodes * nd, inputs=inputs, device=x.device)
+        episodes = x.shape[0] // (steps * (nd + 1))
+        inputs = [steps, nd, x, *arrays]
+        wp.launch(kernel, dim=episodes * nd, inputs=inputs, device=x.device)
 
-    def forward(x: wp.array(dtype=real), y: wp.array(dtype=real)):
-        launch(x, y)
-
-    def backward(
-        x: wp.array(dtype=real),
-        y_bar: wp.array(dtype=real),
-        x_bar: wp.array(dtype=real),
-    ):
-        launch(x, y_bar, x_bar)
-
-    function = backward if name.endswith("_backward") else forward
-    function.__name__ = function.__qualname__ = name
     kernel.module.load(wp.device_from_jax(jax.devices()[0]))
-    function.__module__ = kernel.module.name
-    call = wp.jax_callable(
-        function,
-        num_outputs=1,
-        vmap_method="broadcast_all",
-        graph_mode=wp.JaxCallableGraphMode.NONE,
-    )
-    return jax.jit(call, static_argnames="output_dims", inline=True)
+    return _row_call(name, dtype, kernel.module, launch)
 
 
 @functools.cache
 def _episode_reduction(name: str, dtype: str, steps: int, nd: int, size: int) -> Any:
     """Reverse-mode function of one episode's row; the mask has no gradient."""
-
-    @jax.custom_vjp
-    def run(x: jax.Array) -> jax.Array:
-        forward = _episode_call(f"{name}_forward", dtype, steps, nd)
-        return forward(x, output_dims=size)[0]
-
-    def run_forward(x: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return run(x), x
-
-    def run_backward(x: jax.Array, y_bar: jax.Array) -> tuple[jax.Array]:
-        backward = _episode_call(f"{name}_backward", dtype, steps, nd)
-        return (backward(x, y_bar, output_dims=x.shape[0])[0],)
-
-    run.defvjp(run_forward, run_backward)
-    return run
+    call = functools.partial(_episode_call, dtype=dtype, steps=steps, nd=nd)
+    return _differentiable(call, name, steps * (nd + 1), size)
 
 
 def _episode_row(state_desc: jax.Array, mask: jax.Array) -> jax.Array:

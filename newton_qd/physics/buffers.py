@@ -13,8 +13,10 @@ from newton_qd.physics.precision import kernels, pack_width
 from newton_qd.physics.system import CONTACT_FRACTION, STANDARD_GRAVITY, System
 from newton_qd.physics.tree import Tree, build_tree, origin_axes
 
-# Solves of a substep: the predictor and two correctors.
-_SOLVES = 3
+# Trials of a substep and solves of a trial. With contacts: a predictor and two
+# correctors of the contacts. Without: two more trials, each at the mean velocity of the
+# one before.
+_TOUCHING, _FREE = (1, 3), (3, 1)
 # Scratch arrays by what they hold an entry for.
 _PER_BODY = ("pose", "twist_w", "twist_v", "bias_w", "bias_v", "inertia", "moment")
 _PER_BODY += ("wrench_w", "wrench_v")
@@ -31,6 +33,10 @@ _REPORTED = ("impulse", "angular_impulse", "normal_impulse")
 def _with_world(table: np.ndarray) -> np.ndarray:
     """Prepend the world's row to a body table; it is never read."""
     return np.concatenate([table[:1], table])
+
+
+def _trials_and_passes(system: System) -> tuple[int, int]:
+    return _TOUCHING if len(system.contact_body) else _FREE
 
 
 def kernels_of(
@@ -69,7 +75,8 @@ def build_model(system: System, device: Any, parametric: bool = False) -> Any:
 
     model.nb, model.nq, model.nv = system.nb, system.nq, system.nv
     model.nu, model.nc = system.nu, len(system.contact_body)
-    model.substeps, model.passes = robot.substeps, _SOLVES
+    model.substeps = robot.substeps
+    model.trials, model.passes = _trials_and_passes(system)
     model.h = robot.dt / robot.substeps
     model.gravity = robot.gravity
     model.total_mass = system.total_mass
@@ -166,6 +173,34 @@ def _put_contacts(put: Any, system: System, tree: Tree) -> None:
     put("obstacle_size", system.obstacle_size)
 
 
+def _entries(system: System, adjoint: bool) -> dict[str, int]:
+    """Entries of each scratch array for one pack of worlds."""
+    n, nc = system.robot.substeps, max(len(system.contact_body), 1)
+    nf = len(system.feet)
+    trials, passes = _trials_and_passes(system)
+    # the state after the last substep has kinematics too
+    steps = n * trials + 1 if adjoint else 1
+    solves = n * trials * passes if adjoint else 1
+    return {
+        "fault": 1,
+        "lost": 1,
+        "q": (n + 2) * system.nq,
+        "v": (n * trials + 2) * system.nv,
+        "ctrl": max(system.nu, 1),
+        "parameter": 4 + 2 * system.nb + system.nv,
+        **dict.fromkeys(_PER_BODY, steps * (system.nb + 1)),
+        **dict.fromkeys(("axis_w", "axis_v"), steps * system.nv),
+        **dict.fromkeys(_PER_CONTACT, steps * nc),
+        **dict.fromkeys(_REPORTED, n * nc),
+        **dict.fromkeys(_PER_SOLVE_CONTACT, solves * nc),
+        **dict.fromkeys(_PER_SOLVE_BODY, solves * (system.nb + 1)),
+        "dv": solves * system.nv,
+        **dict.fromkeys(_PER_READING, system.nb + 1),
+        "torso_xy": 2,
+        **dict.fromkeys(("foot_contact", "smooth_foot_contact"), max(nf, 1)),
+    }
+
+
 def build_scratch(
     system: System,
     slots: int,
@@ -190,30 +225,8 @@ def build_scratch(
     """
     space = kernels_of(system, device, parametric)
     values, adjoints = space.structs.Scratch(), space.structs.Scratch()
-    n, nc = system.robot.substeps, max(len(system.contact_body), 1)
-    nf = len(system.feet)
-    # the state after the last substep has kinematics too
-    steps, solves = (n + 1, _SOLVES * n) if adjoint else (1, 1)
-    counts = {
-        "fault": 1,
-        "lost": 1,
-        "q": (n + 2) * system.nq,
-        "v": (n + 2) * system.nv,
-        "ctrl": max(system.nu, 1),
-        "parameter": 4 + 2 * system.nb + system.nv,
-        **dict.fromkeys(_PER_BODY, steps * (system.nb + 1)),
-        **dict.fromkeys(("axis_w", "axis_v"), steps * system.nv),
-        **dict.fromkeys(_PER_CONTACT, steps * nc),
-        **dict.fromkeys(_REPORTED, n * nc),
-        **dict.fromkeys(_PER_SOLVE_CONTACT, solves * nc),
-        **dict.fromkeys(_PER_SOLVE_BODY, solves * (system.nb + 1)),
-        "dv": solves * system.nv,
-        **dict.fromkeys(_PER_READING, system.nb + 1),
-        "torso_xy": 2,
-        **dict.fromkeys(("foot_contact", "smooth_foot_contact"), max(nf, 1)),
-    }
     size = 0
-    for name, count in counts.items():
+    for name, count in _entries(system, adjoint).items():
         dtype = space.structs.Scratch.vars[name].type.dtype
         array = wp.zeros(
             slots * count, dtype=dtype, device=device, requires_grad=adjoint

@@ -48,7 +48,7 @@ class Algorithm:
         make: Makes the emitter; raises ``ConfigError`` for options that it does not
             have.
         transitions: Whether its emitter learns from the steps of the episodes.
-        evaluates: Whether its emitter evaluates individuals by ``Parts.score``.
+        evaluates: Whether its emitter evaluates individuals as it learns.
         evaluations: Episodes of one generation, given the settings; an episode that
             is differentiated counts as one, too.
         gradients: Those of them that are differentiated.

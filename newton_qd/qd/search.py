@@ -85,7 +85,7 @@ class Search:
         self._key_emitter = jax.random.fold_in(self._key_generations, 0)
         self._policy = make_policy(task.env, config.hidden)
         self._centroids = cell_centroids(config, task.limits, key_centroids)
-        score = self._loop_scoring()
+        score = self._scoring()
         self._emitter = self._algorithm.make(
             Parts(
                 config,
@@ -173,7 +173,7 @@ class Search:
             return None
         return correct(
             archive,
-            self._compiled(self._scoring()),
+            self._compiled(self._plain_scoring()),
             self._key_corrected,
             reevaluations=self._config.reevaluations,
             offset=self._task.reward_offset * self._config.episode_length,
@@ -203,7 +203,8 @@ class Search:
         """Puts the leaves of a checkpoint where they belong."""
         shape = (self._config.batch_size, self._policy.size)
         genotypes = jax.ShapeDtypeStruct(shape, jnp.float32)
-        scores = jax.eval_shape(self._loop_scoring(), genotypes, self._key_reset)
+        score = self._scoring()
+        scores = jax.eval_shape(score, genotypes, self._key_reset)
         repertoire = self.empty().repertoire
         example = jax.eval_shape(self._begun, repertoire, genotypes, scores)[1]
         expected, structure = jax.tree.flatten(example)
@@ -223,20 +224,27 @@ class Search:
                 )
         return jax.tree.unflatten(structure, restored)
 
-    def _scoring(self, transitions: bool = False) -> ScoringFunction:
-        """Scoring function of this task, split over the mesh."""
-        length = self._config.episode_length
-        score = make_scoring_function(
-            self._task, self._policy, length, transitions=transitions
-        )
-        return self._split(score)
+    def _initial(self, key: jax.Array) -> jax.Array:
+        """Weights (size,) of an individual of the initial population."""
+        scale = self._algorithm.initial_scale(self._config)
+        return scale * self._policy.init(key)
 
-    def _loop_scoring(self) -> ScoringFunction:
-        """Scoring function of the loop, split over the mesh."""
-        made = self._algorithm.scoring
-        if made is None:
-            return self._scoring(transitions=self._algorithm.transitions)
-        return self._split(made(self._config, self._task, self._policy))
+    def _scoring(self) -> ScoringFunction:
+        """The scoring function of the loop, split over the mesh."""
+        if self._algorithm.scoring is None:
+            return self._plain_scoring(self._algorithm.transitions)
+        return self._split(
+            self._algorithm.scoring(self._config, self._task, self._policy)
+        )
+
+    def _plain_scoring(self, transitions: bool = False) -> ScoringFunction:
+        """A scoring function without gradients, split over the mesh."""
+        length = self._config.episode_length
+        return self._split(
+            make_scoring_function(
+                self._task, self._policy, length, transitions=transitions
+            )
+        )
 
     def _split(self, score: ScoringFunction) -> ScoringFunction:
         return score if self._mesh is None else shard_scoring(score, self._mesh)
@@ -246,11 +254,6 @@ class Search:
         if self._mesh is None or not evaluates:
             return jax.jit(function)
         return on_mesh(function, self._mesh)
-
-    def _initial(self, key: jax.Array) -> jax.Array:
-        """Weights (size,) of an individual of the initial population."""
-        scale = self._algorithm.initial_scale(self._config)
-        return scale * self._policy.init(key)
 
     def _proposed(self, repertoire: Any, emitter: Any, key: jax.Array) -> Any:
         """Next genotypes (N, size), and what the emitter wants told with them."""

@@ -8,6 +8,7 @@ from newton_qd.robots.humanoid import HUMANOID
 from newton_qd.robots.humanoid_standup import HUMANOID_STANDUP
 from newton_qd.robots.inverted_double_pendulum import INVERTED_DOUBLE_PENDULUM
 from newton_qd.robots.inverted_pendulum import INVERTED_PENDULUM
+from newton_qd.robots.pusher import PUSHER
 from newton_qd.robots.reacher import REACHER
 from newton_qd.robots.reacherangle import REACHERANGLE
 from newton_qd.robots.row import Contact, Material, Robot
@@ -26,6 +27,7 @@ ROBOTS = {
         HUMANOID_STANDUP,
         INVERTED_DOUBLE_PENDULUM,
         INVERTED_PENDULUM,
+        PUSHER,
         REACHER,
         REACHERANGLE,
         SWIMMER,
@@ -41,6 +43,7 @@ __all__ = [
     "HUMANOID_STANDUP",
     "INVERTED_DOUBLE_PENDULUM",
     "INVERTED_PENDULUM",
+    "PUSHER",
     "REACHER",
     "REACHERANGLE",
     "ROBOTS",

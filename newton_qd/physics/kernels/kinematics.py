@@ -66,12 +66,9 @@ def free_joint(m: Model, sc: Scratch, row: Row, i: int):
     x = load(sc.pose, row.body + load(m.body_parent, i)) * rigid(p, r)
     store(sc.pose, row.body + i, x)
     at = translation(x)
-    vl = vector(
-        load(sc.v, row.v + k), load(sc.v, row.v + k + 1), load(sc.v, row.v + k + 2)
-    )
-    om = vector(
-        load(sc.v, row.v + k + 3), load(sc.v, row.v + k + 4), load(sc.v, row.v + k + 5)
-    )
+    at_v = row.v_body + k
+    vl = vector(load(sc.v, at_v), load(sc.v, at_v + 1), load(sc.v, at_v + 2))
+    om = vector(load(sc.v, at_v + 3), load(sc.v, at_v + 4), load(sc.v, at_v + 5))
     store(sc.twist_w, row.body + i, om)
     store(sc.twist_v, row.body + i, vl + cross(at, om))
     store(sc.bias_w, row.body + i, vec3())
@@ -85,7 +82,7 @@ def hinge_joint(m: Model, sc: Scratch, row: Row, i: int):
     p = load(m.body_parent, i)
     k = load(m.v_start, i)
     qk = load(sc.q, row.q + load(m.q_start, i))
-    vk = load(sc.v, row.v + k)
+    vk = load(sc.v, row.v_body + k)
     frame = load(sc.pose, row.body + p) * constant(m.parent_frame, i)
     axis = constant(m.joint_axis, i)
     a = rotate(rotation(frame), axis)

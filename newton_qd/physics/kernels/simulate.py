@@ -12,7 +12,7 @@ from .contact import (
     contact_slip,
 )
 from .inertia import rigid_inertia
-from .integration import new_coordinates, new_velocity
+from .integration import mean_velocity, new_coordinates, new_velocity
 from .kinematics import free_joint, hinge_joint, world_frame
 from .memory import load
 from .readings import body_impulse, body_reading, foot_contact, torso_position
@@ -66,13 +66,23 @@ def linear_solve(m: Model, sc: Scratch, row: Row, lane: int, lanes: int):
 
 
 @stage
-def substep(m: Model, sc: Scratch, slot: int, keep: int, s: int, lane: int, lanes: int):
-    """Substep ``s`` from its kinematics on; ``keep`` as in ``row_at``."""
-    first = row_at(m, slot, keep, s, 0)
+def substep(
+    m: Model,
+    sc: Scratch,
+    slot: int,
+    keep: int,
+    s: int,
+    trial: int,
+    lane: int,
+    lanes: int,
+):
+    """A trial of substep ``s`` from its kinematics on; ``keep`` as in ``row_at``."""
+    start = trial * m.passes
+    first = row_at(m, slot, keep, s, start)
     for i in range(1 + lane, m.nb + 1, lanes):
         rigid_inertia(m, sc, first, i)
     # predictor, then correctors
-    for p in range(m.passes):
+    for p in range(start, start + m.passes):
         row = row_at(m, slot, keep, s, p)
         for c in range(lane, m.nc, lanes):
             if p == 0:
@@ -83,15 +93,21 @@ def substep(m: Model, sc: Scratch, slot: int, keep: int, s: int, lane: int, lane
                 contact_corrector(m, sc, row, c, p)
         sync(lane)
         linear_solve(m, sc, row, lane, lanes)
-    last = row_at(m, slot, keep, s, m.passes - 1)
-    for k in range(lane, m.nv, lanes):
-        new_velocity(sc, last, k)
-    for c in range(lane, m.nc, lanes):
-        contact_impulse(sc, last, c)
-    sync(lane)
-    for i in range(1 + lane, m.nb + 1, lanes):
-        new_coordinates(m, sc, last, i)
-    sync(lane)
+    last = row_at(m, slot, keep, s, start + m.passes - 1)
+    if trial < m.trials - 1:
+        ahead = row_at(m, slot, keep, s, start + m.passes)
+        for k in range(lane, m.nv, lanes):
+            mean_velocity(sc, last, ahead, k)
+        sync(lane)
+    else:
+        for k in range(lane, m.nv, lanes):
+            new_velocity(sc, last, k)
+        for c in range(lane, m.nc, lanes):
+            contact_impulse(sc, last, c)
+        sync(lane)
+        for i in range(1 + lane, m.nb + 1, lanes):
+            new_coordinates(m, sc, last, i)
+        sync(lane)
 
 
 @wp.func
@@ -106,19 +122,20 @@ def simulate(
 ):
     """All substeps of a pack, then the returned state and what is read from it."""
     slot = pack.slot
-    for n in range(m.substeps + 1):
+    for n in range(m.substeps * m.trials + 1):
         # the kinematics of the returned state are those of a last turn: written
         # twice, a GPU's compiler takes twice as long
-        s = n + n // m.substeps
-        row = row_at(m, slot, keep, s, 0)
-        if n == m.substeps:
+        s = n // m.trials
+        trial = n - s * m.trials
+        row = row_at(m, slot, keep, s + s // m.substeps, trial * m.passes)
+        if s == m.substeps:
             detect_fault(m, sc, pack, x, lane)
-            settle(m, sc, pack, x, row_at(m, slot, keep, n, 0), row, lane, lanes)
+            settle(m, sc, pack, x, row_at(m, slot, keep, s, 0), row, lane, lanes)
             sync(lane)
-        if n < m.substeps or m.reports_bodies == 1 or m.torso_q < 0:
+        if s < m.substeps or m.reports_bodies == 1 or m.torso_q < 0:
             kinematics(m, sc, row, lane, lanes)
-        if n < m.substeps:
-            substep(m, sc, slot, keep, n, lane, lanes)
+        if s < m.substeps:
+            substep(m, sc, slot, keep, s, trial, lane, lanes)
     read_out(m, sc, slot, row_after(m, slot, keep), lane, lanes)
 
 

@@ -23,7 +23,8 @@ class Model:
     nc: int
     substeps: int
     total_mass: scalar  # [kg]
-    passes: int  # solves of a substep: predictor and correctors
+    trials: int  # times that a substep finds the velocities of its bodies
+    passes: int  # solves of a trial: predictor and correctors
     h: scalar  # [s]
     gravity: scalar  # [m/s^2]
     rest_q: wp.array[scalar]  # (nq,)
@@ -169,6 +170,7 @@ class Row:
     q_next: int
     v: int
     v_next: int
+    v_body: int  # velocities that the bodies have in this trial
     ctrl: int
     parameter: int
     body: int
@@ -184,7 +186,7 @@ class Row:
 
 @wp.func
 def row_at(m: Model, slot: int, keep: int, s: int, p: int):
-    """Row of substep ``s`` and solve ``p``.
+    """Row of substep ``s`` and solve ``p``, which counts those of all its trials.
 
     ``keep`` is 1 where every substep has entries of its own, as the adjoint needs, and
     0 where a slot's substeps share them.
@@ -192,15 +194,22 @@ def row_at(m: Model, slot: int, keep: int, s: int, p: int):
     step = slot
     solve = slot
     before = slot
+    trial = p // m.passes
+    trials = m.substeps * m.trials
     if keep == 1:
-        step = slot * (m.substeps + 1) + wp.min(s, m.substeps)
-        solve = m.passes * (slot * m.substeps + s) + p
+        step = slot * (trials + 1) + wp.min(s * m.trials + trial, trials)
+        solve = m.passes * (slot * trials + s * m.trials) + p
         before = solve - 1
     r = Row()
     r.q = (slot * (m.substeps + 2) + s) * m.nq
     r.q_next = r.q + m.nq
-    r.v = (slot * (m.substeps + 2) + s) * m.nv
+    r.v = (slot * (trials + 2) + s) * m.nv
     r.v_next = r.v + m.nv
+    r.v_body = r.v
+    if trial > 0:
+        # the mean velocities of all trials are behind those of the substeps
+        mean = m.substeps + 1 + s * (m.trials - 1) + trial
+        r.v_body = (slot * (trials + 2) + mean) * m.nv
     r.ctrl = slot * m.nu
     r.parameter = slot * (4 + 2 * m.nb + m.nv)
     r.body = step * (m.nb + 1)

@@ -1,0 +1,102 @@
+"""Pusher: bring an object to its goal with the hand of an arm."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from newton_qd import physics
+from newton_qd.envs.base import PhysicsEnv
+from newton_qd.envs.vectors import length, ordered_sum, rounded
+from newton_qd.physics.system import PhysicsState
+from newton_qd.robots import PUSHER
+from newton_qd.types import Action, Metrics, RNGKey
+
+# Where a reset puts the object: drawn from a rectangle, then drawn in to a distance.
+_LOWEST, _HIGHEST = (-0.3, -0.2), (0.0, 0.2)  # x and y [m]
+_FARTHEST = 0.17  # from the origin [m]
+_NEAR, _CONTROL = 0.5, 0.1  # weights of the hand's distance [1/m] and of control [-]
+
+
+class Pusher(PhysicsEnv):
+    """An arm of seven hinges over a table, driven by torques, that pushes an object.
+
+    Observation: ``observation_layout``. Reward: minus the distance of the object from
+    its goal, minus half of its distance from the hand, both at the start of the step,
+    minus a cost of control. Never done. There is no friction: an object that was
+    pushed slides on.
+    """
+
+    reads_bodies = True
+
+    def __init__(
+        self,
+        *,
+        reset_noise_scale: float = 0.0,
+        reset_velocity_noise_scale: float = 0.005,
+        dtype: str = "float32",
+    ) -> None:
+        """Loads the arm.
+
+        Args:
+            reset_noise_scale: Half width of the uniform noise on joint angles at a
+                reset [rad].
+            reset_velocity_noise_scale: That of joint velocities [rad/s].
+            dtype: ``"float32"``, or ``"float64"`` with JAX x64 on.
+        """
+        super().__init__(
+            PUSHER,
+            reset_noise_scale=reset_noise_scale,
+            reset_velocity_noise_scale=reset_velocity_noise_scale,
+            dtype=dtype,
+        )
+
+    def _place(self, rng: RNGKey, q: jax.Array) -> jax.Array:
+        """Returns the coordinates (nq,) with the object somewhere near the origin."""
+        low, high = (jnp.asarray(ends, self.dtype) for ends in (_LOWEST, _HIGHEST))
+        drawn = jax.random.uniform(rng, (2,), self.dtype, low, high)
+        farthest = jnp.asarray(_FARTHEST, self.dtype)
+        drawn_in = drawn * (farthest / jnp.maximum(length(drawn), farthest))
+        names = self.system.joint_names
+        joints = np.array([names.index(name) for name in ("object_x", "object_y")])
+        return q.at[self.system.q_start[joints]].set(drawn_in)
+
+    def _observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
+        """Returns the blocks of the observation."""
+        del action
+        hand, pushed, goal = self._places(state)
+        return {
+            "joint angles [rad]": state.q[self._joint_q],
+            "joint velocities [rad/s]": state.v[self._joint_v],
+            "hand position x y z [m]": hand,
+            "object position x y z [m]": pushed,
+            "goal position x y z [m]": goal,
+        }
+
+    def _places(self, state: PhysicsState) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Returns the positions (3,) of the hand, of the object and of its goal [m]."""
+        system = self.system
+        position = physics.seen_bodies(system, state).position
+        goal = system.scene_frames[system.scene_links.index("goal"), :3]
+        hand, pushed = (
+            position[system.body_names.index(name)]
+            for name in ("r_wrist_roll_link", "object")
+        )
+        return hand, pushed, jnp.asarray(goal, self.dtype)
+
+    def _outcome(
+        self, before: PhysicsState, after: PhysicsState, action: Action
+    ) -> tuple[jax.Array, jax.Array, Metrics]:
+        """Returns reward, done and metrics of a step."""
+        del after
+        hand, pushed, goal = self._places(before)
+        distance, near = length(pushed - goal), length(pushed - hand)
+        control = ordered_sum(jnp.square(action))
+        metrics = {
+            "reward_dist": -distance,
+            "reward_ctrl": -control,
+            "reward_near": -near,
+        }
+        cost = rounded(_CONTROL * control) + rounded(_NEAR * near)
+        return -distance - cost, jnp.zeros_like(distance), metrics

@@ -1,0 +1,290 @@
+"""The adjoint of every environment: to all that it depends on, however it is asked for.
+
+Every simulated robot and task, from states in and out of contact: the gradients of
+reward, observation, state descriptor and contact impulses with respect to coordinates,
+velocities, actions and each physical parameter. They agree with central differences,
+with one another under every transformation of JAX, and with Warp's tape.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import warp as wp
+from physics_helpers import random_states, report
+
+import newton_qd
+from newton_qd import physics
+from newton_qd.envs.base import PhysicsEnv
+from newton_qd.envs.state import State
+from newton_qd.gradients import with_smooth_descriptor
+from newton_qd.physics import bridge, buffers
+from newton_qd.physics.launch import output_size
+from newton_qd.physics.parameters import FIELDS
+from newton_qd.physics.precision import pack_width
+from newton_qd.physics.rest import raising_coordinate
+from newton_qd.physics.system import System
+from newton_qd.robots import ANT, HALFCHEETAH, Robot
+
+WORLDS = 8
+DISTANCES = (1e-4, 1e-5, 1e-6)  # of the differences; the one that agrees best counts
+INPUTS = ("q", "v", "action", *FIELDS)
+Inputs = dict[str, Any]
+
+
+def _robots() -> dict[str, str]:
+    """Names of the simulated environments, and the URDF files of their robots."""
+    bases = {n: newton_qd.create(n).unwrapped for n in newton_qd.registered_envs()}
+    return {n: b.robot.urdf for n, b in bases.items() if isinstance(b, PhysicsEnv)}
+
+
+def _marked(names: Any, quick: tuple[str, ...]) -> list[Any]:
+    slow = pytest.mark.slow
+    return [pytest.param(n, marks=() if n in quick else slow) for n in names]
+
+
+EVERY = _marked(_robots(), ("hopper_uni", "anttrap"))
+# of each robot the task that came last, with its wrappers
+EACH_ROBOT = _marked(
+    {urdf: n for n, urdf in _robots().items()}.values(), ("hopper_uni",)
+)
+
+
+@functools.cache
+def make(name: str) -> Any:
+    """The environment in double precision, its feet read smoothly."""
+    env = newton_qd.create(name, episode_length=None, auto_reset=False, dtype="float64")
+    return with_smooth_descriptor(env, 0.05)
+
+
+def inputs_of(env: Any, worlds: int = WORLDS) -> Inputs:
+    """What a step depends on, in several worlds that all differ."""
+    system, rng = env.unwrapped.system, np.random.default_rng(0)
+    if raising_coordinate(system) is not None:
+        q, v, action = random_states(system, rng, worlds)
+    else:
+        q = system.rest_q + 0.3 * rng.normal(size=(worlds, system.nq))
+        v = rng.normal(size=(worlds, system.nv))
+        action = rng.uniform(-1.0, 1.0, (worlds, env.action_size))
+    params = {name: np.asarray(getattr(env.default_params, name)) for name in FIELDS}
+    scales = {
+        name: x * rng.uniform(0.7, 1.3, (worlds, *x.shape))
+        for name, x in params.items()
+    }
+    return {"q": q, "v": v, "action": action, **scales}
+
+
+@functools.cache
+def readings(env: Any) -> Callable[..., jax.Array]:
+    """Reward, observation, descriptor and impulses (n,) summed over some steps."""
+    first = jax.jit(env.reset)(jax.random.key(0))
+
+    def run(inputs: Inputs, steps: int = 1, unrolled: bool = False) -> jax.Array:
+        params = physics.PhysicsParams(**{name: inputs[name] for name in FIELDS})
+        start = physics.initial_state(env.unwrapped.system, inputs["q"], inputs["v"])
+
+        def advance(state: State, _: None) -> tuple[State, jax.Array]:
+            state = env.step(state, inputs["action"], params)
+            seen = state.pipeline_state
+            parts = [state.reward, state.obs, seen.impulse, seen.normal_impulse]
+            parts.append(state.info.get("state_descriptor", jnp.zeros(0)))
+            return state, jnp.concatenate([jnp.ravel(x) for x in parts])
+
+        state = first.replace(pipeline_state=start)
+        rows = jax.lax.scan(
+            advance, state, None, length=steps, unroll=steps if unrolled else 1
+        )[1]
+        return rows.sum(axis=0)
+
+    return run
+
+
+@functools.cache
+def weighted(env: Any) -> Callable[..., jax.Array]:
+    """A random linear functional of the readings."""
+    inputs = jax.tree.map(lambda x: x[0], inputs_of(env))
+    shape = jax.eval_shape(readings(env), inputs).shape
+    weights = jnp.asarray(np.random.default_rng(1).normal(size=shape))
+    return lambda inputs, *options: (weights * readings(env)(inputs, *options)).sum()
+
+
+def norms(x: Any) -> np.ndarray:
+    """Norm of each world's part (n,)."""
+    return np.linalg.norm(np.asarray(x).reshape(len(x), -1), axis=1)
+
+
+def along(a: Any, b: Any) -> np.ndarray:
+    """Inner product of each world's parts (n,)."""
+    return (np.asarray(a) * b).reshape(len(a), -1).sum(axis=1)
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_a_step_of_every_environment(x64: None, name: str) -> None:
+    """Along a random direction of every input: relative error below 1e-6."""
+    env = make(name)
+    inputs, rng = inputs_of(env), np.random.default_rng(2)
+    value = weighted(env)
+    several = jax.jit(jax.vmap(value))
+    exact = jax.jit(jax.vmap(jax.grad(value)))(inputs)
+    worst = {}
+    for part in INPUTS:
+        direction = rng.normal(size=inputs[part].shape)
+        size = norms(exact[part]) * norms(direction)
+        felt = size > 0
+        errors = []
+        for distance in DISTANCES:
+            ahead, behind = (
+                several({**inputs, part: inputs[part] + sign * distance * direction})
+                for sign in (1, -1)
+            )
+            difference = np.asarray(ahead - behind) / (2 * distance)
+            assert not difference[~felt].any(), part
+            error = np.abs(difference - along(exact[part], direction))
+            errors.append(error[felt] / size[felt])
+        worst[part] = np.min(errors, axis=0).max(initial=0.0)
+    report(f"{name}: largest relative errors", worst)
+    assert max(worst.values()) < 1e-6
+    for part in ("q", "v", "action", "gear_scale", "mass_scale"):
+        assert norms(exact[part]).all(), part
+
+
+def close(found: Any, expected: Any) -> None:
+    """Equal up to the order in which XLA takes sums, part by part."""
+    for part in INPUTS:
+        a, b = np.asarray(found[part]), np.asarray(expected[part])
+        atol = 1e-11 * (1 + np.abs(b).max())
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=atol, err_msg=part)
+
+
+@pytest.mark.parametrize("name", EACH_ROBOT)
+def test_every_transformation_gives_the_same(x64: None, name: str) -> None:
+    """Three steps in a scan; batched, nested, unrolled, remat, alone, Jacobian."""
+    env = make(name)
+    inputs, weigh = inputs_of(env, 4), weighted(env)
+
+    def value(inputs: Inputs, unrolled: bool = False) -> jax.Array:
+        return weigh(inputs, 3, unrolled)
+
+    gradient = jax.grad(value)
+    inner = jax.jit(jax.vmap(gradient))(inputs)
+    close(jax.jit(jax.grad(lambda x: jax.vmap(value)(x).sum()))(inputs), inner)
+    pairs = jax.tree.map(lambda x: x.reshape(2, 2, *x.shape[1:]), inputs)
+    nested = jax.jit(jax.vmap(jax.vmap(gradient)))(pairs)
+    close(jax.tree.map(lambda x: x.reshape(4, *x.shape[2:]), nested), inner)
+    close(jax.jit(jax.vmap(jax.grad(jax.checkpoint(value))))(inputs), inner)
+    unrolled = jax.grad(functools.partial(value, unrolled=True))
+    close(jax.jit(jax.vmap(unrolled))(inputs), inner)
+    one, first = (jax.tree.map(lambda x: x[0], tree) for tree in (inputs, inner))
+    close(jax.jit(gradient)(one), first)
+    rows = jax.jit(jax.jacrev(lambda x: readings(env)(x, 3)))(one)
+    sums = jax.jit(jax.grad(lambda x: readings(env)(x, 3).sum()))(one)
+    close(jax.tree.map(lambda x: x.sum(axis=0), rows), sums)
+
+
+RESET, TOTAL = 3, 6  # steps of an episode, and of two
+
+
+@pytest.mark.parametrize("name", _marked(["hopper_uni", "antmaze"], ("hopper_uni",)))
+def test_no_gradient_crosses_an_auto_reset(x64: None, name: str) -> None:
+    """Rewards of the second episode do not depend on actions of the first, exactly."""
+    env = newton_qd.create(name, episode_length=RESET, dtype="float64")
+    start = jax.jit(env.reset)(jax.random.key(0))
+    half = np.random.default_rng(0).uniform(-1, 1, (RESET, env.action_size))
+
+    def rewards(actions: jax.Array) -> jax.Array:
+        def advance(state: State, action: jax.Array) -> tuple[State, jax.Array]:
+            state = env.step(state, action)
+            return state, jnp.stack([state.reward, state.obs.sum()])
+
+        return jax.lax.scan(advance, start, actions)[1]
+
+    rows = np.asarray(jax.jit(jax.jacrev(rewards))(jnp.asarray(np.tile(half, (2, 1)))))
+    assert rows.shape == (TOTAL, 2, TOTAL, env.action_size)
+    assert not rows[RESET:, :, :RESET].any()
+    # the observation that an auto-reset returns is that of a reset
+    assert not rows[RESET - 1, 1].any() and not rows[-1, 1].any()
+    assert all(rows[step, 0, step].any() for step in range(TOTAL))
+    np.testing.assert_array_equal(rows[RESET:, :, RESET:], rows[:RESET, :, :RESET])
+
+
+STEPS = 4  # of the chain of tapes
+
+
+def taped(system: System, x: np.ndarray, y_bar: np.ndarray) -> np.ndarray:
+    """Adjoints of the inputs (n, inputs) of a step, as Warp's own tape finds them."""
+    device = wp.get_device("cpu")
+    packs = -(-len(x) // pack_width(system.dtype, device))
+    model = buffers.build_model(system, device)
+    scratch = buffers.build_scratch(system, packs, device, adjoint=True)
+    rows = [wp.array(a.ravel(), dtype=wp.float64, device=device) for a in (x, y_bar)]
+    x_bar = wp.zeros(x.size, dtype=wp.float64, device=device)
+    held = (scratch.values, scratch.adjoints)
+    with wp.Tape() as tape:
+        wp.launch(
+            buffers.kernels_of(system, device).backward.step_backward,
+            dim=packs,
+            inputs=[model, 0, 1, len(x), 1, *held, *rows, x_bar],
+            device=device,
+            block_dim=1,
+        )
+    tape.backward()
+    return x_bar.numpy().reshape(x.shape)
+
+
+def size_of(system: System) -> int:
+    """Numbers of a state."""
+    return system.nq + system.nv
+
+
+def chained(system: System, x: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Adjoints of the inputs of four steps whose outputs are weighted, by tapes."""
+    state, rows = size_of(system), [x]
+    y = wp.zeros(len(x) * output_size(system), dtype=wp.float64, device="cpu")
+    launcher = bridge.launcher(system, wp.get_device("cpu"))
+    for _ in range(STEPS - 1):
+        launcher.forward(len(x), wp.array(rows[-1].ravel(), device="cpu"), y)
+        after = y.numpy().reshape(len(x), -1)[:, :state]
+        rows.append(np.concatenate([after, x[:, state:]], axis=1))
+    total = np.zeros_like(x)
+    for row in reversed(rows):
+        y_bar = np.zeros((len(x), output_size(system)))
+        y_bar[:, : len(weights)] = weights
+        y_bar[:, :state] += total[:, :state]
+        x_bar = taped(system, row, y_bar)
+        total = np.concatenate(
+            [x_bar[:, :state], x_bar[:, state:] + total[:, state:]], 1
+        )
+    return total
+
+
+@pytest.mark.parametrize("robot", [ANT, HALFCHEETAH], ids=lambda robot: robot.name)
+def test_the_bridge_agrees_with_a_tape(x64: None, device: Any, robot: Robot) -> None:
+    """Four control steps: the chain of Warp's tapes is ``jax.grad``, to 1e-6."""
+    if device.platform != "cpu":
+        pytest.skip("the tape is launched on a CPU")
+    system = physics.load_system(robot, "float64")
+    inputs = random_states(system, np.random.default_rng(0), 6)
+    weights = np.random.default_rng(1).normal(size=size_of(system) + 7 * system.nb)
+    kept = jnp.asarray(weights)
+
+    def value(q: jax.Array, v: jax.Array, control: jax.Array) -> jax.Array:
+        def advance(state: Any, _: None) -> tuple[Any, jax.Array]:
+            state, _fault = physics.step(system, state, control)
+            parts = (state.q, state.v, state.impulse.ravel(), state.normal_impulse)
+            return state, kept @ jnp.concatenate(parts)
+
+        start = physics.initial_state(system, q, v)
+        return jax.lax.scan(advance, start, None, length=STEPS)[1].sum()
+
+    expected = jax.jit(jax.vmap(jax.grad(value, argnums=(0, 1, 2))))(*inputs)
+    expected = np.concatenate(expected, axis=1)
+    found = chained(system, np.concatenate(inputs, axis=1), weights)
+    error = norms(found - expected) / norms(expected)
+    report("largest relative difference", error.max())
+    assert error.max() < 1e-6

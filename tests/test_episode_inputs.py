@@ -1,0 +1,129 @@
+"""Episodes from a given state and with given parameters, and their gradients."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from contract import same
+from physics_helpers import report
+from test_episode_gradients import Line, make
+
+from newton_qd import physics
+from newton_qd.envs.state import State
+from newton_qd.extractors import get_feet_contact_proportion
+from newton_qd.gradients import (
+    GradientOptions,
+    make_episode,
+    make_episode_gradient,
+    with_smooth_descriptor,
+)
+
+STEPS, KEY = 16, jax.random.key(3)
+
+
+@functools.cache
+def hopping(dtype: str = "float64") -> Any:
+    """A hopper, its episode under a plan, jitted too, and a plan."""
+    # wide: friction hardly changes the load of the foot
+    env = with_smooth_descriptor(make("hopper_uni", dtype), 1.0)
+    episode = make_episode(env, None, get_feet_contact_proportion, episode_length=STEPS)
+    plan = np.random.default_rng(0).uniform(-0.5, 0.5, (STEPS, env.action_size))
+    return env, episode, jax.jit(episode), plan.astype(env.dtype)
+
+
+def test_a_state_and_its_key_begin_the_same_episode() -> None:
+    env, _, episode, plan = hopping("float32")
+    start = jax.jit(env.reset)(KEY)
+    assert same(episode(plan, start), episode(plan, KEY))
+    assert same(episode(plan, KEY, env.default_params), episode(plan, KEY))
+    # further on, what is left of an episode
+    later = jax.jit(env.step)(start, plan[0])
+    rest = make_episode(env, None, None, episode_length=STEPS - 1)
+    whole = episode(plan, KEY).fitness
+    part = jax.jit(rest)(plan[1:], later).fitness
+    assert later.reward + part == pytest.approx(float(whole), rel=1e-6)
+
+
+def test_gradients_to_first_state_and_parameters(x64: None) -> None:
+    """Of fitness and descriptor, along a random direction of each: below 1e-6."""
+    env, episode, _, plan = hopping()
+    first = jax.jit(env.reset)(KEY)
+    # on the ground, and sliding
+    seen = first.pipeline_state
+    where = {"q": seen.q.at[1].add(-0.02), "v": seen.v.at[0].add(1.0)}
+    given = {**where, **vars(env.default_params)}
+
+    def values(given: dict[str, jax.Array]) -> jax.Array:
+        params = {k: x for k, x in given.items() if k not in where}
+        start = physics.initial_state(env.system, given["q"], given["v"])
+        state = first.replace(pipeline_state=start)
+        outcome = episode(plan, state, physics.PhysicsParams(**params))
+        return jnp.append(outcome.fitness, outcome.descriptor)
+
+    jacobian = jax.jit(jax.jacrev(values))(given)
+    value, rng = jax.jit(values), np.random.default_rng(1)
+    for name, x in given.items():
+        direction = rng.normal(size=x.shape)
+        rows = np.asarray(jacobian[name]).reshape(2, -1)
+        assert rows.any(axis=1).all(), name
+        size = np.linalg.norm(rows, axis=1) * np.linalg.norm(direction)
+        errors = []
+        # what moves the hopper little needs a distance that its rounding does not see
+        for distance in (1e-6, 1e-4):
+            ahead, behind = (
+                value({**given, name: x + sign * distance * direction})
+                for sign in (1, -1)
+            )
+            difference = np.asarray(ahead - behind) / (2 * distance)
+            errors.append(np.abs(rows @ direction.ravel() - difference) / size)
+        error = np.minimum(*errors)
+        report(f"largest relative error, {name}", error.max())
+        assert error.max() < 1e-6, name
+
+
+def test_worlds_share_launches_with_parameters_of_their_own() -> None:
+    env, _, _, plan = hopping("float32")
+    episode = make_episode(env, None, None, episode_length=STEPS)
+    default = env.default_params
+    friction = jnp.array([0.2, 1.0], jnp.float32)
+    several = jax.vmap(
+        lambda f: episode(plan, KEY, default.replace(friction=f)).fitness
+    )
+    found = jax.jit(several)(friction)
+    assert found[0] != found[1]
+    alone = jax.jit(episode)(plan, KEY, default.replace(friction=friction[0]))
+    assert found[0] == alone.fitness
+
+
+def on_line(options: GradientOptions | None) -> jax.Array:
+    """Gradient of the return of eight steps to where they begin."""
+    episode = make_episode(Line(1.1), None, None, episode_length=8, options=options)
+    first = Line(1.1).reset(KEY)
+
+    def fitness(x: jax.Array) -> jax.Array:
+        state: State = first.replace(pipeline_state=x)
+        return episode(jnp.zeros((8, 1), jnp.float32), state).fitness
+
+    return jax.jit(jax.grad(fitness))(jnp.ones((1,), jnp.float32))[0]
+
+
+def test_the_first_window_reaches_the_first_state() -> None:
+    powers = 1.1 ** np.arange(1, 9)
+    assert on_line(None) == pytest.approx(powers.sum(), rel=1e-5)
+    window = GradientOptions(window=3)
+    assert on_line(window) == pytest.approx(powers[:3].sum(), rel=1e-5)
+    discounted = GradientOptions(discount=0.5)
+    expected = 1.1 * ((0.5 * 1.1) ** np.arange(8)).sum()
+    assert on_line(discounted) == pytest.approx(expected, rel=1e-5)
+
+
+def test_no_descriptor() -> None:
+    gradient = make_episode_gradient(Line(1.0), None, None, episode_length=4)
+    result = jax.jit(gradient)(jnp.zeros((2, 4, 1), jnp.float32), KEY)
+    assert result.descriptors.shape == (2, 0)
+    np.testing.assert_array_equal(result.gradients[:, 0, :, 0], [[4, 3, 2, 1]] * 2)
