@@ -161,7 +161,7 @@ ROWS: dict[str, EnvironmentRow] = {
         Ant, "ant", (39.53, 40.32), ((-5.0, -5.0), (40.0, 40.0)), MazeWrapper
     ),
     "halfcheetah": EnvironmentRow(HalfCheetah, "halfcheetah"),
-    "halfcheetah_uni": _uni(HalfCheetah, "halfcheetah", (5.96, 9.231)),
+    "halfcheetah_uni": _uni(HalfCheetah, "halfcheetah", (7.59, 9.231)),
     "hopper": EnvironmentRow(Hopper, "hopper"),
     "hopper_uni": _uni(Hopper, "hopper", (0.9, 0.9)),
     "humanoid": EnvironmentRow(Humanoid, "humanoid"),
