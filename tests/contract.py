@@ -26,10 +26,15 @@ NAMES = [
 ]
 # One of each kind; the others share their code with these and run with the slow tests.
 _QUICK = {"ant_uni", "antmaze", "hopper_uni", "humanoid_uni", "pointmaze"}
-EVERY_NAME = [
-    pytest.param(name, marks=() if name in _QUICK else pytest.mark.slow)
-    for name in NAMES
-]
+
+
+def named(name: str, *others: Any) -> Any:
+    """A case of a task, slow where another one of its kind is not."""
+    marks = () if name in _QUICK else pytest.mark.slow
+    return pytest.param(name, *others, marks=marks)
+
+
+EVERY_NAME = [named(name) for name in NAMES]
 STACKS: dict[str, dict[str, Any]] = {
     "default": {},
     "bare": {"episode_length": None, "auto_reset": False},

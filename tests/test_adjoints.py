@@ -49,7 +49,7 @@ def _marked(names: Any, quick: tuple[str, ...]) -> list[Any]:
     return [pytest.param(n, marks=() if n in quick else slow) for n in names]
 
 
-EVERY = _marked(_robots(), ("hopper_uni", "anttrap"))
+EVERY = _marked(_robots(), ("hopper_uni",))
 # of each robot the task that came last, with its wrappers
 EACH_ROBOT = _marked(
     {urdf: n for n, urdf in _robots().items()}.values(), ("hopper_uni",)

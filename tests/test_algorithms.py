@@ -155,6 +155,7 @@ def test_options_out_of_range_are_refused(
         run(SMALL.replace(algorithm=name, options=options))
 
 
+@pytest.mark.slow
 def test_initial_weights_are_scaled() -> None:
     def norm(options: dict[str, Any]) -> float:
         config = SMALL.replace(algorithm="me-gradient", iterations=0, options=options)
@@ -164,7 +165,9 @@ def test_initial_weights_are_scaled() -> None:
     assert norm({"initial_scale": 0.01}) < 0.1 < norm({})
 
 
-@pytest.mark.parametrize("name", ["me-gradient", "cma-mega"])
+@pytest.mark.parametrize(
+    "name", ["me-gradient", pytest.param("cma-mega", marks=pytest.mark.slow)]
+)
 def test_faulty_individuals_are_counted(name: str) -> None:
     """``PointEnv`` is faulty far right; gradients do not lead out of the archive."""
     config = SMALL.replace(

@@ -83,6 +83,7 @@ def test_thresholds_and_elites(size: int, x64: None) -> None:
     assert np.any(best > fitnesses), "the annealed archive has forgotten nothing"
 
 
+@pytest.mark.slow
 def test_agrees_with_pyribs(x64: None) -> None:
     pytest.importorskip("ribs")
     from ribs.archives import GridArchive

@@ -112,6 +112,7 @@ def fail_at(patch: pytest.MonkeyPatch, moment: int) -> None:
     patch.setattr(checkpoint_module.os, "fsync", full)
 
 
+@pytest.mark.slow
 def test_a_full_disk_loses_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

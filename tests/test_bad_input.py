@@ -14,6 +14,7 @@ from contract import (
     coordinates,
     gradient,
     make,
+    named,
     random_actions,
     reset,
     rollout,
@@ -39,7 +40,7 @@ def spoil(state: State, actions: jax.Array, kind: str) -> tuple[State, jax.Array
 
 
 KINDS = [
-    (name, kind)
+    named(name, kind)
     for name in NAMES
     for kind in ("nan", "inf", "huge", "state")
     # actions of the maze are clipped: a huge one is sound

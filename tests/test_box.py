@@ -226,6 +226,7 @@ def test_step_is_smooth(
     assert min(orders) > 1.9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("steps", "bound"), [(1, 1e-6), (8, 1e-4)])
 def test_directional_derivatives(
     x64: None, tmp_path: Path, steps: int, bound: float

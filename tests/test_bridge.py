@@ -224,6 +224,7 @@ def test_wrong_precision(x64: None) -> None:
         physics.step(SYSTEM, start(), jnp.zeros(8, jnp.float64))
 
 
+@pytest.mark.slow
 def test_shards_of_a_batch(tmp_path: Path, device: jax.Device) -> None:
     """Two devices of one process: the same values as one, gradients included."""
     if device.platform != "cpu":

@@ -79,12 +79,14 @@ def test_default_folder_and_resume(
     assert {entry.name: entry.read_bytes() for entry in out.iterdir()} == before
 
 
+@pytest.mark.slow
 def test_resume_starts_a_run_that_was_killed_too_early(tmp_path: Path) -> None:
     out = tmp_path / "run"
     assert call(*POINT, "--resume", "--out", out) == cli.OK
     assert (out / "archive.npz").exists()
 
 
+@pytest.mark.slow
 def test_a_signal_before_the_first_generation(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -151,6 +153,7 @@ def test_arguments_that_cannot_be_parsed(
     assert message in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_damaged_checkpoint_is_a_failure(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

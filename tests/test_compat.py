@@ -130,6 +130,7 @@ def setup(name: str, batch: int = 16, episode_length: int = 24) -> Setup:
     return Setup(env, policy, score, params, name, episode_length)
 
 
+@pytest.mark.slow
 def test_a_policy_scores_the_same_in_every_batch() -> None:
     task = setup("pointmaze")
     fitnesses, descriptors, extra = task.score(task.params, jax.random.key(2))
@@ -154,6 +155,7 @@ def test_mask_begins_after_the_end() -> None:
     )
 
 
+@pytest.mark.slow
 def test_functions_of_older_scripts_have_the_signatures_of_their_time() -> None:
     environments: Any = importlib.import_module("qdax.environments")
     tasks: Any = importlib.import_module("qdax.tasks.brax_envs")

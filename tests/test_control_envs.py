@@ -40,6 +40,11 @@ NAMES = (
     "swimmer",
 )
 REACHERS = ("reacher", "reacherangle")
+# One with and one without a drawn target; the others run with the slow tests.
+EVERY_NAME = [
+    pytest.param(n, marks=() if n in ("reacher", "swimmer") else pytest.mark.slow)
+    for n in NAMES
+]
 
 
 def wrap(angle: np.ndarray) -> np.ndarray:
@@ -233,7 +238,7 @@ def test_standing_up_starts_at_rest_on_the_back() -> None:
     assert np.any(path.impulse[-1] != 0)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", EVERY_NAME)
 def test_a_world_does_not_depend_on_its_batch(name: str) -> None:
     env = make(name)
     state, actions = thrown(env, 16)

@@ -46,6 +46,7 @@ def diagnose(env: Any, **options: Any) -> GradientReport:
     return diagnose_gradients(env, horizons=HORIZONS, worlds=4, **options)
 
 
+@pytest.mark.slow
 def test_a_tame_system_is_usable_throughout(tmp_path: Path) -> None:
     report = diagnose(Growing(0.5))
     assert report.exact_horizon == report.useful_horizon == 16

@@ -261,6 +261,7 @@ def test_unknown_options_are_refused(make: Callable[..., Humanoid]) -> None:
         make(ctrl_weight=1.0)
 
 
+@pytest.mark.slow
 def test_a_world_at_fault_observes_no_torque() -> None:
     state = HUMANOID_ENV.fixed_state()
     bad = jnp.full(17, 0.5, np.float32).at[3].set(jnp.nan)

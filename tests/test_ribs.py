@@ -79,6 +79,7 @@ def test_faulty_individuals_have_the_worst_objective() -> None:
         make_ribs_evaluation(score, key, limits=LIMITS, worst=-np.inf)
 
 
+@pytest.mark.slow
 def test_gradients_reach_the_scheduler() -> None:
     from ribs.archives import GridArchive
     from ribs.emitters import GradientArborescenceEmitter
