@@ -266,7 +266,7 @@ class Search:
         """Archive, emitter's state and metrics after the initial population."""
         repertoire, told = self._added(repertoire, genotypes, scores)
         emitter = self._emitter.init(key=self._key_emitter, **told)
-        return repertoire, emitter, self._measured(repertoire, scores)
+        return repertoire, _strongly_typed(emitter), self._measured(repertoire, scores)
 
     def _told(
         self,
@@ -307,6 +307,18 @@ class Search:
         finite = jnp.isfinite(fitnesses) & jnp.all(jnp.isfinite(found), axis=1)
         metrics = default_qd_metrics(repertoire, qd_offset=offset)
         return {**metrics, "rejected": jnp.sum(~finite)}
+
+
+def _strongly_typed(tree: Any) -> Any:
+    """Takes weak types off; those of the next generation differ, and compile again."""
+
+    def strong(leaf: Any) -> jax.Array:
+        leaf = jnp.asarray(leaf)
+        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            return leaf
+        return jax.lax.convert_element_type(leaf, leaf.dtype)
+
+    return jax.tree.map(strong, tree)
 
 
 def _leaf_to_host(leaf: Any) -> np.ndarray:
