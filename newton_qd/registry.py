@@ -146,8 +146,7 @@ def create(
         fixed_init_state: Whether a reset is free of noise.
         qdax_wrappers_kwargs: Keyword arguments for each of the environment's own
             wrappers, replacing those of the registry.
-        material: Softness of contacts and joint limits; ``None``: that of the robot's
-            row, ``env.unwrapped.robot.material``.
+        material: Softness of contacts and limits; ``None``: that of the robot's row.
         **kwargs: To the environment inside, as ``dtype`` or ``ctrl_cost_weight``.
 
     Returns:
