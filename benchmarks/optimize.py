@@ -6,8 +6,9 @@
 
 Three problems of 250 control steps: a plan of actions for one hopper, whose gradient is
 windowed, and policies for ants and halfcheetahs, by a short-horizon actor-critic. The
-strategy is one of evosax (``benchmarks/optimize-requirements.txt``), the best of those
-that ``--screen`` tries, on seeds of its own.
+strategy is one of evosax (``benchmarks/optimize-requirements.txt``), which ``CHOSEN``
+names. It shall be the best of those that ``--screen`` tries, on seeds of its own; the
+screening has not been run yet, and the first candidate stands there.
 
 The two methods take turns in one process, a slice of the budget each, so that what else
 the machine does slows both down; on one that is busy, ``--clock processor`` counts the
@@ -118,7 +119,7 @@ CHOSEN: dict[str, int] = {"hopper": 0, "ant": 0, "halfcheetah": 0}
 
 
 def evolution_method(problem: Problem) -> Method:
-    """The evolution strategy that did best in the screening."""
+    """The evolution strategy that takes part in the comparison."""
     return list(candidates(problem).values())[CHOSEN[problem.name]]
 
 
