@@ -266,7 +266,7 @@ def _episode_row(state_desc: jax.Array, mask: jax.Array) -> jax.Array:
 def episode_proportion(state_desc: jax.Array, mask: jax.Array) -> jax.Array:
     """Proportion of the valid steps of one episode; under ``vmap`` one launch.
 
-    Bitwise :func:`newton_qd.extractors.get_feet_contact_proportion`.
+    On a CPU bitwise :func:`newton_qd.extractors.get_feet_contact_proportion`.
 
     Args:
         state_desc: (t, nd) state descriptors before each step.
@@ -285,7 +285,7 @@ def episode_proportion(state_desc: jax.Array, mask: jax.Array) -> jax.Array:
 def episode_final(state_desc: jax.Array, mask: jax.Array) -> jax.Array:
     """State descriptor before the last valid step; under ``vmap`` one launch.
 
-    Bitwise :func:`newton_qd.extractors.get_final_xy_position`.
+    On a CPU bitwise :func:`newton_qd.extractors.get_final_xy_position`.
 
     Args:
         state_desc: (t, nd) state descriptors before each step.
