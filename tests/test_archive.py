@@ -23,6 +23,7 @@ from test_evolve import (
 from newton_qd import cli
 from newton_qd.qd import checkpoint as checkpoint_module
 from newton_qd.qd.archive import Archive, ArchiveError, archive_bytes, load_archive
+from newton_qd.qd.checkpoint import CheckpointError, load_checkpoint
 from newton_qd.qd.config import read_config
 
 __all__ = ["compile_once", "reference"]  # fixtures
@@ -145,3 +146,11 @@ def test_a_read_only_folder_is_named(
     assert cli.main(arguments, task_factory=point_task) == cli.FAILED
     assert f"Read-only file system: '{out}/config.json'" in capsys.readouterr().err
     assert not list(out.iterdir())
+
+
+def test_a_checkpoint_of_another_version_is_refused(tmp_path: Path) -> None:
+    """Those with number 1 have a column less."""
+    path = tmp_path / "checkpoint.bin"
+    path.write_bytes(b"newton_qd checkpoint 1 0\n")
+    with pytest.raises(CheckpointError, match="not a checkpoint of this version"):
+        load_checkpoint(path)

@@ -159,7 +159,7 @@ def test_a_damaged_checkpoint_is_a_failure(
 ) -> None:
     out = tmp_path / "run"
     assert call(*POINT, "--out", out) == cli.OK
-    (out / "checkpoint.bin").write_bytes(b"newton_qd checkpoint 1 0\n")
+    (out / "checkpoint.bin").write_bytes(b"newton_qd checkpoint 2 0\n")
     assert call("evolve", "--resume", "--quiet", "--out", out) == cli.FAILED
     assert "checkpoint.bin is damaged" in capsys.readouterr().err
 

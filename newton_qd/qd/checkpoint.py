@@ -15,7 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-_MAGIC = b"newton_qd checkpoint 1 "
+# The number changes with what a checkpoint holds, columns of the metrics included.
+_MAGIC = b"newton_qd checkpoint 2 "
 
 
 class CheckpointError(RuntimeError):
