@@ -280,7 +280,9 @@ class Search:
         repertoire, told = self._added(repertoire, genotypes, scores)
         told["extra_scores"] = {**told["extra_scores"], **remembered}
         emitter = self._emitter.state_update(emitter, **told)
-        return repertoire, emitter, self._measured(repertoire, scores)
+        metrics = self._measured(repertoire, scores)
+        metrics["rejected"] += jnp.sum(remembered.get("overflowed", 0))
+        return repertoire, emitter, metrics
 
     def _added(self, repertoire: Any, genotypes: Any, scores: Any) -> tuple[Any, dict]:
         """The archive with a generation in it, and what the emitter hears of that."""
@@ -299,7 +301,7 @@ class Search:
         }
 
     def _measured(self, repertoire: Any, scores: Any) -> Any:
-        """QD score, coverage [%], best fitness and what a generation had rejected."""
+        """QD score, coverage [%], best fitness and individuals that were rejected."""
         from qdax.utils.metrics import default_qd_metrics
 
         offset = self._task.reward_offset * self._config.episode_length

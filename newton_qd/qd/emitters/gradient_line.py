@@ -82,8 +82,8 @@ class GradientLineEmitter(Emitter):
         """Draws parents and follows one gradient of each.
 
         Returns:
-            (parents * branches, size) offspring and an empty dictionary. Where a
-            gradient is zero or not finite, the direction is random.
+            (parents * branches, size) offspring, and which gradients ``overflowed``,
+            (parents,). Where a gradient is zero or not finite, the direction is random.
         """
         del emitter_state
         climb_key, target_key, step_key, way_key, score_key = jax.random.split(key, 5)
@@ -103,7 +103,8 @@ class GradientLineEmitter(Emitter):
         units = _units(found.gradients[:, 0], way_key)
         steps = self._draw(step_key, genotypes.dtype)
         offspring = genotypes[:, None] + steps[..., None] * units[:, None]
-        return offspring.reshape(-1, offspring.shape[-1]), {}
+        lost = found.overflowed[:, 0] | found.faulty
+        return offspring.reshape(-1, offspring.shape[-1]), {"overflowed": lost}
 
     def _draw(self, key: jax.Array, dtype: Any) -> jax.Array:
         """(parents, branches) lengths of steps."""
