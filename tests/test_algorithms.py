@@ -16,6 +16,7 @@ from newton_qd import cli
 from newton_qd.qd.algorithms import ALGORITHMS
 from newton_qd.qd.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
 from newton_qd.qd.config import ConfigError, EvolveConfig, read_config
+from newton_qd.qd.emitters import GradientLineEmitter
 from newton_qd.qd.evolve import evolve
 from newton_qd.qd.search import Search
 
@@ -38,6 +39,10 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "dcrl-me": CRITIC,
     "me-es": {"num_optimizer_steps": 2, "sample_sigma": 0.1, "learning_rate": 0.1},
     "me-gradient": {},
+    "me-actor-critic": {
+        **{"actors": 2, "branches": 1, "copies": 4, "updates": 1, "lifetime": 3},
+        **{"worlds": 2, "window": 4, "batches": 2, "critic": (8,)},
+    },
     "omg-mega": {},
     "cma-mega": {"points": 2},
     "cma-maega": {"points": 2, "adam": 0.05},
@@ -99,9 +104,10 @@ def test_a_stop_changes_nothing(
     metrics = whole.metrics
     for column in ("qd_score", "coverage", "max_fitness"):
         assert metrics[column][-1] > metrics[column][0], column
-    # What is differentiated counts, too: two parents, two solution points.
-    more = {"me-es": 1, "me-gradient": 2, "cma-mega": 2, "cma-maega": 2}
-    each = 16 + more.get(name, 0)
+    # What is differentiated counts, too: two parents, two solution points, the
+    # sixteen control steps of two actors.
+    more = {"me-gradient": 2, "me-actor-critic": 1, "cma-mega": 2, "cma-maega": 2}
+    each = 16 + {"me-es": 1, **more}.get(name, 0)
     np.testing.assert_array_equal(np.diff(metrics["evaluations"]), each)
     assert not metrics["rejected"].any()
 
@@ -141,6 +147,14 @@ def test_shares_of_a_batch_that_do_not_fit_are_refused() -> None:
         ("me-gradient", {"branches": 0}, "branches must be at least 1, got 0"),
         ("me-gradient", {"branches": 9}, "holds no parent with branches = 9"),
         ("me-gradient", {"shortest": 3.0}, "0 < shortest <= longest, got shortest"),
+        ("me-actor-critic", {"worlds": 0}, "worlds must be at least 1, got 0"),
+        (
+            "me-actor-critic",
+            {"discount": 1.0},
+            r"discount must be in \[0, 1\), got 1.0",
+        ),
+        ("me-actor-critic", {"steered": 2.0}, r"steered must be in \[0, 1\], got 2.0"),
+        ("me-actor-critic", {}, "copies = 8 are more than batch_size = 16"),
         ("omg-mega", {"sigma_g": -1.0}, "sigma_g must be positive, got -1.0"),
         ("omg-mega", {"window": -1}, "window=-1: allowed: None, integers from 1"),
         ("cma-mega", {"points": 3}, "points must divide batch_size = 16, got 3"),
@@ -182,6 +196,19 @@ def test_faulty_individuals_are_counted(name: str) -> None:
     archive = result.archive
     assert np.isfinite(archive.genotypes).all()
     assert np.isfinite(archive.fitnesses[archive.filled]).all()
+
+
+def test_lost_gradients_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    emit = GradientLineEmitter.emit
+
+    def lossy(self: Any, *given: Any) -> Any:
+        offspring, told = emit(self, *given)
+        return offspring, {"overflowed": ~told["overflowed"]}
+
+    monkeypatch.setattr(GradientLineEmitter, "emit", lossy)
+    metrics = run(SMALL.replace(algorithm="me-gradient", iterations=2)).metrics
+    # of two parents, in every generation but the first
+    np.testing.assert_array_equal(metrics["rejected"], [0, 2, 2])
 
 
 @pytest.mark.slow

@@ -106,7 +106,8 @@ def _add_setting_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--algorithm",
         metavar="NAME",
-        help="me, cma-me, pga-me, dcrl-me, me-es, or, with gradients, me-gradient, "
+        help="me, cma-me, pga-me, dcrl-me, me-es, or, with gradients, "
+        "me-gradient, me-actor-critic, "
         f"omg-mega, cma-mega or cma-maega (default: {_DEFAULTS.algorithm})",
     )
     group.add_argument(

@@ -11,6 +11,7 @@ from newton_qd.gradients.exact import make_directional_gradient, make_episode_gr
 from newton_qd.gradients.flow import GradientOptions
 from newton_qd.gradients.mixed import make_mixed_gradient
 from newton_qd.gradients.smooth import with_smooth_descriptor
+from newton_qd.qd.actor_critic import ActorCritic, ActorCriticSettings, measure_of
 from newton_qd.qd.config import ConfigError, EvolveConfig
 from newton_qd.qd.gradient_scoring import make_gradient_scoring_function
 from newton_qd.qd.parts import Algorithm, Parts, isoline_emitter, settings
@@ -94,15 +95,20 @@ class MixedOptions(FlowOptions):
         return 2 * self.samples or 1
 
 
+def _tuned(kind: Any, config: EvolveConfig) -> Any:
+    """Options of a run, with the defaults of its environment."""
+    names = {field.name for field in dataclasses.fields(kind)}
+    tuned = TUNED.get(config.env_name, {}).items()
+    return settings(kind, config, **{k: v for k, v in tuned if k in names})
+
+
 def _options(kind: Any, config: EvolveConfig) -> Any:
-    """Options of a run, with the defaults of its environment.
+    """Options of a run that differentiates whole episodes, checked.
 
     Raises:
         ConfigError: There is no option of this name, or its value is not allowed.
     """
-    names = {field.name for field in dataclasses.fields(kind)}
-    tuned = TUNED.get(config.env_name, {}).items()
-    options = settings(kind, config, **{k: v for k, v in tuned if k in names})
+    options = _tuned(kind, config)
     try:
         options.flow()
     except (TypeError, ValueError) as error:
@@ -110,7 +116,7 @@ def _options(kind: Any, config: EvolveConfig) -> Any:
     return options
 
 
-def _differentiable(task: Task, options: FlowOptions) -> Task:
+def _differentiable(task: Task, options: FlowOptions | ActorCriticOptions) -> Task:
     """The task with a descriptor of the same values that has a gradient."""
     env = with_smooth_descriptor(task.env, options.smooth_width, straight_through=True)
     return dataclasses.replace(task, env=env)
@@ -204,6 +210,87 @@ def _me_gradient(parts: Parts) -> Any:
 
 def _me_gradients(config: EvolveConfig) -> int:
     return _options(MEGradientOptions, config).parents(config)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ActorCriticOptions(ActorCriticSettings):
+    """Options of MAP-Elites with actors that learn by the gradient of the physics.
+
+    Attributes:
+        actors: Number of actors.
+        branches: Times in a generation that actors have offspring.
+        copies: Offspring of an actor then; the rest of the generation are iso+line
+            variations.
+        updates: Updates of an actor between two of these times.
+        steered: Share of the actors that follow directions of the descriptor [-].
+        fitness: Weight of the reward of these [-].
+        lifetime: Generations after which these begin again.
+        smooth_width: As in ``FlowOptions``.
+        initial_scale: As in ``FlowOptions``.
+    """
+
+    actors: int = 2
+    branches: int = 2
+    copies: int = 8
+    updates: int = 1
+    steered: float = 0.5
+    fitness: float = 0.1
+    lifetime: int = 10
+    smooth_width: float = 0.1
+    initial_scale: float = 1.0
+
+    def episodes(self, config: EvolveConfig) -> int:
+        """Episodes that the control steps of a generation's updates amount to."""
+        updates = self.actors * self.branches * self.updates
+        return -(-updates * self.worlds * self.window // config.episode_length)
+
+
+def _me_actor_critic(parts: Parts) -> Any:
+    """MAP-Elites with the policies of actors that learn over short horizons."""
+    from qdax.core.emitters.multi_emitter import MultiEmitter
+
+    from newton_qd.qd.emitters.actor_critic import ActorCriticEmitter
+
+    config, policy = parts.config, parts.policy
+    options = _tuned(ActorCriticOptions, config)
+    task = _differentiable(parts.task, options)
+    method = ActorCritic(
+        task.env,
+        lambda weights, obs: policy.apply(policy.unravel(weights), obs),
+        measure_of(task),
+        config.episode_length,
+        options,
+    )
+    emitter = ActorCriticEmitter(
+        method,
+        task.env.reset(parts.reset_key),
+        actors=options.actors,
+        branches=options.branches,
+        copies=options.copies,
+        updates=options.updates,
+        steered=options.steered,
+        fitness=options.fitness,
+        lifetime=options.lifetime,
+        measures=task.descriptor_length,
+    )
+    rest = config.batch_size - emitter.batch_size
+    if rest < 0:
+        raise ConfigError(
+            f"options: actors = {options.actors} times branches = {options.branches} "
+            f"times copies = {options.copies} are more than batch_size = "
+            f"{config.batch_size}"
+        )
+    if not rest:
+        return emitter
+    return MultiEmitter((emitter, isoline_emitter(config, rest)))
+
+
+def _actor_critic_episodes(config: EvolveConfig) -> int:
+    return _tuned(ActorCriticOptions, config).episodes(config)
+
+
+def _actor_critic_scale(config: EvolveConfig) -> float:
+    return _tuned(ActorCriticOptions, config).initial_scale
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -358,6 +445,12 @@ GRADIENT_ALGORITHMS: Mapping[str, Algorithm] = {
         evaluations=lambda config: config.batch_size + _me_gradients(config),
         gradients=_me_gradients,
         initial_scale=functools.partial(_scale, MEGradientOptions),
+    ),
+    "me-actor-critic": Algorithm(
+        _checked(_me_actor_critic),
+        evaluations=lambda config: config.batch_size + _actor_critic_episodes(config),
+        gradients=_actor_critic_episodes,
+        initial_scale=_actor_critic_scale,
     ),
     "omg-mega": Algorithm(
         _checked(_omg_mega),

@@ -1,5 +1,6 @@
 """Emitters that are fed with exact gradients, as emitters of QDax.
 
+- ``ActorCriticEmitter``: the policies of actors that learn over short horizons
 - ``OMGMEGAEmitter``: random steps along the gradients of elites
 - ``CMAMEGAEmitter``: CMA-ES searches for the steps along the gradients of a solution
   point
@@ -8,9 +9,10 @@
 - ``GradientVariationEmitter``: elites climb their fitness, or move along descriptors
 - ``SteeringEmitter``: elites move towards empty cells
 
-``GradientLineEmitter`` evaluates its own gradients; all others read
-``extra_scores["gradients"]`` as ``gradients.py`` describes. All of them run under
-``jax.jit`` and ``jax.lax.scan``, and mix with QDax's emitters in its ``MultiEmitter``.
+``ActorCriticEmitter`` and ``GradientLineEmitter`` evaluate their own gradients; all
+others read ``extra_scores["gradients"]`` as ``gradients.py`` describes. All of them run
+under ``jax.jit`` and ``jax.lax.scan``, and mix with QDax's emitters in its
+``MultiEmitter``.
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 from newton_qd.qd.extras import require_extra
 
 if TYPE_CHECKING:
+    from newton_qd.qd.emitters.actor_critic import ActorCriticEmitter
     from newton_qd.qd.emitters.cma_maega import CMAMAEGAEmitter
     from newton_qd.qd.emitters.cma_mega import CMAMEGAEmitter
     from newton_qd.qd.emitters.gradient_line import GradientLineEmitter
@@ -31,6 +34,7 @@ if TYPE_CHECKING:
     from newton_qd.qd.emitters.steering import SteeringEmitter
 
 __all__ = [
+    "ActorCriticEmitter",
     "CMAMAEGAEmitter",
     "CMAMEGAEmitter",
     "GradientLineEmitter",
@@ -42,6 +46,7 @@ __all__ = [
 ]
 
 _HOME = {
+    "ActorCriticEmitter": "actor_critic",
     "CMAMAEGAEmitter": "cma_maega",
     "CMAMEGAEmitter": "cma_mega",
     "GradientLineEmitter": "gradient_line",

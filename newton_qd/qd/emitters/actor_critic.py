@@ -1,0 +1,248 @@
+"""Actors that learn while the archive grows, and hand it what they know."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from qdax.core.emitters.emitter import Emitter
+
+from newton_qd.envs.state import select
+from newton_qd.qd.actor_critic import ActorCritic, Learner
+from newton_qd.qd.emitters.cells import draw_cells
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class ActorCriticState:
+    """Actors between two generations.
+
+    Attributes:
+        learners: The actors, K in front of every leaf.
+        scale: Mean and deviation of observations, (no,) each.
+        snapshots: (branches, K, size) their weights on the way.
+        failed: (K,) updates of the generation whose gradient was not finite.
+        generation: () of the actors.
+        key: Of the next generation.
+    """
+
+    learners: Learner
+    scale: tuple[jax.Array, jax.Array]
+    snapshots: jax.Array
+    failed: jax.Array
+    generation: jax.Array
+    key: jax.Array
+
+
+class ActorCriticEmitter(Emitter):
+    r"""Emits the policies of actors that learn by the gradient of the physics.
+
+    As PGA-ME (Nilsson and Cully 2021) hands on the policy of its greedy actor, with
+    the actor-critic of short horizons (Xu et al. 2022) in the place of TD3, and with
+    several actors. Some climb the fitness. The others follow a direction u in
+    descriptor space, drawn uniformly from the sphere,
+
+    .. math:: \lambda r_t + u \cdot m_t,
+
+    with the measure :math:`m_t` that a control step adds to the descriptor, so that
+    they leave the archive in that direction; they begin again from a random elite, with
+    another direction, after a number of generations.
+
+    Of what an actor a is at some time of its learning, one individual is a copy. The
+    others lie between it and elites e,
+
+    .. math:: a + s (e - a) + \sigma \epsilon, \qquad s \sim U(0, 1),
+
+    with a standard deviation that is drawn evenly, in proportion, from a range.
+    """
+
+    def __init__(
+        self,
+        method: ActorCritic,
+        first: Any,
+        *,
+        actors: int,
+        branches: int,
+        copies: int = 1,
+        updates: int,
+        spread: tuple[float, float] = (0.005, 0.1),
+        steered: float = 0.5,
+        fitness: float = 0.1,
+        lifetime: int = 10,
+        measures: int,
+    ) -> None:
+        """Sets the actors and how much they learn.
+
+        Args:
+            method: How an actor learns.
+            first: State that every episode begins in.
+            actors: Number of actors.
+            branches: Times in a generation that actors have offspring.
+            copies: Offspring of an actor then.
+            updates: Updates of each actor between two of these times.
+            spread: Range of the standard deviation of the noise, in units of the
+                genotype.
+            steered: Share of the actors that follow directions of the descriptor [-].
+            fitness: Weight of the reward of these [-].
+            lifetime: Generations after which these begin again.
+            measures: Length of the descriptor.
+
+        Raises:
+            ValueError: A number is out of its range.
+        """
+        counts = {"actors": actors, "branches": branches, "copies": copies}
+        counts = {**counts, "updates": updates}
+        for name, value in {**counts, "lifetime": lifetime}.items():
+            if value < 1:
+                raise ValueError(f"{name} must be at least 1, got {value}")
+        if not 0 < spread[0] <= spread[1]:
+            raise ValueError(f"spread must be 0 < smallest <= largest, got {spread}")
+        if not 0 <= steered <= 1:
+            raise ValueError(f"steered must be in [0, 1], got {steered}")
+        self._method = method
+        self._first = first
+        self._actors = actors
+        self._branches = branches
+        self._copies = copies
+        self._spread = spread
+        self._updates = updates
+        self._steered = round(steered * actors)
+        self._fitness = fitness
+        self._lifetime = lifetime
+        self._measures = measures
+
+    @property
+    def batch_size(self) -> int:
+        """Individuals emitted in one generation."""
+        return self._actors * self._branches * self._copies
+
+    def init(
+        self,
+        key: jax.Array,
+        repertoire: Any,
+        genotypes: Any,
+        fitnesses: Any,
+        descriptors: Any,
+        extra_scores: Any,
+    ) -> Any:
+        """Begins from the best of the initial population, which it emits once more."""
+        del repertoire, descriptors, extra_scores
+        key, scale_key, aim_key, critic_key = jax.random.split(key, 4)
+        # the best several times over where there are more actors than individuals
+        order = jnp.resize(jnp.argsort(-fitnesses.reshape(-1)), (self._actors,))
+        weights = genotypes[order]
+        learners = self._begun(critic_key, weights, self._aims(aim_key))
+        return ActorCriticState(
+            learners=learners,
+            scale=self._method.scale(scale_key, self._worlds()),
+            snapshots=jnp.tile(weights, (self._branches, 1, 1)),
+            failed=jnp.zeros((self._actors,), jnp.int32),
+            generation=jnp.zeros((), jnp.int32),
+            key=key,
+        )
+
+    def emit(
+        self, repertoire: Any, emitter_state: Any, key: jax.Array
+    ) -> tuple[jax.Array, dict[str, Any]]:
+        """Draws individuals between actors and elites.
+
+        Returns:
+            (copies * branches * actors, size) weights, and how many gradients
+            ``overflowed``, (actors,).
+        """
+        snapshots = emitter_state.snapshots
+        actors = snapshots.reshape(-1, snapshots.shape[-1])
+        cell_key, part_key, size_key, noise_key = jax.random.split(key, 4)
+        filled = repertoire.fitnesses[:, 0] > -jnp.inf
+        shape = (self._copies - 1, len(actors))
+        cells = draw_cells(cell_key, filled, shape[0] * shape[1])
+        elites = repertoire.genotypes[cells].reshape(*shape, -1)
+        dtype = actors.dtype
+        part = jax.random.uniform(part_key, (*shape, 1), dtype)
+        smallest, largest = self._spread
+        sizes = jax.random.uniform(size_key, (*shape, 1), dtype)
+        sizes = smallest * (largest / smallest) ** sizes
+        noise = jax.random.normal(noise_key, elites.shape, dtype)
+        between = actors + part * (elites - actors) + sizes * noise
+        offspring = jnp.concatenate([actors, between.reshape(-1, actors.shape[-1])])
+        return offspring, {"overflowed": emitter_state.failed}
+
+    def state_update(
+        self,
+        emitter_state: Any,
+        repertoire: Any = None,
+        genotypes: Any = None,
+        fitnesses: Any = None,
+        descriptors: Any = None,
+        extra_scores: Any = None,
+    ) -> Any:
+        """Learns for one generation; actors that are due begin again before it."""
+        del genotypes, fitnesses, descriptors, extra_scores
+        state = emitter_state
+        key, renewal_key, learn_key = jax.random.split(state.key, 3)
+        learners = self._renewed(state, repertoire, renewal_key)
+        update = jax.vmap(self._method.update, in_axes=(0, None, 0))
+
+        def learn(carry: tuple, key: jax.Array) -> tuple[tuple, None]:
+            learners, failed = carry
+            keys = jax.random.split(key, self._actors)
+            learners, lost = update(learners, state.scale, keys)
+            return (learners, failed + lost), None
+
+        def branch(carry: tuple, key: jax.Array) -> tuple[tuple, jax.Array]:
+            keys = jax.random.split(key, self._updates)
+            carry, _ = jax.lax.scan(learn, carry, keys)
+            return carry, carry[0].weights
+
+        begin = (learners, jnp.zeros_like(state.failed))
+        keys = jax.random.split(learn_key, self._branches)
+        (learners, failed), snapshots = jax.lax.scan(branch, begin, keys)
+        return ActorCriticState(
+            learners, state.scale, snapshots, failed, state.generation + 1, key
+        )
+
+    def _worlds(self) -> Any:
+        """States that the worlds of an actor begin in."""
+        number = self._method.settings.worlds
+        return jax.tree.map(
+            lambda leaf: jnp.broadcast_to(leaf, (number, *jnp.shape(leaf))), self._first
+        )
+
+    def _begun(self, key: jax.Array, weights: jax.Array, aims: jax.Array) -> Learner:
+        """Actors (K, size) that have learned nothing yet."""
+        keys = jax.random.split(key, self._actors)
+        begin = jax.vmap(self._method.begin, in_axes=(0, 0, 0, None))
+        return begin(keys, weights, aims, self._worlds())
+
+    def _aims(self, key: jax.Array) -> jax.Array:
+        """(K, 1 + D) what the actors aim at: those that are steered come last."""
+        shape = (self._actors, self._measures)
+        ways = jax.random.normal(key, shape, jnp.float32)
+        ways = ways / jnp.linalg.norm(ways, axis=1, keepdims=True)
+        steered = jnp.arange(self._actors) >= self._actors - self._steered
+        return jnp.concatenate(
+            [
+                jnp.where(steered, jnp.float32(self._fitness), 1)[:, None],
+                jnp.where(steered[:, None], ways, 0),
+            ],
+            axis=1,
+        )
+
+    def _renewed(
+        self, state: ActorCriticState, repertoire: Any, key: jax.Array
+    ) -> Learner:
+        """The actors, of which those that are due begin again from elites."""
+        aim_key, cell_key, critic_key = jax.random.split(key, 3)
+        filled = repertoire.fitnesses[:, 0] > -jnp.inf
+        cells = draw_cells(cell_key, filled, self._actors)
+        weights = repertoire.genotypes[cells]
+        new = self._begun(critic_key, weights, self._aims(aim_key))
+        number = jnp.arange(self._actors)
+        # in turn, so that there are actors of all ages
+        turn = number * self._lifetime // max(self._actors, 1)
+        due = (state.generation + turn) % self._lifetime == 0
+        steered = number >= self._actors - self._steered
+        begun = state.generation > 0
+        return select(due & steered & begun, new, state.learners)

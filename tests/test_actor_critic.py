@@ -1,0 +1,245 @@
+"""Actors that learn over short horizons, on a point that is pushed about."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from qdax.core.containers.mapelites_repertoire import (
+    MapElitesRepertoire,
+    compute_euclidean_centroids,
+)
+from test_evolve import PointEnv, point_task
+
+import newton_qd
+from newton_qd.extractors import get_final_xy_position
+from newton_qd.qd.actor_critic import ActorCritic, ActorCriticSettings, measure_of
+from newton_qd.qd.emitters import ActorCriticEmitter
+
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
+
+# These programs run for milliseconds: they need no optimizer.
+compiled = functools.partial(
+    jax.jit, compiler_options={"xla_backend_optimization_level": 0}
+)
+SIZE, LENGTH = 6, 20
+SETTINGS = ActorCriticSettings(
+    worlds=4, window=5, rate=0.05, clip=1e6, noise=0.1, critic=(8,), batches=2
+)
+
+
+def policy(weights: jax.Array, obs: jax.Array) -> jax.Array:
+    return jnp.tanh(obs @ weights.reshape(3, 2))
+
+
+def reading(before: Any, after: Any) -> jax.Array:
+    del before
+    return after.pipeline_state
+
+
+def method(measure: Any = reading, **changes: Any) -> ActorCritic:
+    settings = dataclasses.replace(SETTINGS, **changes)
+    return ActorCritic(PointEnv(), policy, measure, LENGTH, settings)
+
+
+def learner(way: ActorCritic, aim: tuple[float, ...] = (1.0, 0.0, 0.0)) -> Any:
+    first = jax.vmap(PointEnv().reset)(jax.random.split(jax.random.key(0), 4))
+    return way.begin(jax.random.key(1), jnp.zeros(SIZE), jnp.array(aim), first)
+
+
+def learned(way: ActorCritic, aim: tuple[float, ...], updates: int = 60) -> Any:
+    start = learner(way, aim)
+    scale = compiled(way.scale)(jax.random.key(2), start.first)
+
+    def update(carry: Any, key: jax.Array) -> tuple[Any, jax.Array]:
+        return way.update(carry, scale, key)
+
+    keys = jax.random.split(jax.random.key(3), updates)
+    return compiled(lambda: jax.lax.scan(update, start, keys))()
+
+
+@compiled
+def play(weights: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return of an episode, and where it ends (2,)."""
+    env = PointEnv()
+
+    def step(state: Any, _: None) -> tuple[Any, jax.Array]:
+        state = env.step(state, policy(weights, state.obs))
+        return state, state.reward
+
+    state, rewards = jax.lax.scan(step, env.reset(jax.random.key(5)), length=LENGTH)
+    return rewards.sum(), state.pipeline_state
+
+
+def test_the_gradient_is_that_of_the_window() -> None:
+    """Against rewards, measures and the last value, added up step by step."""
+    way, aim = method(noise=0.0), jnp.array([1.0, 0.3, -0.2])
+    start = learner(way, (1.0, 0.3, -0.2))
+    scale = compiled(way.scale)(jax.random.key(2), start.first)
+    weights = 0.3 * jax.random.normal(jax.random.key(4), (SIZE,))
+    world = jax.tree.map(lambda x: x[0], start.first)
+    discount, env = SETTINGS.discount, PointEnv()
+
+    def by_hand(weights: jax.Array) -> jax.Array:
+        state, total = world, jnp.zeros(())
+        for step in range(SETTINGS.window):
+            state = env.step(state, policy(weights, state.obs))
+            gain = jnp.append(state.reward, state.pipeline_state) @ aim
+            total += discount**step * gain
+        value = way._value(start.target, scale, state.obs)
+        return total + discount**SETTINGS.window * value
+
+    def by_window(weights: jax.Array) -> jax.Array:
+        noise = jnp.zeros((SETTINGS.window, 2))
+        return way._window(weights, start, scale, world, world, noise)[0]
+
+    pair = compiled(by_window)(weights), compiled(by_hand)(weights)
+    np.testing.assert_allclose(*pair, rtol=1e-5)
+    expected = compiled(jax.grad(by_hand))(weights)
+    assert float(jnp.linalg.norm(expected)) > 0.1
+    np.testing.assert_allclose(
+        compiled(jax.grad(by_window))(weights), expected, rtol=1e-4, atol=1e-5
+    )
+
+
+def test_actors_reach_what_they_aim_at() -> None:
+    best, lost = learned(method(), (1.0, 0.0, 0.0))
+    assert not np.asarray(lost).any()
+    assert play(jnp.zeros(SIZE))[0] < 12 < 17 < play(best.weights)[0]
+    left, _ = learned(method(), (0.0, -1.0, 0.0), updates=20)
+    right, _ = learned(method(), (0.0, 1.0, 0.0), updates=20)
+    assert play(left.weights)[1][0] < -0.5 < 0.5 < play(right.weights)[1][0]
+
+
+def test_a_gradient_that_is_not_finite_changes_no_weights() -> None:
+    def half_broken(before: Any, after: Any) -> jax.Array:
+        del before
+        position = after.pipeline_state
+        return jnp.where(position > 0.2, jnp.nan, position)
+
+    way = method(half_broken)
+    after, lost = learned(way, (1.0, 1.0, 1.0), updates=30)
+    assert np.asarray(lost).any() and not np.asarray(lost).all()
+    for leaf in jax.tree.leaves(after):
+        assert np.isfinite(np.asarray(leaf, np.float64)).all()
+
+
+def test_measures_are_those_of_the_descriptor() -> None:
+    before, after = (
+        dataclasses.replace(
+            PointEnv().reset(jax.random.key(0)),
+            info={"state_descriptor": jnp.array(place)},
+        )
+        for place in ([1.0, 2.0], [1.5, 1.0])
+    )
+    task = point_task(None)  # pyright: ignore[reportArgumentType]
+    np.testing.assert_array_equal(measure_of(task)(before, after), [1.5, 1.0])
+    env = newton_qd.create("pointmaze")
+    task = dataclasses.replace(
+        task, env=env, descriptor_extractor=get_final_xy_position
+    )
+    velocity = np.array([0.5, -1.0]) / env.dt
+    np.testing.assert_allclose(measure_of(task)(before, after), velocity, rtol=1e-6)
+
+
+def emitter(measure: Any = reading, **changes: Any) -> ActorCriticEmitter:
+    given = {"actors": 3, "branches": 2, "copies": 4, "updates": 2, "lifetime": 2}
+    first = PointEnv().reset(jax.random.key(0))
+    options: Any = {**given, "steered": 0.7, "measures": 2, **changes}
+    return ActorCriticEmitter(method(measure), first, **options)
+
+
+def broken(before: Any, after: Any) -> jax.Array:
+    del before
+    return jnp.where(after.pipeline_state > -9, jnp.nan, 0)
+
+
+@functools.cache
+def parts(measure: Any = reading) -> tuple[ActorCriticEmitter, Any, Any, Any]:
+    """An emitter, and its compiled functions."""
+    made = emitter(measure)
+    return made, compiled(made.init), compiled(made.emit), compiled(made.state_update)
+
+
+def generations(number: int, measure: Any = reading) -> list[tuple[Any, Any, Any]]:
+    """State, individuals and what is told of them, of each generation."""
+    _, init, emit, update = parts(measure)
+    cells = compute_euclidean_centroids((4, 4), [-2.0, -2.0], [2.0, 2.0])
+    genotypes = 0.1 * jax.random.normal(jax.random.key(0), (16, SIZE), jnp.float32)
+    fitnesses, found = jax.vmap(play)(genotypes)
+    repertoire = MapElitesRepertoire.init(genotypes, fitnesses, found, cells, {})
+    state = init(jax.random.key(1), repertoire, genotypes, fitnesses, found, {})
+    rows = []
+    for generation in range(number):
+        offspring, told = emit(repertoire, state, jax.random.key(generation))
+        rows.append((state, offspring, told))
+        state = update(state, repertoire)
+    return rows
+
+
+def test_individuals_are_actors_and_what_lies_between_them_and_elites() -> None:
+    made, rows = parts()[0], generations(3)
+    for state, offspring, told in rows:
+        assert offspring.shape == (made.batch_size, SIZE) == (24, SIZE)
+        assert offspring.dtype == jnp.float32
+        snapshots = state.snapshots.reshape(-1, SIZE)
+        np.testing.assert_array_equal(offspring[:6], snapshots)
+        assert told["overflowed"].shape == (3,)
+    last = rows[-1][0]
+    np.testing.assert_array_equal(last.snapshots[-1], last.learners.weights)
+
+
+def test_steered_actors_begin_again() -> None:
+    aims = np.stack([state.learners.aim for state, *_ in generations(6)])
+    # one of three climbs and keeps its aim; the others follow directions in turn
+    np.testing.assert_array_equal(aims[:, 0], np.tile([1.0, 0.0, 0.0], (6, 1)))
+    np.testing.assert_allclose(np.linalg.norm(aims[:, 1:, 1:], axis=2), 1, rtol=1e-6)
+    changed = (np.diff(aims, axis=0) != 0).any(axis=2)
+    assert changed[:, 1].sum() == changed[:, 2].sum() == 2
+    assert not (changed[:, 1] & changed[:, 2]).any()
+
+
+def test_equal_keys_give_equal_bits() -> None:
+    one, two = (generations(3)[-1] for _ in range(2))
+    np.testing.assert_array_equal(one[1], two[1])
+
+
+def test_lost_gradients_are_told() -> None:
+    state, offspring, told = generations(2, broken)[-1]
+    np.testing.assert_array_equal(told["overflowed"], 4)
+    assert np.isfinite(offspring).all() and np.isfinite(state.snapshots).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"actors": 0}, "actors must be at least 1, got 0"),
+        ({"copies": 0}, "copies must be at least 1, got 0"),
+        ({"lifetime": 0}, "lifetime must be at least 1, got 0"),
+        ({"spread": (0.1, 0.01)}, r"spread must be 0 < smallest <= largest, got \(0.1"),
+        ({"steered": -0.1}, r"steered must be in \[0, 1\], got -0.1"),
+    ],
+)
+def test_bad_numbers_are_refused(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        emitter(**changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"window": 0}, "window must be at least 1, got 0"),
+        ({"batches": 21}, r"batches must be at most worlds \* window = 20, got 21"),
+        ({"clip": 0.0}, "clip must be finite and above 0, got 0.0"),
+        ({"noise": -1.0}, "noise must be at least 0, got -1.0"),
+        ({"trace": 2.0}, r"trace must be in \[0, 1\], got 2.0"),
+    ],
+)
+def test_bad_settings_are_refused(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        method(**changes)
