@@ -6,9 +6,8 @@
 
 Three problems of 250 control steps: a plan of actions for one hopper, whose gradient is
 windowed, and policies for ants and halfcheetahs, by a short-horizon actor-critic. The
-strategy is one of evosax (``benchmarks/optimize-requirements.txt``), which ``CHOSEN``
-names. It shall be the best of those that ``--screen`` tries, on seeds of its own; the
-screening has not been run yet, and the first candidate stands there.
+strategy is one of evosax (``benchmarks/optimize-requirements.txt``): for each problem
+the best of those that ``--screen`` tries, on seeds of its own, which ``CHOSEN`` names.
 
 The two methods take turns in one process, a slice of the budget each, so that what else
 the machine does slows both down; on one that is busy, ``--clock processor`` counts the
@@ -30,10 +29,11 @@ from pathlib import Path
 from typing import Any
 
 import jax
-from optimize_methods import ActorCritic, Evolution, GradientPlan, Method
+from optimize_methods import Evolution, GradientPlan, Method, ShortHorizon
 from optimize_problems import PROBLEMS, Problem
 
 from newton_qd.gradients import GradientOptions
+from newton_qd.qd.actor_critic import ActorCriticSettings
 
 METHODS: tuple[str, ...] = ("gradient", "evolution")
 SCREENING_SEED = 100  # of the first run of a screening, beyond those of the comparison
@@ -69,18 +69,28 @@ def gradient_method(problem: Problem) -> Method:
     """The method that follows analytic gradients."""
     if problem.policy is None:
         # a hopper's gradient grows by 1.05 a step; the discount takes that off again
-        options = GradientOptions(
-            window=100, discount=0.97, clip=100.0, checkpoint_every=None
+        options = GradientOptions(discount=0.98, clip=1e4, checkpoint_every=None)
+        return GradientPlan(
+            problem, 64, 0.03, options, caution=4.0, spread=1.0, renewal=10
         )
-        return GradientPlan(problem, 16, 0.05, options, caution=2.0)
-    return ActorCritic(problem, **_ACTOR_CRITIC[problem.name])
+    settings, hidden = _ACTOR_CRITIC[problem.name]
+    return ShortHorizon(problem, settings, hidden)
 
 
-# Halfcheetahs are the more chaotic ones: the doctor trusts first orders over 8 steps of
-# open loop, and feedback makes that less.
-_ACTOR_CRITIC: dict[str, dict[str, Any]] = {
-    "ant": {"worlds": 64, "window": 16, "clip": 10.0, "noise": 0.1},
-    "halfcheetah": {"worlds": 128, "window": 4, "clip": 1.0, "noise": 0.2},
+_ACTOR_CRITIC: dict[str, tuple[ActorCriticSettings, tuple[int, ...]]] = {
+    "ant": (
+        ActorCriticSettings(
+            worlds=32, window=16, clip=300.0, rate=2e-3, noise=0.2, discount=0.95
+        ),
+        (64, 64),
+    ),
+    # The more chaotic one: the doctor trusts first orders over 8 steps of open loop.
+    "halfcheetah": (
+        ActorCriticSettings(
+            worlds=128, window=8, clip=30.0, critic=(32, 32), discount=0.98
+        ),
+        (32, 32),
+    ),
 }
 
 
@@ -95,8 +105,11 @@ def candidates(problem: Problem) -> dict[str, Method]:
             for name, population, sigma, rate in (
                 ("Open_ES", 256, 0.1, 0.03),
                 ("Open_ES", 256, 0.3, 0.1),
+                ("Open_ES", 64, 0.2, 0.1),
                 ("SNES", 256, 0.3, None),
+                ("SNES", 64, 0.3, None),
                 ("Sep_CMA_ES", 256, 0.3, None),
+                ("Sep_CMA_ES", 64, 0.3, None),
                 ("CMA_ES", 64, 0.3, None),
             )
         }
@@ -108,14 +121,19 @@ def candidates(problem: Problem) -> dict[str, Method]:
             ("Open_ES", 128, 2, 0.1, 0.05, ()),
             ("Open_ES", 256, 1, 0.05, 0.02, ()),
             ("Open_ES", 256, 1, 0.1, 0.05, (16,)),
+            ("Open_ES", 64, 1, 0.2, 0.1, ()),
             ("SNES", 256, 1, 0.1, None, ()),
+            ("SNES", 64, 1, 0.3, None, ()),
             ("Sep_CMA_ES", 64, 4, 0.1, None, ()),
+            ("Sep_CMA_ES", 64, 1, 0.3, None, ()),
+            ("CMA_ES", 64, 1, 0.1, None, ()),
+            ("CMA_ES", 32, 1, 0.3, None, ()),
         )
     }
 
 
 # Candidate of each problem that the comparison takes, by its place.
-CHOSEN: dict[str, int] = {"hopper": 0, "ant": 0, "halfcheetah": 0}
+CHOSEN: dict[str, int] = {"hopper": 1, "ant": 1, "halfcheetah": 5}
 
 
 def evolution_method(problem: Problem) -> Method:
@@ -267,6 +285,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--problems", nargs="+", default=list(PROBLEMS))
     parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--first-seed", type=int, help="of those seeds")
     parser.add_argument("--budget", type=float, default=24.0, help="per run [s]")
     parser.add_argument("--clock", choices=("wall", "processor"), default="wall")
     parser.add_argument("--slices", type=int, default=12, help="evaluations of a run")
@@ -275,7 +294,10 @@ def main() -> None:
     parser.add_argument("--plot", type=Path)
     options = parser.parse_args()
     if options.plot:
-        plot(read(options.out), options.plot)
+        points = read(options.out)
+        if not points:
+            parser.error(f"--out: {options.out} holds no runs to draw")
+        plot(points, options.plot)
         return
     names = [options.screen] if options.screen else options.problems
     for name in names:
@@ -287,7 +309,9 @@ def main() -> None:
             made = (gradient_method(problem), evolution_method(problem))
             methods = dict(zip(METHODS, made, strict=True))
         compile_all(problem, methods)
-        first = SCREENING_SEED if options.screen else 0
+        first = options.first_seed
+        if first is None:
+            first = SCREENING_SEED if options.screen else 0
         seeds = range(first, first + options.seeds)
         settings = (options.budget, options.slices, options.clock)
         for seed in seeds:

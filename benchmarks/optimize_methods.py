@@ -9,11 +9,11 @@ from typing import Any, Protocol
 import jax
 import jax.numpy as jnp
 import optax
-from optimize_problems import STEPS, Cautious, Layers, Problem, make_network, network
+from jax.flatten_util import ravel_pytree
+from optimize_problems import STEPS, Cautious, Problem, make_network
 
-from newton_qd.envs.state import select
 from newton_qd.gradients import GradientOptions, make_episode_gradient
-from newton_qd.gradients.flow import passed_back
+from newton_qd.qd.actor_critic import ActorCritic, ActorCriticSettings
 
 
 class Method(Protocol):
@@ -57,6 +57,9 @@ class GradientPlan:
         rate: Learning rate of Adam.
         options: Windows and clipping.
         caution: Weight of the penalty of ``Cautious``.
+        spread: Standard deviation of the first plans, before their tanh.
+        renewal: Updates after which the worse half of the plans begins again as noisy
+            copies of the better half.
     """
 
     problem: Problem
@@ -64,6 +67,8 @@ class GradientPlan:
     rate: float
     options: GradientOptions
     caution: float
+    spread: float
+    renewal: int
 
     @property
     def steps(self) -> int:
@@ -72,14 +77,20 @@ class GradientPlan:
 
     def init(self, seed: int) -> Any:
         """Plans, state of Adam, and the key of the reset."""
-        keys = jax.random.split(jax.random.key(seed + 1000), self.plans)
-        plans = jax.vmap(lambda key: first_solution(self.problem, key, ()))(keys)
-        return plans, optax.adam(self.rate).init(plans), jax.random.key(seed)
+        keys = jax.random.split(jax.random.key(seed + 1000), 2)
+        plans = self._draw(keys[0])
+        moments = optax.adam(self.rate).init(plans)
+        return plans, moments, jax.random.key(seed), keys[1], 0
+
+    def _draw(self, key: jax.Array) -> jax.Array:
+        """Random plans (plans, STEPS, nu)."""
+        shape = (self.plans, STEPS, self.problem.env.action_size)
+        return self.spread * jax.random.normal(key, shape, jnp.float32)
 
     @functools.partial(jax.jit, static_argnums=0)
     def update(self, carry: Any) -> Any:
         """One step of Adam."""
-        plans, optimizer, key = carry
+        plans, optimizer, reset_key, key, count = carry
         gradient = make_episode_gradient(
             Cautious(self.problem.env, self.caution),
             None,
@@ -88,12 +99,25 @@ class GradientPlan:
             unravel=jnp.tanh,
             options=self.options,
         )
-        downhill = -gradient(plans, key).gradients[:, 0]
+        key, renewal_key = jax.random.split(key)
+        found = gradient(plans, reset_key)
+        downhill = -found.gradients[:, 0]
         # Adam forgets the size; what one plan's gradient has lost must not come back
         size = jnp.sqrt(jnp.sum(jnp.square(downhill), axis=(1, 2), keepdims=True))
         downhill = downhill / jnp.maximum(size, 1e-6)
         change, optimizer = optax.adam(self.rate).update(downhill, optimizer)
-        return plans + change, optimizer, key
+        plans = plans + change
+        order = jnp.argsort(-found.fitnesses)
+        half = self.plans // 2
+        parents = order.at[half:].set(order[: self.plans - half])
+        due = (count + 1) % self.renewal == 0
+        plans, optimizer = jax.tree.map(
+            lambda x: jnp.where(due, x[parents], x) if x.ndim else x,
+            (plans, optimizer),
+        )
+        new = due & (jnp.arange(self.plans) >= half)
+        plans = plans + jnp.where(new[:, None, None], self._draw(renewal_key), 0)
+        return plans, optimizer, reset_key, key, count + 1
 
     def solutions(self, carry: Any) -> Any:
         """All plans."""
@@ -101,152 +125,60 @@ class GradientPlan:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class ActorCritic:
-    """Short-horizon actor-critic (SHAC).
-
-    Xu et al. 2022, "Accelerated policy learning with parallel differentiable
-    simulation": the policy climbs the gradient of the return over a short window that
-    ends with the value of its last state; the worlds go on from there.
+class ShortHorizon:
+    """The short-horizon actor-critic of ``newton_qd.qd.actor_critic``.
 
     Attributes:
         problem: A problem whose solutions are policies.
-        worlds: Number of worlds.
-        window: Control steps of a window.
-        rate: Learning rate of the policy.
-        critic_rate: Learning rate of the value.
-        clip: Largest norm of the adjoint of a world's state.
-        noise: Standard deviation of the noise before the policy's last tanh.
-        hidden: Widths of the hidden layers of policy and value.
-        discount: Discount of a control step.
-        trace: lambda of the targets of the value.
-        epochs: Times that a window is fitted by the value.
-        batches: Steps of its optimizer in each of them.
+        settings: How it learns.
+        hidden: Widths of the hidden layers of the policy.
     """
 
     problem: Problem
-    worlds: int = 64
-    window: int = 16
-    rate: float = 2e-3
-    critic_rate: float = 2e-3
-    clip: float = 10.0
-    noise: float = 0.1
+    settings: ActorCriticSettings
     hidden: tuple[int, ...] = (64, 64)
-    discount: float = 0.99
-    trace: float = 0.95
-    epochs: int = 4
-    batches: int = 4
 
     @property
     def steps(self) -> int:
         """Control steps of an update."""
-        return self.worlds * self.window
+        return self._method.steps
 
-    def _optimizer(self, rate: float) -> Any:
-        return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(rate, b1=0.7))
+    @functools.cached_property
+    def _example(self) -> tuple[jax.Array, Any]:
+        like = first_solution(self.problem, jax.random.key(0), self.hidden)
+        return ravel_pytree(like)
+
+    @functools.cached_property
+    def _method(self) -> ActorCritic:
+        policy, unravel = self.problem.policy, self._example[1]
+        assert policy is not None
+        return ActorCritic(
+            self.problem.env,
+            lambda weights, obs: policy(unravel(weights), obs),
+            lambda before, after: jnp.zeros((0,)),
+            STEPS,
+            self.settings,
+        )
 
     def init(self, seed: int) -> Any:
-        """Networks, states of their optimizers, worlds, and a key."""
-        keys = jax.random.split(jax.random.key(seed + 1000), 4)
-        env = self.problem.env
-        actor = first_solution(self.problem, keys[0], self.hidden)
-        critic = make_network(keys[1], (env.observation_size, *self.hidden, 1), 0.01)
-        networks = {"actor": actor, "critic": critic, "target": critic}
-        rates = ((self.rate, actor), (self.critic_rate, critic))
-        moments = [self._optimizer(rate).init(layers) for rate, layers in rates]
-        first = jax.jit(jax.vmap(env.reset))(jax.random.split(keys[2], self.worlds))
-        # worlds at all ages, so that they do not begin again at once
-        age = jnp.arange(self.worlds, dtype=jnp.int32) * STEPS // self.worlds
-        return networks, moments, (first, first, age), keys[3]
+        """The actor, the scale of observations, and a key."""
+        keys = jax.random.split(jax.random.key(seed + 1000), 5)
+        env, worlds = self.problem.env, self.settings.worlds
+        first = jax.jit(jax.vmap(env.reset))(jax.random.split(keys[2], worlds))
+        weights = ravel_pytree(first_solution(self.problem, keys[0], self.hidden))[0]
+        learner = self._method.begin(keys[1], weights, jnp.ones((1,)), first)
+        return learner, jax.jit(self._method.scale)(keys[4], first), keys[3]
 
     @functools.partial(jax.jit, static_argnums=0)
     def update(self, carry: Any) -> Any:
         """One window: a step of the policy, several of the value."""
-        networks, moments, (first, state, age), key = carry
-        key, noise_key, order_key = jax.random.split(key, 3)
-        shape = (self.worlds, self.window, self.problem.env.action_size)
-        noise = self.noise * jax.random.normal(noise_key, shape, jnp.float32)
-
-        def loss(actor: Layers) -> tuple[jax.Array, Any]:
-            run = functools.partial(self._window, actor, networks["target"])
-            returns, found = jax.vmap(run)(first, state, noise)
-            return -returns.sum() / self.steps, found
-
-        slope, (state, obs, targets) = jax.grad(loss, has_aux=True)(networks["actor"])
-        change, actor_moments = self._optimizer(self.rate).update(slope, moments[0])
-        actor = optax.apply_updates(networks["actor"], change)
-        critic, critic_moments = self._fit(
-            networks["critic"], moments[1], order_key, obs, targets
-        )
-        target = jax.tree.map(
-            lambda new, old: 0.8 * new + 0.2 * old, critic, networks["target"]
-        )
-        age = age + self.window
-        old = age >= STEPS
-        state = jax.vmap(select)(old, first, state)
-        networks = {"actor": actor, "critic": critic, "target": target}
-        worlds = (first, state, jnp.where(old, 0, age))
-        return networks, [actor_moments, critic_moments], worlds, key
-
-    def _value(self, critic: Layers, obs: jax.Array) -> jax.Array:
-        # the network's numbers are rewards of a step
-        return network(critic, self.problem.seen(obs))[0] / (1 - self.discount)
-
-    def _window(
-        self, actor: Layers, critic: Layers, first: Any, state: Any, noise: jax.Array
-    ) -> tuple[jax.Array, Any]:
-        """One world's window: its return, last state, observations and targets."""
-
-        def advance(state: Any, noise: jax.Array) -> tuple[Any, Any]:
-            one = jnp.ones((), jnp.float32)
-            # every step scales the adjoint, which the loss has divided by ``steps``
-            state = passed_back(state, one, self.clip / self.steps)
-            drive = network(actor, self.problem.seen(state.obs))
-            after = self.problem.env.step(state, jnp.tanh(drive + noise))
-            value = self._value(critic, after.obs)
-            row = (state.obs, after.reward, after.done > 0, value)
-            return select(after.done > 0, first, after), row
-
-        last, (obs, rewards, dones, values) = jax.lax.scan(advance, state, noise)
-
-        def back(sums: Any, row: Any) -> tuple[Any, jax.Array]:
-            total, target = sums
-            reward, done, value = row
-            mixed = (1 - self.trace) * value + self.trace * target
-            total, target = (
-                reward + self.discount * jnp.where(done, 0, x) for x in (total, mixed)
-            )
-            return (total, target), target
-
-        rows = (rewards, dones, values)
-        (total, _), targets = jax.lax.scan(
-            back, (values[-1], values[-1]), rows, reverse=True
-        )
-        return total, jax.lax.stop_gradient((last, obs, targets))
-
-    def _fit(
-        self, critic: Layers, moments: Any, key: jax.Array, obs: Any, targets: Any
-    ) -> tuple[Layers, Any]:
-        """Some steps of the value towards its targets (worlds, window)."""
-        optimizer = self._optimizer(self.critic_rate)
-        obs, targets = obs.reshape(self.steps, -1), targets.reshape(self.steps)
-
-        def error(critic: Layers, rows: jax.Array) -> jax.Array:
-            values = jax.vmap(functools.partial(self._value, critic))(obs[rows])
-            return jnp.square((1 - self.discount) * (values - targets[rows])).mean()
-
-        def fit(carry: Any, rows: jax.Array) -> tuple[Any, None]:
-            critic, moments = carry
-            change, moments = optimizer.update(jax.grad(error)(critic, rows), moments)
-            return (optax.apply_updates(critic, change), moments), None
-
-        keys = jax.random.split(key, self.epochs)
-        order = jax.vmap(lambda k: jax.random.permutation(k, self.steps))(keys)
-        order = order.reshape(self.epochs * self.batches, -1)
-        return jax.lax.scan(fit, (critic, moments), order)[0]
+        learner, scale, key = carry
+        key, own = jax.random.split(key)
+        return self._method.update(learner, scale, own)[0], scale, key
 
     def solutions(self, carry: Any) -> Any:
         """The policy."""
-        return jax.tree.map(lambda x: x[None], carry[0]["actor"])
+        return jax.vmap(self._example[1])(carry[0].weights[None])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
