@@ -329,6 +329,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("dqd.csv"))
     parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--first-seed", type=int, default=0, help="of those seeds")
     parser.add_argument("--iterations", type=int, default=10_000)
     parser.add_argument("--dimension", type=int, default=1000)
     parser.add_argument("--emitters", type=int, default=1)
@@ -342,7 +343,7 @@ def main() -> None:
     done = read(args.out)
     sizes = (args.dimension, args.emitters, args.iterations)
     kinds = list(itertools.product(args.domains, args.algorithms, args.libraries))
-    for seed in range(args.seeds):
+    for seed in range(args.first_seed, args.first_seed + args.seeds):
         for domain, algorithm, library in kinds:
             run = Run(domain, algorithm, library, *sizes, seed)
             if run in done:
