@@ -46,7 +46,14 @@ TASKS = (
     "anttrap",
     "pointmaze",
 )
-ALGORITHMS = ("me", "cma-me", "pga-me", "me-gradient", "cma-maega")
+ALGORITHMS = (
+    "me",
+    "cma-me",
+    "pga-me",
+    "me-gradient",
+    "cma-maega",
+    "me-actor-critic",
+)
 # Rows of a file: enough for a curve.
 POINTS = 200
 TUNING_SEED = 1000
