@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Generic, TypeVar
 
 from newton_qd.envs.base import Env
+from newton_qd.envs.options import check_flag
 from newton_qd.errors import UnknownEnvironment
 from newton_qd.robots import Material, Robot
 from newton_qd.tasks import ROWS as _ROWS
@@ -158,6 +159,16 @@ def create(
         ValueError: A value or a combination is not allowed.
     """
     row = _row(env_name)
+    for name, flag in (
+        ("auto_reset", auto_reset),
+        ("eval_metrics", eval_metrics),
+        ("fixed_init_state", fixed_init_state),
+    ):
+        check_flag(name, flag)
+    if material is not None and not isinstance(material, Material):
+        raise TypeError(
+            f"material={material!r}: allowed: None, newton_qd.robots.Material"
+        )
     options = _wrapper_options(env_name, row, qdax_wrappers_kwargs)
     if episode_length is None and (action_repeat != 1 or eval_metrics):
         raise ValueError(
@@ -220,6 +231,11 @@ def _wrapper_options(
     """Returns the keyword arguments of each wrapper of a row."""
     if given is None:
         return [wrapper_row.options for wrapper_row in row.wrappers]
+    if isinstance(given, Mapping) or not all(isinstance(x, Mapping) for x in given):
+        raise TypeError(
+            f"qdax_wrappers_kwargs={given!r}: allowed: None, or a sequence of "
+            "dictionaries, one for each wrapper"
+        )
     if len(given) != len(row.wrappers):
         names = ", ".join(
             getattr(wrapper_row.wrapper, "__name__", repr(wrapper_row.wrapper))

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from newton_qd.envs.base import PhysicsEnv
+from newton_qd.envs.options import checked_options
 from newton_qd.envs.vectors import ordered_sum, rounded, wrapped
 from newton_qd.physics.system import PhysicsState
 from newton_qd.robots import ACROBOT
@@ -20,6 +21,7 @@ class Acrobot(PhysicsEnv):
     done.
     """
 
+    @checked_options
     def __init__(
         self, *, reset_noise_scale: float = 0.01, dtype: str = "float32"
     ) -> None:

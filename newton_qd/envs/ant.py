@@ -8,6 +8,7 @@ import numpy as np
 
 from newton_qd.envs.base import PhysicsEnv
 from newton_qd.envs.contacts import angular_changes, linear_changes
+from newton_qd.envs.options import checked_options
 from newton_qd.envs.vectors import length, ordered_sum
 from newton_qd.physics.system import PhysicsState
 from newton_qd.robots import ANT
@@ -26,6 +27,7 @@ class Ant(PhysicsEnv):
 
     forward_reward_name = "reward_forward"
 
+    @checked_options
     def __init__(
         self,
         *,

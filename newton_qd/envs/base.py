@@ -13,6 +13,7 @@ import numpy as np
 
 from newton_qd import physics
 from newton_qd.envs.inputs import checked_action, require_precision
+from newton_qd.envs.options import float_type
 from newton_qd.envs.state import State, select
 from newton_qd.envs.views import SystemView, joint_indices
 from newton_qd.physics.system import PhysicsState, System
@@ -195,7 +196,7 @@ class PhysicsEnv(Env):
             scene: What stands on the ground; ``None``: nothing.
         """
         self.robot = robot
-        self._dtype = np.dtype(dtype)
+        self._dtype = float_type(dtype)
         self._angle_noise = self._velocity_noise = reset_noise_scale
         if reset_velocity_noise_scale is not None:
             self._velocity_noise = reset_velocity_noise_scale

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 
 from newton_qd.envs import planar
 from newton_qd.envs.base import PhysicsEnv
+from newton_qd.envs.options import checked_options
 from newton_qd.envs.vectors import ordered_sum
 from newton_qd.physics.system import PhysicsState
 from newton_qd.robots import HALFCHEETAH
@@ -22,6 +23,7 @@ class HalfCheetah(PhysicsEnv):
 
     forward_reward_name = "reward_run"
 
+    @checked_options
     def __init__(
         self,
         *,

@@ -9,6 +9,7 @@ import numpy as np
 from newton_qd import physics
 from newton_qd.envs.base import PhysicsEnv
 from newton_qd.envs.contacts import isotropic_inertia
+from newton_qd.envs.options import checked_options
 from newton_qd.envs.vectors import cross, length, ordered_sum, rounded
 from newton_qd.physics.system import Kinematics, PhysicsState
 from newton_qd.robots import HUMANOID, Robot
@@ -37,6 +38,7 @@ class Humanoid(PhysicsEnv):
     reads_bodies = True
     _row: Robot = HUMANOID
 
+    @checked_options
     def __init__(
         self,
         *,

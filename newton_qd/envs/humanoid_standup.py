@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from newton_qd.envs.humanoid import Humanoid
+from newton_qd.envs.options import checked_options
 from newton_qd.envs.vectors import ordered_sum, rounded
 from newton_qd.physics.system import PhysicsState
 from newton_qd.robots import HUMANOID_STANDUP
@@ -23,6 +24,7 @@ class HumanoidStandup(Humanoid):
     forward_reward_name = None
     _row = HUMANOID_STANDUP
 
+    @checked_options
     def __init__(
         self,
         *,

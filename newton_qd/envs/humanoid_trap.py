@@ -7,6 +7,7 @@ import jax.numpy as jnp
 
 from newton_qd.envs.contacts import angular_changes, linear_changes
 from newton_qd.envs.humanoid import Humanoid
+from newton_qd.envs.options import checked_options
 from newton_qd.envs.vectors import rounded
 from newton_qd.physics.system import PhysicsState
 from newton_qd.scenes import HUMANOID_TRAP
@@ -21,6 +22,7 @@ class HumanoidTrap(Humanoid):
     the walls, unclipped.
     """
 
+    @checked_options
     def __init__(
         self,
         *,

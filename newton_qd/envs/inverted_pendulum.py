@@ -7,6 +7,7 @@ import jax.numpy as jnp
 
 from newton_qd import physics
 from newton_qd.envs.base import PhysicsEnv
+from newton_qd.envs.options import checked_options
 from newton_qd.envs.points import point
 from newton_qd.envs.vectors import ordered_sum, wrapped
 from newton_qd.physics.system import PhysicsState
@@ -26,6 +27,7 @@ class InvertedPendulum(PhysicsEnv):
     0.2 rad.
     """
 
+    @checked_options
     def __init__(
         self, *, reset_noise_scale: float = 0.01, dtype: str = "float32"
     ) -> None:
@@ -68,6 +70,7 @@ class InvertedDoublePendulum(PhysicsEnv):
     higher than 1 m; upright it is at 1.3 m.
     """
 
+    @checked_options
     def __init__(
         self, *, reset_noise_scale: float = 0.01, dtype: str = "float32"
     ) -> None:

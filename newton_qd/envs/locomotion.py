@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from newton_qd.envs.base import PhysicsEnv
+from newton_qd.envs.options import checked_options
 from newton_qd.envs.vectors import ordered_sum
 from newton_qd.physics.system import JointKind, PhysicsState
 from newton_qd.robots import Robot
@@ -25,6 +26,7 @@ class Locomotion(PhysicsEnv):
 
     forward_reward_name = "reward_forward"
 
+    @checked_options
     def __init__(
         self,
         robot: Robot,
@@ -53,11 +55,6 @@ class Locomotion(PhysicsEnv):
         Raises:
             ValueError: The robot's first joint is not free, or the range is empty.
         """
-        low, high = healthy_z_range
-        if not low < high:
-            raise ValueError(
-                f"healthy_z_range={healthy_z_range!r}: allowed: lowest below highest"
-            )
         self._forward_reward_weight = forward_reward_weight
         self._ctrl_cost_weight = ctrl_cost_weight
         self._healthy_reward = healthy_reward

@@ -10,6 +10,7 @@ import numpy as np
 
 from newton_qd.envs.base import QDEnv
 from newton_qd.envs.inputs import checked_action, refuse_params, require_precision
+from newton_qd.envs.options import float_type
 from newton_qd.envs.state import State
 from newton_qd.envs.vectors import length, rounded
 from newton_qd.types import Action, Params, RNGKey
@@ -71,9 +72,7 @@ class PointMaze(QDEnv):
         )
         walls = lower_wall_height_offset, upper_wall_height_offset
         _require_box((x_min, x_max), (y_min, y_max), walls)
-        self._dtype = np.dtype(dtype)
-        if self._dtype not in (np.float32, np.float64):
-            raise ValueError(f"dtype={dtype!r}: allowed: 'float32', 'float64'")
+        self._dtype = float_type(dtype)
         require_precision(self._dtype)
         self._scale = scale_action_space
         self._low = (x_min, y_min)

@@ -8,6 +8,7 @@ import numpy as np
 
 from newton_qd import physics
 from newton_qd.envs.base import PhysicsEnv
+from newton_qd.envs.options import checked_options
 from newton_qd.envs.vectors import length, ordered_sum, rounded
 from newton_qd.physics.system import PhysicsState
 from newton_qd.robots import PUSHER
@@ -30,6 +31,7 @@ class Pusher(PhysicsEnv):
 
     reads_bodies = True
 
+    @checked_options
     def __init__(
         self,
         *,

@@ -8,6 +8,7 @@ import numpy as np
 
 from newton_qd import physics
 from newton_qd.envs.base import PhysicsEnv
+from newton_qd.envs.options import checked_options
 from newton_qd.envs.points import point
 from newton_qd.envs.vectors import length, ordered_sum
 from newton_qd.physics.inspection import Kinematics
@@ -29,6 +30,7 @@ class Reacher(PhysicsEnv):
 
     _row: Robot = REACHER
 
+    @checked_options
     def __init__(
         self,
         *,

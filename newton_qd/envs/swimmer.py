@@ -8,6 +8,7 @@ import numpy as np
 
 from newton_qd import physics
 from newton_qd.envs.base import PhysicsEnv
+from newton_qd.envs.options import checked_options
 from newton_qd.envs.state import select
 from newton_qd.envs.vectors import length, ordered_sum, rounded, wrapped
 from newton_qd.physics.inspection import Kinematics
@@ -40,6 +41,7 @@ class Swimmer(PhysicsEnv):
 
     forward_reward_name = "reward_fwd"
 
+    @checked_options
     def __init__(
         self,
         *,

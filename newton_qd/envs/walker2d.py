@@ -6,6 +6,7 @@ import jax
 
 from newton_qd.envs import planar
 from newton_qd.envs.base import PhysicsEnv
+from newton_qd.envs.options import checked_options
 from newton_qd.physics.system import PhysicsState
 from newton_qd.robots import WALKER2D
 from newton_qd.types import Action, Metrics
@@ -20,6 +21,7 @@ class Walker2d(PhysicsEnv):
 
     forward_reward_name = "reward_forward"
 
+    @checked_options
     def __init__(
         self,
         *,

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from newton_qd.envs.base import Env
+from newton_qd.envs.options import check_count
 from newton_qd.envs.state import State
 from newton_qd.types import Action, Params, RNGKey
 from newton_qd.wrappers.base import Wrapper
@@ -30,11 +31,10 @@ class EpisodeWrapper(Wrapper):
             ("episode_length", episode_length),
             ("action_repeat", action_repeat),
         ):
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise ValueError(f"{name}={value!r}: allowed: integers from 1")
+            check_count(name, value)
         super().__init__(env)
-        self.episode_length = episode_length
-        self.action_repeat = action_repeat
+        self.episode_length = int(episode_length)
+        self.action_repeat = int(action_repeat)
 
     def reset(self, rng: RNGKey) -> State:
         """Begins an episode at step 0."""

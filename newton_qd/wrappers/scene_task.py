@@ -36,12 +36,21 @@ class SceneTaskWrapper(Wrapper):
         Args:
             env: The environment, with or without wrappers.
             env_name: Its name, for the error.
+
+        Raises:
+            NotImplementedError: The environment is no such robot.
+            ValueError: The robot stands in a scene already.
         """
         base = env.unwrapped
         if not isinstance(base, PhysicsEnv) or not _floats(base.system):
             raise NotImplementedError(
                 f"This wrapper does not support {env_name} yet. Given: "
                 f"{type(base).__name__}; allowed: simulated robots whose torso floats"
+            )
+        if base.system.scene is not None:
+            raise ValueError(
+                f"env: {env_name}, whose robot stands in the scene "
+                f"{base.system.scene.name!r} already; allowed: robots without a scene"
             )
         self._effective = env is base
         if self._effective:

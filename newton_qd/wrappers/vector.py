@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from newton_qd.envs.base import Env
+from newton_qd.envs.options import check_count
 from newton_qd.envs.state import State
 from newton_qd.types import Action, Params, RNGKey
 from newton_qd.wrappers.base import Wrapper
@@ -19,11 +21,17 @@ class VectorWrapper(Wrapper):
     """
 
     def __init__(self, env: Env, batch_size: int) -> None:
-        integer = isinstance(batch_size, int) and not isinstance(batch_size, bool)
-        if not integer or batch_size < 1:
-            raise ValueError(f"batch_size={batch_size!r}: allowed: integers from 1")
+        check_count("batch_size", batch_size)
+        inside = env
+        while isinstance(inside, Wrapper):
+            if isinstance(inside, VectorWrapper):
+                raise ValueError(
+                    f"env: {inside.batch_size} worlds already; allowed: environments "
+                    "of one world (jax.vmap makes batches of batches)"
+                )
+            inside = inside.env
         super().__init__(env)
-        self.batch_size = batch_size
+        self.batch_size = int(batch_size)
 
     def reset(self, rng: RNGKey) -> State:
         """Begins an episode in every world, from one key."""
@@ -43,11 +51,11 @@ class VectorWrapper(Wrapper):
                 f"state: done has shape {batch}; allowed: (batch,), as after a reset "
                 "of this environment"
             )
-        if jnp.shape(action)[:1] != batch:
-            raise ValueError(
-                f"action: shape {jnp.shape(action)} given; allowed: "
-                f"{(*batch, self.action_size)}"
-            )
+        allowed = f"allowed: an array of shape {(*batch, self.action_size)}"
+        if not isinstance(action, (jax.Array, np.ndarray)):
+            raise TypeError(f"action: type {type(action).__name__} given; {allowed}")
+        if action.shape != (*batch, self.action_size):
+            raise ValueError(f"action: shape {action.shape} given; {allowed}")
         for leaf in jax.tree.leaves(params):
             if jnp.shape(leaf)[:1] != batch:
                 raise ValueError(
