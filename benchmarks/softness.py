@@ -3,7 +3,8 @@
     python benchmarks/softness.py [--robots ant halfcheetah hopper]
 
 Writes the table of docs/gradients.md. *Weight of the first order*: what inverse
-variances give it over the horizon (`newton_qd.diagnose_gradients`). *Off the stiffest*:
+variances give it over the horizon, and *bias*: the share of the first-order slope that
+the zeroth order does not confirm (`newton_qd.diagnose_gradients`). *Off the stiffest*:
 distance of the torso, after 1 s under the same random actions from the same start, from
 where it is with the stiffest material; median over the worlds.
 """
@@ -48,8 +49,9 @@ def main() -> None:
     names = parser.parse_args().robots
     print(
         "| robot | softness | penetration at rest [mm] | off the stiffest [m] | "
-        f"gradient norm, {HORIZON} steps | largest | weight of the first order |\n"
-        "|---|---|---|---|---|---|---|"
+        f"gradient norm, {HORIZON} steps | largest | weight of the first order | "
+        "bias |\n"
+        "|---|---|---|---|---|---|---|---|"
     )
     for name in names:
         with jax.enable_x64(True):
@@ -67,7 +69,8 @@ def main() -> None:
             depth = 1e3 * soft.unwrapped.robot.material.static_penetration
             print(
                 f"| {name} | {factor:g} | {depth:g} | {off:.3f} | {row.norm:.3g} | "
-                f"{row.largest_norm:.3g} | {row.order:.3f} |",
+                f"{row.largest_norm:.3g} | {row.order:.3f} | "
+                f"{row.bias:.2f} ± {row.bias_error:.2f} |",
                 flush=True,
             )
 
