@@ -21,7 +21,10 @@ def row(name: str) -> str:
     """One environment's row."""
     report = newton_qd.diagnose_gradients(name, horizons=HORIZONS, worlds=4, samples=8)
     before, last = report.horizons[-2:]
-    growth = (last.norm / before.norm) ** (1 / (last.steps - before.steps))
+    growth = "-"  # of a return that does not depend on the actions
+    if before.norm:
+        steps = last.steps - before.steps
+        growth = f"{(last.norm / before.norm) ** (1 / steps):.3f}"
     right, better = (
         max((steps for steps, good in column if good), default=0)
         for column in (
@@ -31,7 +34,7 @@ def row(name: str) -> str:
     )
     return (
         f"| {name} | {last.seconds:.2g} | {last.alive:.2g} | {last.norm:.3g}, "
-        f"{last.largest_norm:.3g} | {growth:.3f} | {last.order:.3f} | {right} | "
+        f"{last.largest_norm:.3g} | {growth} | {last.order:.3f} | {right} | "
         f"{better} |"
     )
 
