@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import importlib.util
 from collections.abc import Iterator
 from pathlib import Path
@@ -57,6 +58,19 @@ def test_tripod_is_a_task(example: ModuleType) -> None:
     cost = 0.5 * np.sum(np.square(actions[1:-1]), axis=1)
     expected = velocity + 1.0 - cost
     np.testing.assert_allclose(states.reward[1:-1], expected, atol=1e-4)
+
+
+def test_tripod_is_in_the_tables(example: ModuleType) -> None:
+    del example  # its import registers the names
+    assert newton_qd.FEET_NAMES["tripod"] == ("foot_1", "foot_2", "foot_3")
+    assert newton_qd.COG_NAMES["tripod"] == "body"
+    assert newton_qd.FORWARD_REWARD_NAMES["tripod"] == "reward_forward"
+
+
+def test_forward_reward_is_seen_through_partials() -> None:
+    inner = functools.partial(Locomotion, healthy_reward=2.0)
+    row = registry.EnvironmentRow(functools.partial(inner, ctrl_cost_weight=0.0), "x")
+    assert row.forward_reward == "reward_forward"
 
 
 def test_reward_has_a_gradient(example: ModuleType) -> None:
