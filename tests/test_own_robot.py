@@ -89,6 +89,14 @@ def test_bad_options(example: ModuleType) -> None:
         Locomotion(dataclasses.replace(example.TRIPOD, urdf="./nowhere.urdf"))
 
 
+def test_robot_that_touches_nothing_resets(example: ModuleType) -> None:
+    free = dataclasses.replace(example.TRIPOD, contacts=(), feet=())
+    env = Locomotion(free)
+    state = jax.eval_shape(env.reset, jax.random.key(0))
+    assert state.obs.shape == (env.observation_size,)
+    jax.eval_shape(env.sys.default_qp, jnp.zeros(6))
+
+
 def test_walls_of_the_yard_stop_the_tripod(example: ModuleType) -> None:
     """Sent at the first wall it stays on this side; beside the wall it goes on."""
     env = Locomotion(example.TRIPOD, scene=example.YARD)
