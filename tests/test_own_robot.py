@@ -89,6 +89,12 @@ def test_bad_options(example: ModuleType) -> None:
         Locomotion(dataclasses.replace(example.TRIPOD, urdf="./nowhere.urdf"))
 
 
+def test_robot_that_nothing_drives(example: ModuleType) -> None:
+    passive = dataclasses.replace(example.TRIPOD, actuators=())
+    with pytest.raises(ValueError, match=r"'tripod', actuators=\(\): .*allowed: at l"):
+        Locomotion(passive)
+
+
 def test_robot_that_touches_nothing_resets(example: ModuleType) -> None:
     free = dataclasses.replace(example.TRIPOD, contacts=(), feet=())
     env = Locomotion(free)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from newton_qd import physics
-from newton_qd.envs.inputs import checked_action, require_precision
+from newton_qd.envs.inputs import checked_action, require_actuators, require_precision
 from newton_qd.envs.state import State, select
 from newton_qd.envs.views import SystemView, joint_indices
 from newton_qd.physics.system import PhysicsState, System
@@ -212,6 +212,7 @@ class PhysicsEnv(Env):
         )
         self.system: System = system
         self._joint_q, self._joint_v = joint_indices(system)
+        require_actuators(system)
         self._grounding = physics.grounding_coordinate(system)
         rest = jax.eval_shape(self._rest)
         action = jax.ShapeDtypeStruct((self.action_size,), self._dtype)
