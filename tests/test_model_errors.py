@@ -92,6 +92,11 @@ BAD_FILES = {
         r"<axis>: xyz is zero",
     ),
     "limits": ('upper="0.5', 'upper="-1.5', r"<limit>: lower -0.523599 is above upper"),
+    "continuous joint with limits": (
+        'type="revolute"',
+        'type="continuous"',
+        r"<limit>: lower='-0.52.*' of a continuous joint; allowed: none, so remove low",
+    ),
     "half a limit": (
         'lower="-0.5235987755982988"',
         "",
@@ -120,6 +125,16 @@ def test_bad_file(case: str, tmp_path: Path) -> None:
     with pytest.raises(RobotDescriptionError, match=message) as caught:
         build_system(robot, "float32")
     assert robot.urdf in str(caught.value)
+
+
+def test_continuous_joint_may_say_how_strong_it_is(tmp_path: Path) -> None:
+    limits = ('effort="1" velocity="2"', 'lower="-1e16" upper="1e16"')
+    for limit in limits:
+        hinge = joint("j", "continuous", "a", "b", f"<limit {limit}/>")
+        path = write(tmp_path, f"<robot name='r'>{link('a')}{link('b')}{hinge}</robot>")
+        system = build_system(row(path, "a"), "float32")
+        assert system.limit_lower[-1] == -math.inf
+        assert system.limit_upper[-1] == math.inf
 
 
 @pytest.mark.parametrize(
