@@ -137,6 +137,15 @@ def test_continuous_joint_may_say_how_strong_it_is(tmp_path: Path) -> None:
         assert system.limit_upper[-1] == math.inf
 
 
+@pytest.mark.filterwarnings("ignore:Asset file")
+def test_mesh_that_is_not_there(tmp_path: Path) -> None:
+    mesh = '<collision><geometry><mesh filename="a.obj"/></geometry></collision>'
+    path = write(tmp_path, f"<robot name='r'>{link('a', mesh)}</robot>")
+    message = r"link 'a' has a mesh as collider, .*allowed: sphere or capsule, or box"
+    with pytest.raises(RobotDescriptionError, match=message):
+        build_system(row(path, "a"), "float32")
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
