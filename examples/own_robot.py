@@ -44,6 +44,7 @@ newton_qd.register(
     wrappers=(WrapperRow(FeetContactWrapper),),
     descriptor_extractor=get_feet_contact_proportion,
     reward_offset=2.0,
+    robot=TRIPOD,
 )
 
 # The same robot among walls, described by where it comes to.
@@ -57,6 +58,7 @@ newton_qd.register(
     ),
     descriptor_extractor=get_final_xy_position,
     reward_offset=2.0,
+    robot=TRIPOD,
 )
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import functools
 import inspect
+import math
+import numbers
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Generic, TypeVar
 
@@ -99,10 +101,13 @@ def register(
         wrappers: Wrappers, from the inside to the outside.
         descriptor_extractor: Reads the descriptor of an episode, for QD tasks.
         reward_offset: Added to each step's reward to keep QD scores positive.
-        robot: Row of the robot inside, for ``FEET_NAMES`` and ``COG_NAMES``.
+        robot: Row of the robot inside, for ``FEET_NAMES`` and ``COG_NAMES``; ``None``:
+            that of the suite called ``base_name``, if there is one.
 
     Raises:
-        ValueError: The name is taken, or is not a name.
+        TypeError: An argument is of another type.
+        ValueError: The name is taken, a name is not a name, or ``reward_offset`` is
+            not finite.
     """
     if not isinstance(env_name, str) or not env_name:
         raise ValueError(f"env_name={env_name!r}: allowed: a string that is not empty")
@@ -112,6 +117,20 @@ def register(
         )
     if not callable(base):
         raise TypeError(f"base={base!r}: allowed: a class or a function")
+    # A row is read by every table: one that is wrong would break them all.
+    if base_name is not None and (not isinstance(base_name, str) or not base_name):
+        raise ValueError(
+            f"base_name={base_name!r}: allowed: None, or a string that is not empty"
+        )
+    if descriptor_extractor is not None and not callable(descriptor_extractor):
+        raise TypeError(
+            f"descriptor_extractor={descriptor_extractor!r}: allowed: None, or a "
+            "function of (data, mask)"
+        )
+    if robot is not None and not isinstance(robot, Robot):
+        raise TypeError(f"robot={robot!r}: allowed: None, or a newton_qd.robots.Robot")
+    _check_offset(reward_offset)
+    _check_wrappers(wrappers)
     _ROWS[env_name] = EnvironmentRow(
         base,
         env_name if base_name is None else base_name,
@@ -120,6 +139,42 @@ def register(
         reward_offset,
         robot=robot,
     )
+
+
+def _check_offset(reward_offset: object) -> None:
+    """Raises for a ``reward_offset`` of ``register`` that is not a finite number."""
+    allowed = "allowed: None, or a finite number"
+    if reward_offset is None:
+        return
+    if not isinstance(reward_offset, numbers.Real) or isinstance(reward_offset, bool):
+        raise TypeError(f"reward_offset={reward_offset!r}: {allowed}")
+    if not math.isfinite(reward_offset):
+        raise ValueError(f"reward_offset={reward_offset!r}: {allowed}")
+
+
+def _check_wrappers(wrappers: object) -> None:
+    """Raises for ``wrappers`` of ``register`` that are not rows of wrappers."""
+    if not isinstance(wrappers, Sequence) or isinstance(wrappers, str):
+        raise TypeError(
+            f"wrappers={wrappers!r}: allowed: a tuple or list of WrapperRow, such as "
+            "(WrapperRow(FeetContactWrapper),)"
+        )
+    for index, row in enumerate(wrappers):
+        if not isinstance(row, WrapperRow):
+            raise TypeError(
+                f"wrappers[{index}]={row!r}: allowed: a WrapperRow, such as "
+                "WrapperRow(FeetContactWrapper)"
+            )
+        if not callable(row.wrapper):
+            raise TypeError(
+                f"wrappers[{index}].wrapper={row.wrapper!r}: allowed: a class or a "
+                "function"
+            )
+        if not isinstance(row.options, Mapping):
+            raise TypeError(
+                f"wrappers[{index}].options={row.options!r}: allowed: a mapping of "
+                "keyword arguments"
+            )
 
 
 def create(

@@ -6,6 +6,7 @@ To add one, add a row; :func:`newton_qd.register` does so from outside.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -87,7 +88,11 @@ class EnvironmentRow:
     @property
     def forward_reward(self) -> str | None:
         """Metric that is the forward part of the reward; ``None``: there is none."""
-        return getattr(self.base, "forward_reward_name", None)
+        base: Any = self.base
+        # a class with some of its arguments filled in is still that class
+        while isinstance(base, functools.partial):
+            base = base.func
+        return getattr(base, "forward_reward_name", None)
 
     @property
     def _robot(self) -> Robot | None:

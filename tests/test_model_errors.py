@@ -92,6 +92,11 @@ BAD_FILES = {
         r"<axis>: xyz is zero",
     ),
     "limits": ('upper="0.5', 'upper="-1.5', r"<limit>: lower -0.523599 is above upper"),
+    "continuous joint with limits": (
+        'type="revolute"',
+        'type="continuous"',
+        r"<limit>: lower='-0.52.*' of a continuous joint; allowed: none, so remove low",
+    ),
     "half a limit": (
         'lower="-0.5235987755982988"',
         "",
@@ -120,6 +125,25 @@ def test_bad_file(case: str, tmp_path: Path) -> None:
     with pytest.raises(RobotDescriptionError, match=message) as caught:
         build_system(robot, "float32")
     assert robot.urdf in str(caught.value)
+
+
+def test_continuous_joint_may_say_how_strong_it_is(tmp_path: Path) -> None:
+    limits = ('effort="1" velocity="2"', 'lower="-1e16" upper="1e16"')
+    for limit in limits:
+        hinge = joint("j", "continuous", "a", "b", f"<limit {limit}/>")
+        path = write(tmp_path, f"<robot name='r'>{link('a')}{link('b')}{hinge}</robot>")
+        system = build_system(row(path, "a"), "float32")
+        assert system.limit_lower[-1] == -math.inf
+        assert system.limit_upper[-1] == math.inf
+
+
+@pytest.mark.filterwarnings("ignore:Asset file")
+def test_mesh_that_is_not_there(tmp_path: Path) -> None:
+    mesh = '<collision><geometry><mesh filename="a.obj"/></geometry></collision>'
+    path = write(tmp_path, f"<robot name='r'>{link('a', mesh)}</robot>")
+    message = r"link 'a' has a mesh as collider, .*allowed: sphere or capsule, or box"
+    with pytest.raises(RobotDescriptionError, match=message):
+        build_system(row(path, "a"), "float32")
 
 
 @pytest.mark.parametrize(
@@ -180,6 +204,42 @@ BAD_ROWS = {
     "rest NaN": (changed(rest_pose=(("hip_1", NAN),)), "angle of 'hip_1'=nan; allowed"),
     "height": (changed(rest_height=math.inf), "rest_height=inf; allowed: finite"),
     "friction": (soft(friction=NAN), "material.friction=nan; allowed: finite, 0 or"),
+    "gear of text": (
+        changed(actuators=(("hip_1", "30"),)),
+        "gear of 'hip_1'='30'; allowed: finite, > 0",
+    ),
+    "actuators without gears": (
+        changed(actuators=("hip_1", "ankle_1")),
+        r"actuators\[0\]='hip_1'; allowed: a tuple of \(joint, gear\), such as",
+    ),
+    "list": (
+        changed(actuators=[("hip_1", 1.0)]),
+        r"actuators=\[\('hip_1', 1.0\)\]; allowed: a tuple of \(joint",
+    ),
+    "one rest angle": (
+        changed(rest_pose=("hip_1", 1.0)),
+        r"rest_pose\[0\]='hip_1'; allowed: a tuple of \(joint, angle\)",
+    ),
+    "contact by name": (
+        changed(contacts=("torso",)),
+        r"contacts\[0\]='torso'; allowed: a tuple of Contact, such as",
+    ),
+    "pair by name": (
+        changed(pairs=(("foot_1", "foot_2"),)),
+        r"pairs\[0\]=.*; allowed: a tuple of pairs of Contact",
+    ),
+    "one foot": (changed(feet="foot_1"), "feet='foot_1'; allowed: a tuple of links"),
+    "one servo": (changed(servos="hip_1"), "servos='hip_1'; allowed: a tuple of joint"),
+    "contact twice": (
+        changed(contacts=(*ANT.contacts, ANT.contacts[-1])),
+        "contacts: end=.* of link 'foot_4' given twice; allowed: once",
+    ),
+    "two angles": (
+        changed(rest_rotation=(0.0, 0.0)),
+        r"rest_rotation=\(0.0, 0.0\); allowed: a tuple of roll, pitch and yaw",
+    ),
+    "dt of text": (changed(dt="0.1"), "dt='0.1'; allowed: finite, > 0"),
+    "material": (changed(material=3), "material=3; allowed: a Material"),
     "support": (soft(support=0), "material.support=0; allowed: finite, > 0"),
 }
 
@@ -189,6 +249,15 @@ def test_bad_row(case: str) -> None:
     robot, message = BAD_ROWS[case]
     with pytest.raises(RobotDescriptionError, match=f"robot 'ant', .*{message}"):
         build_system(robot, "float32")
+
+
+def test_rows_that_cannot_be_hashed_are_named() -> None:
+    with pytest.raises(RobotDescriptionError, match=r"feet=\['foot_1'\]; allowed: a t"):
+        load_system(changed(feet=["foot_1"]))
+    with pytest.raises(RobotDescriptionError, match=r"gear of 'hip_1'=\[1\]; allowed"):
+        load_system(changed(actuators=(("hip_1", [1]),)))
+    with pytest.raises(TypeError, match="robot='ant': allowed: a Robot, such as"):
+        load_system("ant")  # pyright: ignore[reportArgumentType]
 
 
 def test_rest_height_without_a_height(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import importlib.util
 from collections.abc import Iterator
 from pathlib import Path
@@ -59,6 +60,19 @@ def test_tripod_is_a_task(example: ModuleType) -> None:
     np.testing.assert_allclose(states.reward[1:-1], expected, atol=1e-4)
 
 
+def test_tripod_is_in_the_tables(example: ModuleType) -> None:
+    del example  # its import registers the names
+    assert newton_qd.FEET_NAMES["tripod"] == ("foot_1", "foot_2", "foot_3")
+    assert newton_qd.COG_NAMES["tripod"] == "body"
+    assert newton_qd.FORWARD_REWARD_NAMES["tripod"] == "reward_forward"
+
+
+def test_forward_reward_is_seen_through_partials() -> None:
+    inner = functools.partial(Locomotion, healthy_reward=2.0)
+    row = registry.EnvironmentRow(functools.partial(inner, ctrl_cost_weight=0.0), "x")
+    assert row.forward_reward == "reward_forward"
+
+
 def test_reward_has_a_gradient(example: ModuleType) -> None:
     env = Locomotion(example.TRIPOD)
     state = jax.jit(env.reset)(jax.random.key(0))
@@ -73,6 +87,20 @@ def test_bad_options(example: ModuleType) -> None:
         Locomotion(example.TRIPOD, healthy_z_range=(1.0, 0.5))
     with pytest.raises(FileNotFoundError, match="nowhere"):
         Locomotion(dataclasses.replace(example.TRIPOD, urdf="./nowhere.urdf"))
+
+
+def test_robot_that_nothing_drives(example: ModuleType) -> None:
+    passive = dataclasses.replace(example.TRIPOD, actuators=())
+    with pytest.raises(ValueError, match=r"'tripod', actuators=\(\): .*allowed: at l"):
+        Locomotion(passive)
+
+
+def test_robot_that_touches_nothing_resets(example: ModuleType) -> None:
+    free = dataclasses.replace(example.TRIPOD, contacts=(), feet=())
+    env = Locomotion(free)
+    state = jax.eval_shape(env.reset, jax.random.key(0))
+    assert state.obs.shape == (env.observation_size,)
+    jax.eval_shape(env.sys.default_qp, jnp.zeros(6))
 
 
 def test_walls_of_the_yard_stop_the_tripod(example: ModuleType) -> None:

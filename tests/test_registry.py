@@ -280,6 +280,53 @@ def test_register(rows: None) -> None:
         newton_qd.register("three", 3)  # pyright: ignore[reportArgumentType]
 
 
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"base_name": 3}, ValueError, r"base_name=3: allowed: None, or a string"),
+        ({"base_name": ""}, ValueError, r"base_name='': allowed"),
+        ({"robot": "ant"}, TypeError, r"robot='ant': allowed: None, or .*Robot"),
+        ({"reward_offset": "x"}, TypeError, r"reward_offset='x': .* finite number"),
+        ({"reward_offset": True}, TypeError, r"reward_offset=True: allowed"),
+        ({"reward_offset": np.nan}, ValueError, r"reward_offset=nan: allowed"),
+        ({"descriptor_extractor": 3}, TypeError, r"descriptor_extractor=3: allowed"),
+        ({"wrappers": None}, TypeError, r"wrappers=None: allowed: a tuple or list"),
+        (
+            {"wrappers": registry.WrapperRow(FeetContactWrapper)},
+            TypeError,
+            r"wrappers=WrapperRow\(.*allowed: a tuple or list of WrapperRow",
+        ),
+        (
+            {"wrappers": (FeetContactWrapper,)},
+            TypeError,
+            r"wrappers\[0\]=<class .*FeetContactWrapper'>: allowed: a WrapperRow",
+        ),
+        (
+            {"wrappers": [registry.WrapperRow(3)]},  # pyright: ignore
+            TypeError,
+            r"wrappers\[0\].wrapper=3: allowed: a class or a function",
+        ),
+        (
+            {"wrappers": [registry.WrapperRow(FeetContactWrapper, 3)]},  # pyright: ignore
+            TypeError,
+            r"wrappers\[0\].options=3: allowed: a mapping",
+        ),
+    ],
+)
+def test_register_refuses_before_it_stores(
+    options: dict[str, Any], error: type[Exception], message: str, rows: None
+) -> None:
+    with pytest.raises(error, match=message):
+        newton_qd.register("mine", Ant, **options)
+    assert "mine" not in newton_qd.registered_envs()
+    assert "ant" in list(newton_qd.FEET_NAMES)
+
+
+def test_register_takes_numbers_of_numpy(rows: None) -> None:
+    newton_qd.register("mine", Ant, reward_offset=np.float32(2.0))  # pyright: ignore
+    assert newton_qd.reward_offset["mine"] == 2.0
+
+
 def test_errors_survive_pickling() -> None:
     for error in (
         newton_qd.UnknownEnvironment("x", ["ant"]),

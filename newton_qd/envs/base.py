@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from newton_qd import physics
-from newton_qd.envs.inputs import checked_action, require_precision
+from newton_qd.envs.inputs import checked_action, require_actuators, require_precision
 from newton_qd.envs.options import float_type
 from newton_qd.envs.state import State, select
 from newton_qd.envs.views import SystemView, joint_indices
@@ -213,7 +213,8 @@ class PhysicsEnv(Env):
         )
         self.system: System = system
         self._joint_q, self._joint_v = joint_indices(system)
-        self._raising = physics.raising_coordinate(system)
+        require_actuators(system)
+        self._grounding = physics.grounding_coordinate(system)
         rest = jax.eval_shape(self._rest)
         action = jax.ShapeDtypeStruct((self.action_size,), self._dtype)
         self._layout: tuple[tuple[str, int], ...] = ()
@@ -282,8 +283,8 @@ class PhysicsEnv(Env):
         rest = self._rest()
         q = self._place(root_key, rest.q)
         q = q.at[self._joint_q].add(self._noise(angle_key, self._angle_noise))
-        if self.robot.rest_height is None and self._raising is not None:
-            coordinate, sign = self._raising
+        if self._grounding is not None:
+            coordinate, sign = self._grounding
             q = q.at[coordinate].add(-sign * physics.lowest_contact(self.system, q))
         noise = self._noise(velocity_key, self._velocity_noise)
         v = rest.v.at[self._joint_v].set(noise)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from newton_qd.physics.system import System
 from newton_qd.types import Action, Params
 
 
@@ -19,6 +20,19 @@ def require_precision(dtype: np.dtype) -> None:
         raise ValueError(
             "dtype='float64': JAX x64 is off; allowed: 'float32', or "
             "jax.config.update('jax_enable_x64', True) before the environment"
+        )
+
+
+def require_actuators(system: System) -> None:
+    """Raises for a robot without actuators, which no action could move.
+
+    Raises:
+        ValueError: The row of the system's robot has no actuators.
+    """
+    if not system.nu:
+        raise ValueError(
+            f"robot {system.robot.name!r}, actuators=(): an environment has actions; "
+            'allowed: at least one (joint, gear), such as (("hip", 30.0),)'
         )
 
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from newton_qd import physics
-from newton_qd.physics.rest import raising_coordinate
+from newton_qd.physics.rest import grounding_coordinate
 from newton_qd.physics.system import JointKind, PhysicsState, System
 
 _LIGHTEST = 1e-5  # [kg]
@@ -202,9 +202,9 @@ class SystemView:
         joint_q, joint_v = joint_indices(system)
         if joint_angle is not None:
             q = q.at[joint_q].set(_checked("joint_angle", joint_angle, joint_q, dtype))
-            height = raising_coordinate(system)
-            if system.robot.rest_height is None and height is not None:
-                coordinate, sign = height
+            grounding = grounding_coordinate(system)
+            if grounding is not None:
+                coordinate, sign = grounding
                 q = q.at[coordinate].add(-sign * physics.lowest_contact(system, q))
         if joint_velocity is not None:
             v = v.at[joint_v].set(

@@ -15,7 +15,7 @@ from newton_qd.physics.inspection import (
 )
 from newton_qd.physics.model import load_system
 from newton_qd.physics.parameters import PhysicsParams, default_params
-from newton_qd.physics.rest import raising_coordinate
+from newton_qd.physics.rest import grounding_coordinate, raising_coordinate
 from newton_qd.physics.step import initial_state, step
 from newton_qd.physics.system import Kinematics, PhysicsState, System
 
@@ -30,6 +30,7 @@ __all__ = [
     "episode_proportion",
     "forward_kinematics",
     "from_jax",
+    "grounding_coordinate",
     "initial_state",
     "load_system",
     "lowest_contact",

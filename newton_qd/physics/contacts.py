@@ -63,9 +63,17 @@ def _collider(robot: Robot, contact: Contact, body: Body) -> Shape:
 
 def _ground_contacts(robot: Robot, bodies: list[Body]) -> Iterator[ContactRow]:
     """Pairs the spheres of the robot's row with the ground."""
+    # a collider may be named or be the only one of its kind: both ways mean the same
+    seen: set[tuple[int, int]] = set()
     for contact in robot.contacts:
         body = body_of(robot, "contacts", contact.link, bodies)
         shape = _collider(robot, contact, bodies[body])
+        if (id(shape), contact.end) in seen:
+            raise RobotDescriptionError(
+                f"robot {robot.name!r}, contacts: end={contact.end} of link "
+                f"{contact.link!r} given twice; allowed: once"
+            )
+        seen.add((id(shape), contact.end))
         centre, radius = _contact_sphere(shape, contact.end)
         yield ContactRow(body, 0, centre, np.zeros(3), radius)
 

@@ -186,9 +186,25 @@ def read_link(reader: XmlReader, element: ElementTree.Element) -> Link:
     return Link(name, mass, com, inertia, tuple(shapes))
 
 
+def _refuse_limits(reader: XmlReader, limit: ElementTree.Element) -> None:
+    # URDF gives a continuous joint no limits, and Newton takes those that are written.
+    for key in ("lower", "upper"):
+        if limit.get(key) is None:
+            continue
+        if abs(reader.numbers(limit, key, 1, finite=False)[0]) < UNLIMITED:
+            raise reader.error(
+                limit,
+                f"{key}={limit.get(key)!r} of a continuous joint; allowed: none, so "
+                "remove lower and upper, or make the joint revolute",
+            )
+
+
 def _read_limits(reader: XmlReader, joint: ElementTree.Element) -> tuple[float, float]:
     limit = joint.find("limit")
-    if limit is None or joint.get("type") == "continuous":
+    if limit is None:
+        return -math.inf, math.inf
+    if joint.get("type") == "continuous":
+        _refuse_limits(reader, limit)
         return -math.inf, math.inf
     lower = float(reader.numbers(limit, "lower", 1, finite=False)[0])
     upper = float(reader.numbers(limit, "upper", 1, finite=False)[0])

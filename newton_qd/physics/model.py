@@ -331,5 +331,6 @@ def load_system(
     _check_dtype(dtype)
     if feet_width is not None and not feet_width > 0:
         raise ValueError(f"feet_width={feet_width!r}: allowed: None, or above 0")
+    check_row(robot)  # before the cache hashes it
     system = _cached_system(robot, dtype, scene)
     return _cached_variant(system, feet_width, reports_bodies)

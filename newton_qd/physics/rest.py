@@ -36,6 +36,21 @@ def raising_coordinate(system: System) -> tuple[int, float] | None:
     return None
 
 
+def grounding_coordinate(system: System) -> tuple[int, float] | None:
+    """Finds what puts a robot on the ground in any pose, as its row asks for.
+
+    Args:
+        system: The robot.
+
+    Returns:
+        The coordinate that raises the torso, and its sign; ``None`` if none does, if
+        the row gives the height, or if nothing of the robot touches the ground.
+    """
+    if system.robot.rest_height is not None or not len(system.ground_contacts):
+        return None
+    return raising_coordinate(system)
+
+
 def rest_coordinates(system: System) -> np.ndarray:
     """Returns the coordinates (nq,) of the row's default pose."""
     robot = system.robot

@@ -4,11 +4,54 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import numbers
+from collections.abc import Callable
 
 from newton_qd.physics.xml_reader import RobotDescriptionError
-from newton_qd.robots import Robot
+from newton_qd.robots import Contact, Material, Robot
 
 _MAY_BE_ZERO = ("gravity", "friction", "dissipation")
+
+
+def _is_name(entry: object) -> bool:
+    return isinstance(entry, str)
+
+
+def _is_named_value(entry: object) -> bool:
+    return isinstance(entry, tuple) and len(entry) == 2 and _is_name(entry[0])
+
+
+def _is_contact(entry: object) -> bool:
+    return isinstance(entry, Contact)
+
+
+def _is_pair(entry: object) -> bool:
+    return isinstance(entry, tuple) and len(entry) == 2 and all(map(_is_contact, entry))
+
+
+# Fields that are tuples: what an entry is, and how the field is written.
+_TUPLES: dict[str, tuple[Callable[[object], bool], str]] = {
+    "feet": (_is_name, 'a tuple of links, such as ("foot",)'),
+    "actuators": (
+        _is_named_value,
+        'a tuple of (joint, gear), such as (("hip", 30.0),)',
+    ),
+    "contacts": (_is_contact, 'a tuple of Contact, such as (Contact("foot"),)'),
+    "rest_pose": (
+        _is_named_value,
+        'a tuple of (joint, angle), such as (("knee", 0.8),)',
+    ),
+    "servos": (_is_name, 'a tuple of joints, such as ("hip",)'),
+    "original_names": (
+        _is_named_value,
+        'a tuple of (link, body), such as (("foot", "Foot"),)',
+    ),
+    "pairs": (
+        _is_pair,
+        "a tuple of pairs of Contact, such as "
+        '((Contact("foot"), Contact("other_foot")),)',
+    ),
+}
 
 
 def index_of(robot: Robot, field: str, name: str, allowed: tuple[str, ...]) -> int:
@@ -28,7 +71,11 @@ def index_of(robot: Robot, field: str, name: str, allowed: tuple[str, ...]) -> i
 
 def _check_number(robot: Robot, field: str, value: float, *, signed: bool) -> None:
     zero = field.split(".")[-1] in _MAY_BE_ZERO
-    valid = math.isfinite(value) and (signed or value > 0 or (zero and value == 0))
+    valid = (
+        isinstance(value, numbers.Real)
+        and math.isfinite(value)
+        and (signed or value > 0 or (zero and value == 0))
+    )
     if not valid:
         allowed = "finite" if signed else "finite, " + ("0 or more" if zero else "> 0")
         raise RobotDescriptionError(
@@ -45,13 +92,68 @@ def _check_unique(robot: Robot, field: str, names: list[str]) -> None:
         )
 
 
+def _check_types(robot: Robot) -> None:
+    """Checks that a row can be read: what its fields hold, not yet their values.
+
+    Raises:
+        TypeError: ``robot`` is not a row.
+        RobotDescriptionError: A field is not of the type that it is read as.
+    """
+    if not isinstance(robot, Robot):
+        raise TypeError(
+            f"robot={robot!r}: allowed: a Robot, such as newton_qd.robots.ANT"
+        )
+    for field, (is_entry, allowed) in _TUPLES.items():
+        value = getattr(robot, field)
+        # a text is a sequence, too: read letter by letter, not as one name
+        if not isinstance(value, tuple):
+            raise RobotDescriptionError(
+                f"robot {robot.name!r}, {field}={value!r}; allowed: {allowed}"
+            )
+        for index, entry in enumerate(value):
+            if not is_entry(entry):
+                raise RobotDescriptionError(
+                    f"robot {robot.name!r}, {field}[{index}]={entry!r}; allowed: "
+                    f"{allowed}"
+                )
+    rotation = robot.rest_rotation
+    if not isinstance(rotation, tuple) or len(rotation) != 3:
+        raise RobotDescriptionError(
+            f"robot {robot.name!r}, rest_rotation={rotation!r}; allowed: a tuple of "
+            "roll, pitch and yaw"
+        )
+    if not isinstance(robot.material, Material):
+        raise RobotDescriptionError(
+            f"robot {robot.name!r}, material={robot.material!r}; allowed: a Material"
+        )
+
+
+def _check_contacts(robot: Robot) -> None:
+    """Checks the ends of contacts and pairs."""
+    for contact in robot.contacts:
+        if contact.end not in (-1, 0, 1):
+            raise RobotDescriptionError(
+                f"robot {robot.name!r}, contacts: end={contact.end!r} of link "
+                f"{contact.link!r}; allowed: -1, 0, 1"
+            )
+    for pair in robot.pairs:
+        for contact in pair:
+            if contact.end != 0:
+                raise RobotDescriptionError(
+                    f"robot {robot.name!r}, pairs: end={contact.end!r} of link "
+                    f"{contact.link!r}; allowed: 0, the whole collider"
+                )
+
+
 def check_row(robot: Robot) -> None:
     """Checks the numbers of a row, and what can be checked without its file.
 
     Raises:
-        RobotDescriptionError: A number is not finite or has the wrong sign, or a
-            name is given twice.
+        TypeError: ``robot`` is not a row.
+        RobotDescriptionError: A field is of another type, a number is not finite or
+            has the wrong sign, or a name is given twice.
     """
+    _check_types(robot)
     for field in ("dt", "gravity"):
         _check_number(robot, field, getattr(robot, field), signed=False)
     for field in dataclasses.fields(robot.material):
@@ -76,19 +178,7 @@ def check_row(robot: Robot) -> None:
         raise RobotDescriptionError(
             f"robot {robot.name!r}, substeps={robot.substeps!r}; allowed: 1, 2, ..."
         )
-    for contact in robot.contacts:
-        if contact.end not in (-1, 0, 1):
-            raise RobotDescriptionError(
-                f"robot {robot.name!r}, contacts: end={contact.end!r} of link "
-                f"{contact.link!r}; allowed: -1, 0, 1"
-            )
-    for pair in robot.pairs:
-        for contact in pair:
-            if contact.end != 0:
-                raise RobotDescriptionError(
-                    f"robot {robot.name!r}, pairs: end={contact.end!r} of link "
-                    f"{contact.link!r}; allowed: 0, the whole collider"
-                )
+    _check_contacts(robot)
     _check_unique(robot, "actuators", [joint for joint, _ in robot.actuators])
     _check_unique(robot, "rest_pose", [joint for joint, _ in robot.rest_pose])
     _check_unique(robot, "feet", list(robot.feet))

@@ -135,6 +135,13 @@ class _Checker:
         left = list(self.built.shapes[index])
         for shape in body.shapes:
             match = next((other for other in left if _same_shape(shape, other)), None)
+            if match is None and shape.kind == "mesh":
+                raise ModelMismatchError(
+                    f"{self.description.path}: link {shape.link!r} has a mesh as "
+                    "collider, and Newton could not read its file; contacts do not "
+                    "support a mesh; allowed: sphere or capsule, or box or cylinder "
+                    "where nothing touches"
+                )
             if match is None:
                 found = [_describe(other) for other in left]
                 self.fail("collider", f"link {shape.link!r}", _describe(shape), found)
