@@ -194,6 +194,15 @@ def test_individuals_are_actors_and_what_lies_between_them_and_elites() -> None:
     np.testing.assert_array_equal(last.snapshots[-1], last.learners.weights)
 
 
+def test_a_single_copy_is_the_actor_itself() -> None:
+    state = generations(1)[0][0]
+    archive = MapElitesRepertoire.init_default(
+        jnp.zeros(SIZE), compute_euclidean_centroids((4, 4), [-2.0, -2.0], [2.0, 2.0])
+    )
+    offspring, _ = emitter(copies=1).emit(archive, state, jax.random.key(0))
+    np.testing.assert_array_equal(offspring, state.snapshots.reshape(-1, SIZE))
+
+
 def test_steered_actors_begin_again() -> None:
     aims = np.stack([state.learners.aim for state, *_ in generations(6)])
     # one of three climbs and keeps its aim; the others follow directions in turn

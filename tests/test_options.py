@@ -49,7 +49,9 @@ def test_bad_options_are_named(
 
 def test_ranges_may_be_lists_and_numbers_of_numpy() -> None:
     options = {"healthy_z_range": [0.2, np.float32(1)], "healthy_reward": np.float64(2)}
-    newton_qd.create("ant", **options)  # pyright: ignore[reportArgumentType]
+    env = newton_qd.create("ant", **options)  # pyright: ignore[reportArgumentType]
+    state = env.step(env.reset(jax.random.key(0)), jnp.zeros(8))
+    assert state.metrics["reward_survive"] == 2 and state.done == 0
 
 
 def test_counts_may_be_of_numpy() -> None:

@@ -158,7 +158,7 @@ class ActorCriticEmitter(Emitter):
         filled = repertoire.fitnesses[:, 0] > -jnp.inf
         shape = (self._copies - 1, len(actors))
         cells = draw_cells(cell_key, filled, shape[0] * shape[1])
-        elites = repertoire.genotypes[cells].reshape(*shape, -1)
+        elites = repertoire.genotypes[cells].reshape(*shape, actors.shape[-1])
         dtype = actors.dtype
         part = jax.random.uniform(part_key, (*shape, 1), dtype)
         smallest, largest = self._spread
