@@ -5,9 +5,10 @@
     python benchmarks/optimize.py --screen ant --seeds 2 --budget 20
 
 Three problems of 250 control steps: a plan of actions for one hopper, whose gradient is
-discounted and clipped, and policies for ants and halfcheetahs, by a short-horizon actor-critic. The
-strategy is one of evosax (``benchmarks/optimize-requirements.txt``): for each problem
-the best of those that ``--screen`` tries, on seeds of its own, which ``CHOSEN`` names.
+discounted and clipped, and policies for ants and halfcheetahs, by a short-horizon
+actor-critic. The strategy is one of evosax (``benchmarks/optimize-requirements.txt``):
+for each problem the best of those that ``--screen`` tries, on seeds of its own, which
+``CHOSEN`` names.
 
 The two methods take turns in one process, a slice of the budget each, so that what else
 the machine does slows both down; on one that is busy, ``--clock processor`` counts the

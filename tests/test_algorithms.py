@@ -18,7 +18,10 @@ from newton_qd.qd.checkpoint import CheckpointError, load_checkpoint, save_check
 from newton_qd.qd.config import ConfigError, EvolveConfig, read_config
 from newton_qd.qd.emitters import GradientLineEmitter
 from newton_qd.qd.evolve import evolve
+from newton_qd.qd.gradient_algorithms import GRADIENT_ALGORITHMS
+from newton_qd.qd.gradient_options import TUNED
 from newton_qd.qd.search import Search
+from newton_qd.qd.task import make_task
 
 __all__ = ["compiled"]  # a fixture
 
@@ -67,6 +70,22 @@ def count_after_generations(
 
 def test_every_algorithm_is_tested() -> None:
     assert set(OPTIONS) == set(ALGORITHMS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("env_name", TUNED)
+def test_defaults_of_an_environment_are_accepted(env_name: str) -> None:
+    task = make_task(EvolveConfig(env_name=env_name))
+    for name in GRADIENT_ALGORITHMS:
+        config = EvolveConfig(
+            env_name=env_name,
+            algorithm=name,
+            batch_size=64,
+            episode_length=8,
+            hidden=(4,),
+            grid=(4,) * task.descriptor_length,
+        )
+        Search(config, task)
 
 
 @pytest.mark.slow

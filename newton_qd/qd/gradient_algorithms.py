@@ -4,122 +4,23 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
-from newton_qd.gradients.exact import make_directional_gradient, make_episode_gradient
-from newton_qd.gradients.flow import GradientOptions
-from newton_qd.gradients.mixed import make_mixed_gradient
-from newton_qd.gradients.smooth import with_smooth_descriptor
-from newton_qd.qd.actor_critic import ActorCritic, ActorCriticSettings, measure_of
+from newton_qd.gradients.exact import make_directional_gradient
+from newton_qd.qd.actor_critic_algorithm import ME_ACTOR_CRITIC
 from newton_qd.qd.config import ConfigError, EvolveConfig
+from newton_qd.qd.gradient_options import (
+    FlowOptions,
+    MixedOptions,
+    checked,
+    differentiable,
+    flow_options,
+)
 from newton_qd.qd.gradient_scoring import make_gradient_scoring_function
-from newton_qd.qd.parts import Algorithm, Parts, isoline_emitter, settings
+from newton_qd.qd.parts import Algorithm, Parts, isoline_emitter
 from newton_qd.qd.rollout import Policy, ScoringFunction
 from newton_qd.qd.task import Task
-
-# A robot that falls ends its episode, which no gradient sees: short steps only.
-_FALLS: Mapping[str, Any] = {"shortest": 0.0005, "longest": 0.02, "sigma_g": 0.02}
-
-TUNED: Mapping[str, Mapping[str, Any]] = {
-    # Its return is chaotic after some ten control steps.
-    "halfcheetah_uni": {"window": 10, "clip": 0.0, "longest": 1.0},
-    "hopper_uni": _FALLS,
-    "walker2d_uni": _FALLS,
-    "humanoid_uni": _FALLS,
-    "humanoid_omni": _FALLS,
-    "humanoidtrap": _FALLS,
-}
-"""Defaults of options that differ for an environment."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class FlowOptions:
-    """How gradients come about; every algorithm here has these options.
-
-    Attributes:
-        window: Control steps after which the gradient is cut; 0: never.
-        clip: Largest norm of the adjoint of a state; 0: no limit.
-        discount: Factor of the adjoint for each control step that it goes back [-].
-        smooth_width: Share of a robot's weight over which the reading of a foot has a
-            gradient [-]; its value stays 0 or 1.
-        initial_scale: Factor of the weights of the initial population [-]: small
-            feedback keeps gradients small over more control steps.
-    """
-
-    window: int = 0
-    clip: float = 10.0
-    discount: float = 1.0
-    smooth_width: float = 0.1
-    initial_scale: float = 1.0
-
-    def flow(self) -> GradientOptions:
-        """The options of a gradient, in the fastest way, that keeps intermediates.
-
-        Raises:
-            ValueError: A value is out of its range.
-        """
-        return GradientOptions(
-            window=self.window or None,
-            clip=self.clip or None,
-            discount=self.discount,
-            checkpoint_every=None,
-        )
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class MixedOptions(FlowOptions):
-    """Options of algorithms that need the gradient of every component.
-
-    Attributes:
-        samples: Pairs of samples of the mixed gradient of first and zeroth order; 0:
-            the exact gradient.
-        noise: Standard deviation of these samples, in units of policy weights [-].
-    """
-
-    samples: int = 0
-    noise: float = 0.02
-
-    @property
-    def estimator(self) -> Any:
-        """Builds the gradient, as ``make_gradient_scoring_function`` wants it."""
-        if not self.samples:
-            return make_episode_gradient
-        return functools.partial(
-            make_mixed_gradient, samples=self.samples, sigma=self.noise
-        )
-
-    @property
-    def episodes(self) -> int:
-        """Episodes that are differentiated for one gradient."""
-        return 2 * self.samples or 1
-
-
-def _tuned(kind: Any, config: EvolveConfig) -> Any:
-    """Options of a run, with the defaults of its environment."""
-    names = {field.name for field in dataclasses.fields(kind)}
-    tuned = TUNED.get(config.env_name, {}).items()
-    return settings(kind, config, **{k: v for k, v in tuned if k in names})
-
-
-def _options(kind: Any, config: EvolveConfig) -> Any:
-    """Options of a run that differentiates whole episodes, checked.
-
-    Raises:
-        ConfigError: There is no option of this name, or its value is not allowed.
-    """
-    options = _tuned(kind, config)
-    try:
-        options.flow()
-    except (TypeError, ValueError) as error:
-        raise ConfigError(f"options: {error}") from error
-    return options
-
-
-def _differentiable(task: Task, options: FlowOptions | ActorCriticOptions) -> Task:
-    """The task with a descriptor of the same values that has a gradient."""
-    env = with_smooth_descriptor(task.env, options.smooth_width, straight_through=True)
-    return dataclasses.replace(task, env=env)
 
 
 def _scoring(
@@ -127,7 +28,7 @@ def _scoring(
 ) -> ScoringFunction:
     """Scores with the gradients of fitness and descriptor."""
     return make_gradient_scoring_function(
-        _differentiable(task, options),
+        differentiable(task, options.smooth_width),
         policy,
         config.episode_length,
         options.flow(),
@@ -183,8 +84,8 @@ def _me_gradient(parts: Parts) -> Any:
     from newton_qd.qd.emitters.gradient_line import GradientLineEmitter
 
     config = parts.config
-    options = _options(MEGradientOptions, config)
-    task = _differentiable(parts.task, options)
+    options = flow_options(MEGradientOptions, config)
+    task = differentiable(parts.task, options.smooth_width)
     gradient = make_directional_gradient(
         task.env,
         parts.policy.apply,
@@ -209,88 +110,7 @@ def _me_gradient(parts: Parts) -> Any:
 
 
 def _me_gradients(config: EvolveConfig) -> int:
-    return _options(MEGradientOptions, config).parents(config)
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class ActorCriticOptions(ActorCriticSettings):
-    """Options of MAP-Elites with actors that learn by the gradient of the physics.
-
-    Attributes:
-        actors: Number of actors.
-        branches: Times in a generation that actors have offspring.
-        copies: Offspring of an actor then; the rest of the generation are iso+line
-            variations.
-        updates: Updates of an actor between two of these times.
-        steered: Share of the actors that follow directions of the descriptor [-].
-        fitness: Weight of the reward of these [-].
-        lifetime: Generations after which these begin again.
-        smooth_width: As in ``FlowOptions``.
-        initial_scale: As in ``FlowOptions``.
-    """
-
-    actors: int = 2
-    branches: int = 2
-    copies: int = 8
-    updates: int = 1
-    steered: float = 0.5
-    fitness: float = 0.1
-    lifetime: int = 10
-    smooth_width: float = 0.1
-    initial_scale: float = 1.0
-
-    def episodes(self, config: EvolveConfig) -> int:
-        """Episodes that the control steps of a generation's updates amount to."""
-        updates = self.actors * self.branches * self.updates
-        return -(-updates * self.worlds * self.window // config.episode_length)
-
-
-def _me_actor_critic(parts: Parts) -> Any:
-    """MAP-Elites with the policies of actors that learn over short horizons."""
-    from qdax.core.emitters.multi_emitter import MultiEmitter
-
-    from newton_qd.qd.emitters.actor_critic import ActorCriticEmitter
-
-    config, policy = parts.config, parts.policy
-    options = _tuned(ActorCriticOptions, config)
-    task = _differentiable(parts.task, options)
-    method = ActorCritic(
-        task.env,
-        lambda weights, obs: policy.apply(policy.unravel(weights), obs),
-        measure_of(task),
-        config.episode_length,
-        options,
-    )
-    emitter = ActorCriticEmitter(
-        method,
-        task.env.reset(parts.reset_key),
-        actors=options.actors,
-        branches=options.branches,
-        copies=options.copies,
-        updates=options.updates,
-        steered=options.steered,
-        fitness=options.fitness,
-        lifetime=options.lifetime,
-        measures=task.descriptor_length,
-    )
-    rest = config.batch_size - emitter.batch_size
-    if rest < 0:
-        raise ConfigError(
-            f"options: actors = {options.actors} times branches = {options.branches} "
-            f"times copies = {options.copies} are more than batch_size = "
-            f"{config.batch_size}"
-        )
-    if not rest:
-        return emitter
-    return MultiEmitter((emitter, isoline_emitter(config, rest)))
-
-
-def _actor_critic_episodes(config: EvolveConfig) -> int:
-    return _tuned(ActorCriticOptions, config).episodes(config)
-
-
-def _actor_critic_scale(config: EvolveConfig) -> float:
-    return _tuned(ActorCriticOptions, config).initial_scale
+    return flow_options(MEGradientOptions, config).parents(config)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -309,18 +129,18 @@ def _omg_mega(parts: Parts) -> Any:
     """OMG-MEGA: random steps along all gradients of elites."""
     from newton_qd.qd.emitters import OMGMEGAEmitter
 
-    options = _options(OMGMEGAOptions, parts.config)
+    options = flow_options(OMGMEGAOptions, parts.config)
     return OMGMEGAEmitter(parts.config.batch_size, options.sigma_g)
 
 
 def _omg_mega_scoring(
     config: EvolveConfig, task: Task, policy: Policy
 ) -> ScoringFunction:
-    return _scoring(_options(OMGMEGAOptions, config), config, task, policy)
+    return _scoring(flow_options(OMGMEGAOptions, config), config, task, policy)
 
 
 def _omg_mega_gradients(config: EvolveConfig) -> int:
-    return config.batch_size * _options(OMGMEGAOptions, config).episodes
+    return config.batch_size * flow_options(OMGMEGAOptions, config).episodes
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -387,7 +207,7 @@ def _cma_mega(parts: Parts) -> Any:
     """CMA-MEGA: CMA-ES searches for steps along the gradients of solution points."""
     from newton_qd.qd.emitters import CMAMEGAEmitter
 
-    options = _options(CMAMEGAOptions, parts.config)
+    options = flow_options(CMAMEGAOptions, parts.config)
     return _arborescence(CMAMEGAEmitter, options, parts)
 
 
@@ -396,7 +216,7 @@ def _cma_maega(parts: Parts) -> Any:
     from newton_qd.qd.emitters import CMAMAEGAEmitter
     from newton_qd.qd.emitters.annealed import OnAnnealedRepertoire
 
-    options = _options(CMAMAEGAOptions, parts.config)
+    options = flow_options(CMAMAEGAOptions, parts.config)
     return OnAnnealedRepertoire(
         _arborescence(CMAMAEGAEmitter, options, parts),
         learning_rate=options.learning_rate,
@@ -405,33 +225,19 @@ def _cma_maega(parts: Parts) -> Any:
     )
 
 
-def _checked(make: Callable[[Parts], Any]) -> Callable[[Parts], Any]:
-    """Makes an emitter; a value that it refuses is a wrong setting."""
-
-    def made(parts: Parts) -> Any:
-        try:
-            return make(parts)
-        except ConfigError:
-            raise
-        except ValueError as error:
-            raise ConfigError(f"options: {error}") from error
-
-    return made
-
-
 def _points(kind: Any, config: EvolveConfig) -> int:
-    options = _options(kind, config)
+    options = flow_options(kind, config)
     return options.points * options.episodes
 
 
 def _scale(kind: Any, config: EvolveConfig) -> float:
-    return _options(kind, config).initial_scale
+    return flow_options(kind, config).initial_scale
 
 
 def _row(make: Any, kind: Any) -> Algorithm:
     """A row for an emitter that evaluates the gradients of its solution points."""
     return Algorithm(
-        _checked(make),
+        checked(make),
         evaluations=lambda config: config.batch_size + _points(kind, config),
         gradients=functools.partial(_points, kind),
         takes_faulty=True,
@@ -441,19 +247,14 @@ def _row(make: Any, kind: Any) -> Algorithm:
 
 GRADIENT_ALGORITHMS: Mapping[str, Algorithm] = {
     "me-gradient": Algorithm(
-        _checked(_me_gradient),
+        checked(_me_gradient),
         evaluations=lambda config: config.batch_size + _me_gradients(config),
         gradients=_me_gradients,
         initial_scale=functools.partial(_scale, MEGradientOptions),
     ),
-    "me-actor-critic": Algorithm(
-        _checked(_me_actor_critic),
-        evaluations=lambda config: config.batch_size + _actor_critic_episodes(config),
-        gradients=_actor_critic_episodes,
-        initial_scale=_actor_critic_scale,
-    ),
+    "me-actor-critic": ME_ACTOR_CRITIC,
     "omg-mega": Algorithm(
-        _checked(_omg_mega),
+        checked(_omg_mega),
         evaluations=_omg_mega_gradients,
         gradients=_omg_mega_gradients,
         scoring=_omg_mega_scoring,
