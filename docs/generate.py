@@ -19,6 +19,7 @@ import numpy as np
 
 import newton_qd
 from newton_qd.envs.base import Env, PhysicsEnv, QDEnv
+from newton_qd.envs.pointmaze import PointMaze
 from newton_qd.physics.system import JointKind
 
 PAGE = Path(__file__).with_name("environments.md")
@@ -67,7 +68,7 @@ def _options(base: type) -> list[tuple[object, ...]]:
     return rows
 
 
-def _observation(env: PhysicsEnv) -> list[tuple[object, ...]]:
+def _observation(env: PhysicsEnv | PointMaze) -> list[tuple[object, ...]]:
     rows, first = [], 0
     for block, size in env.observation_layout:
         last = first + size - 1
@@ -99,19 +100,53 @@ def _drive(env: PhysicsEnv, joint: str, gear: float) -> str:
     return f"a force of {gear:g} N" if slides else f"a torque of {gear:g} N m"
 
 
-def _robot(env: PhysicsEnv) -> str:
-    """What all environments of one base share."""
-    text = "\n" + _table(("entries of the observation", "meaning"), _observation(env))
+def _actions(env: PhysicsEnv | PointMaze) -> str:
+    if isinstance(env, PointMaze):
+        rows = [
+            (index, f"a move of {env.reach:g} along {axis}")
+            for index, axis in enumerate("xy")
+        ]
+        return _table(("action", "an action of 1 is"), rows)
     driven = env.robot.actuators[: env.action_size]
-    drives = [
+    rows = [
         (index, f"`{joint}`", _drive(env, joint, gear))
         for index, (joint, gear) in enumerate(driven)
     ]
-    text += "\n" + _table(("action", "joint", "an action of 1 is"), drives)
-    state = jax.eval_shape(env.reset, jax.random.key(0))
-    named = ", ".join(f"`{key}`" for key in state.metrics) or "none"
-    text += f"\nMetrics, the terms of the reward among them: {named}.\n"
-    return text + "\n" + _table(("option", "default", "meaning"), _options(type(env)))
+    return _table(("action", "joint", "an action of 1 is"), rows)
+
+
+def _meanings(base: type) -> tuple[str, dict[str, str]]:
+    """The docstring of an environment, and what it says about its metrics."""
+    text, _, section = (inspect.getdoc(base) or "").partition("\n\nMetrics:\n")
+    rows = re.findall(r"^    (\w+): (.*(?:\n {8,}.*)*)", section, flags=re.MULTILINE)
+    return text, {name: " ".join(meaning.split()) for name, meaning in rows}
+
+
+def _metrics(env: PhysicsEnv | PointMaze) -> str:
+    """Table of the metrics.
+
+    Raises:
+        ValueError: The docstring has others.
+    """
+    metrics = sorted(jax.eval_shape(env.reset, jax.random.key(0)).metrics)
+    meanings = _meanings(type(env))[1]
+    if metrics != sorted(meanings):
+        raise ValueError(
+            f"{type(env).__name__}: metrics {metrics}, docstring {sorted(meanings)}"
+        )
+    if not metrics:
+        return "No metrics.\n"
+    rows = [(f"`{name}`", meaning) for name, meaning in meanings.items()]
+    return _table(("metric", "meaning"), rows)
+
+
+def _tables(env: PhysicsEnv | PointMaze) -> str:
+    """What all environments of one base share."""
+    options = _table(("option", "default", "meaning"), _options(type(env)))
+    seen = _table(("entries of the observation", "meaning"), _observation(env))
+    return "".join(
+        "\n" + text for text in (seen, _actions(env), _metrics(env), options)
+    )
 
 
 def page() -> str:
@@ -127,11 +162,11 @@ def page() -> str:
         if known != name:
             sections += f"The task of [`{known}`](#{known}) with a state descriptor.\n"
         else:
-            sections += f"{inspect.getdoc(type(base))}\n"
+            sections += f"{_meanings(type(base))[0]}\n"
         if name in newton_qd.descriptor_extractor:
             sections += _descriptor(name, cast(QDEnv, env))
-        if known == name and isinstance(base, PhysicsEnv):
-            sections += _robot(base)
+        if known == name and isinstance(base, PhysicsEnv | PointMaze):
+            sections += _tables(base)
     rows = "".join(_table(row, []).splitlines(keepends=True)[0] for row in summary)
     return HEAD + rows + sections
 

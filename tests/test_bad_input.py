@@ -26,6 +26,7 @@ from contract import (
 )
 
 import newton_qd
+from newton_qd.envs.base import Env
 from newton_qd.envs.state import State
 from newton_qd.physics.system import PhysicsState
 
@@ -149,6 +150,26 @@ def test_bad_actions_are_named(name: str) -> None:
         batched.step(states, jnp.zeros((2, size)))
     with pytest.raises(ValueError, match=r"state: done has shape \(\)"):
         batched.step(state, jnp.zeros((3, size)))
+
+
+@pytest.mark.parametrize("name", ("ant_uni", "pointmaze"))
+def test_bad_states_are_named(name: str) -> None:
+    env, action = make(name), jnp.zeros(make(name).action_size)
+    state = reset(env)(jax.random.key(0))
+    wrappers: Env = env
+    while wrappers is not env.unwrapped:
+        with pytest.raises(
+            TypeError, match=r"state: type ArrayImpl .*allowed: a State"
+        ):
+            wrappers.step(action, state)  # pyright: ignore[reportArgumentType]
+        wrappers = wrappers.env  # pyright: ignore[reportAttributeAccessIssue]
+    with pytest.raises(TypeError, match=r"state: type NoneType .*allowed: a State"):
+        env.unwrapped.step(None, action)  # pyright: ignore[reportArgumentType]
+    inside = env.unwrapped.reset(jax.random.key(0))
+    with pytest.raises(ValueError, match=r"state: info has no 'first_obs'; allowed"):
+        env.step(inside, action)
+    with pytest.raises(ValueError, match=r"state: info has no 'steps'; allowed"):
+        newton_qd.create(name, auto_reset=False).step(inside, action)
 
 
 @pytest.mark.parametrize("name", EVERY_NAME)

@@ -173,6 +173,7 @@ def soft(**changes: object) -> Robot:
 LINKS = "allowed: torso, aux_1, foot_1, "
 JOINTS = "allowed: hip_1, ankle_1, hip_2, "
 NAN = math.nan
+TWO_FEET = (Contact("foot_1"), Contact("foot_2"))
 BAD_ROWS = {
     "torso": (changed(torso="chest"), f"torso: 'chest' is not in ant.urdf; {LINKS}"),
     "contact": (
@@ -198,6 +199,9 @@ BAD_ROWS = {
     "dt": (changed(dt=NAN), "dt=nan; allowed: finite, > 0"),
     "no dt": (changed(dt=0.0), "dt=0.0; allowed: finite, > 0"),
     "gravity": (changed(gravity=-9.8), "gravity=-9.8; allowed: finite, 0 or more"),
+    "one substep": (changed(substeps=True), "substeps=True; allowed: 1, 2"),
+    "file": (changed(urdf=3), "urdf=3; allowed: a path"),
+    "pair twice": (changed(pairs=(TWO_FEET, TWO_FEET[::-1])), "pairs: .* named twice"),
     "substeps": (changed(substeps=0), "substeps=0; allowed: 1, 2"),
     "half substep": (changed(substeps=2.5), "substeps=2.5; allowed: 1, 2"),
     "gear": (changed(actuators=(("hip_1", NAN),)), "gear of 'hip_1'=nan; allowed"),
@@ -258,6 +262,8 @@ def test_rows_that_cannot_be_hashed_are_named() -> None:
         load_system(changed(actuators=(("hip_1", [1]),)))
     with pytest.raises(TypeError, match="robot='ant': allowed: a Robot, such as"):
         load_system("ant")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(RobotDescriptionError, match="name=None; allowed: a text"):
+        load_system(changed(name=None))
 
 
 def test_rest_height_without_a_height(tmp_path: Path) -> None:

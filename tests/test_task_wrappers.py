@@ -175,6 +175,11 @@ def test_clip_reward() -> None:
         ClipRewardWrapper(PointMaze(), 1.0, 0.0)
     with pytest.raises(ValueError, match=r"clip_max=nan: allowed: None, or a number"):
         ClipRewardWrapper(PointMaze(), clip_max=np.nan)
+    text: Any = "1"
+    with pytest.raises(ValueError, match=r"clip_min='1': allowed: None, or a number"):
+        ClipRewardWrapper(PointMaze(), clip_min=text)
+    with pytest.raises(TypeError, match=r"offset='1': allowed: finite numbers"):
+        OffsetRewardWrapper(PointMaze(), offset=text)
 
 
 def test_offset_reward() -> None:

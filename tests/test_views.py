@@ -173,6 +173,9 @@ def test_observation_function_of_the_fixed_initial_state() -> None:
     assert after.obs.shape == (87,) and np.ptp(after.obs) > 0
 
     short = FixedInitialStateWrapper(ANT, "ant", lambda qp, info, action: qp.pos[0])
+    text: Any = "obs"
+    with pytest.raises(TypeError, match=r"get_obs_fn='obs': allowed: None, or a func"):
+        FixedInitialStateWrapper(Ant(), get_obs_fn=text)
     with pytest.raises(ValueError, match=r"get_obs_fn: .*\(3,\); allowed: \(87,\)"):
         short.reset(KEY)
     with pytest.raises(NotImplementedError, match=r"^This wrapper does not support"):

@@ -337,6 +337,11 @@ def test_feet_contact_can_be_smooth() -> None:
     )
     with pytest.raises(ValueError, match=r"smooth_width=0.*above 0"):
         FeetContactWrapper(Ant(), "ant", smooth_width=0.0)
+    with pytest.raises(ValueError, match=r"smooth_width=inf: allowed: None, or a fin"):
+        FeetContactWrapper(Ant(), "ant", smooth_width=np.inf)
+    width: Any = "wide"
+    with pytest.raises(TypeError, match=r"smooth_width='wide': allowed: None, or a f"):
+        FeetContactWrapper(Ant(), "ant", smooth_width=width)
     with pytest.raises(ValueError, match=r"feet_width=-1.*above 0"):
         Ant().with_feet_width(-1.0)
 

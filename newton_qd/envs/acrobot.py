@@ -19,6 +19,12 @@ class Acrobot(PhysicsEnv):
     Observation: ``observation_layout``. Reward: 10, minus the squared joint angles,
     which are 0 where the poles stand, minus a penalty for how fast they turn. Never
     done.
+
+    Metrics:
+        dist_penalty: Sum of the squared joint angles [rad^2].
+        vel_penalty: Penalty for how fast the poles turn [-].
+        alive_bonus: 0, as in the original; the reward has its 10.
+        r_tot: The reward [-].
     """
 
     @checked_options

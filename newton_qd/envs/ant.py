@@ -23,6 +23,18 @@ class Ant(PhysicsEnv):
 
     Observation: ``observation_layout``. Reward: velocity along x, plus a bonus for
     being healthy, minus costs of control and of contact. Done when unhealthy.
+
+    Metrics:
+        reward_forward: Velocity of the torso along x [m/s].
+        forward_reward: The same.
+        reward_survive: Bonus for being healthy [-].
+        reward_ctrl: Minus the cost of control [-].
+        reward_contact: Minus the cost of contact [-].
+        x_position: x of the torso [m].
+        y_position: y of the torso [m].
+        distance_from_origin: Length of its position, height included [m].
+        x_velocity: Velocity of the torso along x [m/s].
+        y_velocity: That along y [m/s].
     """
 
     forward_reward_name = "reward_forward"

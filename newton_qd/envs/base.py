@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from newton_qd import physics
-from newton_qd.envs.inputs import checked_action, require_actuators, require_precision
+from newton_qd.envs import inputs
 from newton_qd.envs.options import float_type
 from newton_qd.envs.state import State, select
 from newton_qd.envs.views import SystemView, joint_indices
@@ -213,7 +213,7 @@ class PhysicsEnv(Env):
         )
         self.system: System = system
         self._joint_q, self._joint_v = joint_indices(system)
-        require_actuators(system)
+        inputs.require_actuators(system)
         self._grounding = physics.grounding_coordinate(system)
         rest = jax.eval_shape(self._rest)
         action = jax.ShapeDtypeStruct((self.action_size,), self._dtype)
@@ -278,7 +278,7 @@ class PhysicsEnv(Env):
 
     def reset(self, rng: RNGKey) -> State:
         """Begins an episode in the default pose with noise on the joints."""
-        require_precision(self._dtype)
+        inputs.require_precision(self._dtype)
         root_key, angle_key, velocity_key = jax.random.split(rng, 3)
         rest = self._rest()
         q = self._place(root_key, rest.q)
@@ -292,13 +292,14 @@ class PhysicsEnv(Env):
 
     def fixed_state(self) -> State:
         """Returns the state of a reset without noise: the default pose, at rest."""
-        require_precision(self._dtype)
+        inputs.require_precision(self._dtype)
         return self._first_state(self._rest())
 
     def step(self, state: State, action: Action, params: Params = None) -> State:
         """Advances by one control step, or freezes a world at fault."""
-        require_precision(self._dtype)
-        action = checked_action(action, self.action_size, self._dtype)
+        inputs.require_precision(self._dtype)
+        inputs.require_state(state, "fault")
+        action = inputs.checked_action(action, self.action_size, self._dtype)
         # The physics freezes a world at fault and passes no gradient through it; a
         # world that was at fault before is handed over as one. The outcome sees numbers
         # instead, so that its zero gradient is not 0 * nan (double where).
@@ -327,7 +328,7 @@ class PhysicsEnv(Env):
     @property
     def default_params(self) -> physics.PhysicsParams:
         """Physical parameters of one world as in the robot's files."""
-        require_precision(self._dtype)
+        inputs.require_precision(self._dtype)
         return physics.default_params(self.system)
 
     @property

@@ -19,6 +19,12 @@ class HalfCheetah(PhysicsEnv):
 
     Observation: ``observation_layout``. Reward: velocity along x minus a cost of
     control. Never done.
+
+    Metrics:
+        x_position: x of the trunk [m].
+        x_velocity: Its velocity along x [m/s].
+        reward_run: That velocity, weighted.
+        reward_ctrl: Minus the cost of control [-].
     """
 
     forward_reward_name = "reward_run"

@@ -19,6 +19,13 @@ class Hopper(PhysicsEnv):
 
     Observation: ``observation_layout``. Reward: velocity along x, plus a bonus for
     being healthy, minus a cost of control. Done when unhealthy.
+
+    Metrics:
+        reward_forward: Velocity of the torso along x, weighted.
+        reward_ctrl: Minus the cost of control [-].
+        reward_healthy: Bonus for being healthy [-].
+        x_position: x of the torso [m].
+        x_velocity: Its velocity along x [m/s].
     """
 
     forward_reward_name = "reward_forward"

@@ -32,6 +32,17 @@ class Humanoid(PhysicsEnv):
     Observation: ``observation_layout``. Reward: velocity of the centre of mass along
     x, plus a bonus for being healthy, minus a cost of control. Done when unhealthy.
     Only the shins touch the ground: the rest falls through it, as in the original.
+
+    Metrics:
+        forward_reward: Velocity of the centre of mass along x, weighted.
+        reward_linvel: The same.
+        reward_quadctrl: Minus the cost of control [-].
+        reward_alive: Bonus for being healthy [-].
+        x_position: x of the robot's centre of mass [m].
+        y_position: Its y [m].
+        distance_from_origin: Length of its position, height included [m].
+        x_velocity: Its velocity along x [m/s].
+        y_velocity: That along y [m/s].
     """
 
     forward_reward_name: str | None = "reward_linvel"

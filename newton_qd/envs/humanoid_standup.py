@@ -19,6 +19,10 @@ class HumanoidStandup(Humanoid):
     The observation is the humanoid's. Reward: height of the torso over the duration of
     a step, plus 1, minus a cost of control. Never done. Torso, shins and lower arms
     touch the ground.
+
+    Metrics:
+        reward_linup: Height of the torso over the duration of a step [m/s].
+        reward_quadctrl: Minus the cost of control [-].
     """
 
     forward_reward_name = None

@@ -20,6 +20,12 @@ class HumanoidTrap(Humanoid):
     The robot is the humanoid, in front of a trap that its shins run into. Its
     observation ends with contact velocity changes of every body, of the ground and of
     the walls, unclipped.
+
+    Metrics:
+        reward_linvel: Velocity of the centre of mass along x, weighted.
+        reward_quadctrl: The cost of control [-]: above 0, as in the original.
+        reward_alive: Bonus for being healthy [-].
+        reward_impact: 0, as in the original.
     """
 
     @checked_options

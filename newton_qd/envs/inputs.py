@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from newton_qd.envs.state import State
 from newton_qd.physics.system import System
 from newton_qd.types import Action, Params
 
@@ -47,6 +48,30 @@ def refuse_params(params: Params) -> None:
             f"params: {type(params).__name__} given, and this environment has no "
             "physical parameters; allowed: None"
         )
+
+
+def require_state(state: State, *keys: str) -> None:
+    """Raises for what is no state, or one of an environment with fewer wrappers.
+
+    Args:
+        state: What a step was given.
+        *keys: What the step reads of its ``info``.
+
+    Raises:
+        TypeError: It is no ``State``.
+        ValueError: Its ``info`` lacks a key.
+    """
+    if not isinstance(state, State):
+        raise TypeError(
+            f"state: type {type(state).__name__} given; allowed: a State that reset or "
+            "step returned"
+        )
+    for key in keys:
+        if key not in state.info:
+            raise ValueError(
+                f"state: info has no {key!r}; allowed: a state that reset or step of "
+                "this environment returned, wrappers included"
+            )
 
 
 def checked_action(action: Action, size: int, dtype: np.dtype) -> Action:

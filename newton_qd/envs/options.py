@@ -40,9 +40,15 @@ def _anything(name: str, value: Any) -> None:
     del name, value
 
 
-def _number(name: str, value: Any) -> None:
+def check_number(name: str, value: Any) -> None:
+    """Raises where a number is none, or scales noise and is below 0.
+
+    Raises:
+        TypeError: It is no number.
+        ValueError: It is not finite, or below 0 and scales noise.
+    """
     allowed = "finite numbers from 0" if "noise_scale" in name else "finite numbers"
-    if not _is_number(value):
+    if not is_number(value):
         raise TypeError(f"{name}={value!r}: allowed: {allowed}")
     if not math.isfinite(value) or ("noise_scale" in name and value < 0):
         raise ValueError(f"{name}={value!r}: allowed: {allowed}")
@@ -52,7 +58,7 @@ def _range(name: str, value: Any) -> None:
     allowed = "two numbers, lowest below highest"
     if not isinstance(value, (tuple, list, np.ndarray)) or len(value) != 2:
         raise TypeError(f"{name}={value!r}: allowed: {allowed}")
-    if not all(_is_number(end) for end in value):
+    if not all(is_number(end) for end in value):
         raise TypeError(f"{name}={value!r}: allowed: {allowed}")
     if not value[0] < value[1]:
         raise ValueError(f"{name}={value!r}: allowed: {allowed}")
@@ -96,12 +102,13 @@ def float_type(dtype: Any) -> np.dtype:
     return found
 
 
-def _is_number(value: Any) -> bool:
+def is_number(value: Any) -> bool:
+    """Returns whether a value is a real number; ``True`` and ``False`` are none."""
     return isinstance(value, numbers.Real) and not isinstance(value, bool)
 
 
 _CHECKS: dict[str, Callable[[str, Any], None]] = {
-    "float": _number,
+    "float": check_number,
     "tuple[float, float]": _range,
     "bool": check_flag,
 }

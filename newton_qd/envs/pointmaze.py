@@ -9,7 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from newton_qd.envs.base import QDEnv
-from newton_qd.envs.inputs import checked_action, refuse_params, require_precision
+from newton_qd.envs.inputs import (
+    checked_action,
+    refuse_params,
+    require_precision,
+    require_state,
+)
 from newton_qd.envs.options import float_type
 from newton_qd.envs.state import State
 from newton_qd.envs.vectors import length, rounded
@@ -27,7 +32,8 @@ class PointMaze(QDEnv):
     ``pipeline_state`` is empty. The lower wall leaves a gap at the left, the upper one
     at the right; a point that would cross a wall stops at its face and slides. Whether
     it crosses is decided where its path meets the lower face of the wall. Lengths
-    have no unit. Reward: minus the distance to the goal. Done in the goal zone.
+    have no unit. Actions are clipped to the borders of the box, x and y each. Reward:
+    minus the distance to the goal. Done in the goal zone.
     """
 
     def __init__(
@@ -49,7 +55,8 @@ class PointMaze(QDEnv):
         """Sets up the maze.
 
         Args:
-            scale_action_space: An action moves the point by itself over this.
+            scale_action_space: An action, clipped to the borders of the box, moves the
+                point by itself over this.
             x_min: Left border of the box.
             x_max: Right border.
             y_min: Lower border, below -0.7: a reset puts the point between them.
@@ -104,6 +111,7 @@ class PointMaze(QDEnv):
     def step(self, state: State, action: Action, params: Params = None) -> State:
         """Moves the point, or freezes it where something is not finite."""
         require_precision(self._dtype)
+        require_state(state, "fault")
         refuse_params(params)
         action = checked_action(action, self.action_size, self._dtype)
         old = state.obs
@@ -220,6 +228,11 @@ class PointMaze(QDEnv):
     def observation_layout(self) -> tuple[tuple[str, int], ...]:
         """Name and size of each block of the observation, in order."""
         return (("position x y", 2),)
+
+    @property
+    def reach(self) -> float:
+        """How far an action of 1 moves the point."""
+        return 1 / self._scale
 
     @property
     def goal(self) -> tuple[float, float]:

@@ -27,6 +27,12 @@ class Pusher(PhysicsEnv):
     its goal, minus half of its distance from the hand, both at the start of the step,
     minus a cost of control. Never done. There is no friction: an object that was
     pushed slides on.
+
+    Metrics:
+        reward_dist: Minus the distance of the object from its goal [m].
+        reward_ctrl: Minus the sum of squared actions, before its weight of 0.1 [-].
+        reward_near: Minus the distance of the object from the hand, before its weight
+            of 0.5 [m].
     """
 
     reads_bodies = True

@@ -26,6 +26,10 @@ class Reacher(PhysicsEnv):
     Observation: ``observation_layout``. Reward: minus the distance of the tip from the
     target, minus the sum of squared actions. Never done. The target is a body of the
     simulation that nothing moves.
+
+    Metrics:
+        reward_dist: Minus the distance of the tip from the target [m].
+        reward_ctrl: Minus the sum of squared actions [-].
     """
 
     _row: Robot = REACHER
@@ -117,6 +121,10 @@ class ReacherAngle(Reacher):
     An action from -1 to 1 is the angle that a joint is driven to, from one end of its
     range to the other; beyond, it is clipped. Reward: minus the distance of the tip
     from the target. Never done.
+
+    Metrics:
+        rewardDist: Minus the distance of the tip from the target [m].
+        rewardCtrl: 0, as in the original.
     """
 
     _row = REACHERANGLE

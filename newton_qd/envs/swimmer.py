@@ -37,6 +37,17 @@ class Swimmer(PhysicsEnv):
     minus a cost of control. Never done. The water drags each link at its centre of
     mass: against its velocity, and more across the link than along it; the drag is
     that of the start of a step.
+
+    Metrics:
+        reward_fwd: Velocity of the centre of mass along x, weighted.
+        reward_ctrl: Minus the cost of control [-].
+        x_position: x of the centre of mass of all links [m].
+        y_position: Its y [m].
+        distance_from_origin: Distance of the first link's centre of mass from the
+            origin [m].
+        x_velocity: Velocity of the centre of mass along x [m/s].
+        y_velocity: That along y [m/s].
+        forward_reward: The same as ``reward_fwd``.
     """
 
     forward_reward_name = "reward_fwd"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import numbers
+import os
 from collections.abc import Callable
 
 from newton_qd.physics.xml_reader import RobotDescriptionError
@@ -92,6 +93,12 @@ def _check_unique(robot: Robot, field: str, names: list[str]) -> None:
         )
 
 
+def _pair_name(pair: tuple[Contact, Contact]) -> str:
+    """Name of a pair, in whichever order it is written."""
+    ends = (":".join(filter(None, (end.link, end.collider))) for end in pair)
+    return " and ".join(sorted(ends))
+
+
 def _check_types(robot: Robot) -> None:
     """Checks that a row can be read: what its fields hold, not yet their values.
 
@@ -102,6 +109,15 @@ def _check_types(robot: Robot) -> None:
     if not isinstance(robot, Robot):
         raise TypeError(
             f"robot={robot!r}: allowed: a Robot, such as newton_qd.robots.ANT"
+        )
+    if not isinstance(robot.name, str) or not robot.name:
+        raise RobotDescriptionError(
+            f"robot, name={robot.name!r}; allowed: a text that is not empty"
+        )
+    if not isinstance(robot.urdf, (str, os.PathLike)):
+        raise RobotDescriptionError(
+            f"robot {robot.name!r}, urdf={robot.urdf!r}; allowed: a path, such as "
+            '"robot.urdf"'
         )
     for field, (is_entry, allowed) in _TUPLES.items():
         value = getattr(robot, field)
@@ -174,7 +190,8 @@ def check_row(robot: Robot) -> None:
                 f"robot {robot.name!r}, servos: {joint!r} is not driven; allowed: "
                 f"{', '.join(driven) or 'none, as actuators is empty'}"
             )
-    if not isinstance(robot.substeps, int) or robot.substeps < 1:
+    substeps = robot.substeps
+    if not isinstance(substeps, int) or isinstance(substeps, bool) or substeps < 1:
         raise RobotDescriptionError(
             f"robot {robot.name!r}, substeps={robot.substeps!r}; allowed: 1, 2, ..."
         )
@@ -182,6 +199,7 @@ def check_row(robot: Robot) -> None:
     _check_unique(robot, "actuators", [joint for joint, _ in robot.actuators])
     _check_unique(robot, "rest_pose", [joint for joint, _ in robot.rest_pose])
     _check_unique(robot, "feet", list(robot.feet))
+    _check_unique(robot, "pairs", [_pair_name(pair) for pair in robot.pairs])
     touching = {contact.link for contact in robot.contacts}
     for foot in robot.feet:
         if foot not in touching:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from newton_qd.envs.inputs import require_state
 from newton_qd.envs.state import State, select
 from newton_qd.types import READINGS, Action, Params, RNGKey
 from newton_qd.wrappers.base import Wrapper
@@ -35,6 +36,7 @@ class AutoResetWrapper(Wrapper):
 
     def step(self, state: State, action: Action, params: Params = None) -> State:
         """Advances by one step, then returns the finished worlds."""
+        require_state(state, "first_obs")
         begins = state.done > 0
         counters = {key: state.info[key] for key in _COUNTERS if key in state.info}
         zeros = {key: jnp.zeros_like(value) for key, value in counters.items()}

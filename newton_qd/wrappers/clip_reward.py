@@ -7,6 +7,7 @@ import math
 import jax.numpy as jnp
 
 from newton_qd.envs.base import Env
+from newton_qd.envs.options import is_number
 from newton_qd.envs.state import State
 from newton_qd.types import Action, Params, RNGKey
 from newton_qd.wrappers.base import Wrapper
@@ -29,7 +30,7 @@ class ClipRewardWrapper(Wrapper):
             clip_max: Highest reward, not below ``clip_min``; ``None``: no limit.
         """
         for name, value in (("clip_min", clip_min), ("clip_max", clip_max)):
-            if value is not None and math.isnan(value):
+            if value is not None and (not is_number(value) or math.isnan(value)):
                 raise ValueError(f"{name}={value!r}: allowed: None, or a number")
         if clip_min is not None and clip_max is not None and clip_min > clip_max:
             raise ValueError(

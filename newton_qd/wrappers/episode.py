@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from newton_qd.envs.base import Env
+from newton_qd.envs.inputs import require_state
 from newton_qd.envs.options import check_count
 from newton_qd.envs.state import State
 from newton_qd.types import Action, Params, RNGKey
@@ -47,6 +48,7 @@ class EpisodeWrapper(Wrapper):
 
     def step(self, state: State, action: Action, params: Params = None) -> State:
         """Repeats the action; the rewards are summed, the rest is of the last."""
+        require_state(state, "steps")
         nstate, steps = state, state.info["steps"]
         if self.action_repeat == 1:
             steps = steps + _moving(state)

@@ -41,6 +41,11 @@ class FixedInitialStateWrapper(Wrapper):
                 ``None``: that of the environment.
         """
         base = env.unwrapped
+        if get_obs_fn is not None and not callable(get_obs_fn):
+            raise TypeError(
+                f"get_obs_fn={get_obs_fn!r}: allowed: None, or a function of (qp, "
+                "info, action)"
+            )
         if get_obs_fn is not None and not isinstance(base, PhysicsEnv):
             raise NotImplementedError(
                 f"This wrapper does not support {base_env_name or base.name} yet. "

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
-
 from newton_qd.envs.base import Env
+from newton_qd.envs.options import check_number
 from newton_qd.envs.state import State
 from newton_qd.types import Action, Params, RNGKey
 from newton_qd.wrappers.base import Wrapper
@@ -20,8 +19,7 @@ class OffsetRewardWrapper(Wrapper):
             env: The environment; an action that it repeats gets the offset once.
             offset: What is added, as ``newton_qd.reward_offset[name]``.
         """
-        if not math.isfinite(offset):
-            raise ValueError(f"offset={offset!r}: allowed: finite numbers")
+        check_number("offset", offset)
         super().__init__(env)
         self._offset = float(offset)
 
