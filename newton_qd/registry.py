@@ -220,20 +220,13 @@ def create(
         ("fixed_init_state", fixed_init_state),
     ):
         check_flag(name, flag)
-    if material is not None and not isinstance(material, Material):
-        raise TypeError(
-            f"material={material!r}: allowed: None, newton_qd.robots.Material"
-        )
     options = _wrapper_options(env_name, row, qdax_wrappers_kwargs)
     if episode_length is None and (action_repeat != 1 or eval_metrics):
         raise ValueError(
             f"episode_length=None with action_repeat={action_repeat!r}, eval_metrics="
             f"{eval_metrics!r}; allowed: 1 and False, or an episode length"
         )
-    _require_keywords(env_name, row.base, kwargs)
-    env = row.base(**kwargs)
-    if material is not None:
-        env = env.with_material(material)
+    env = _base(env_name, row, material, kwargs)
     if fixed_init_state:
         env = FixedInitialStateWrapper(env, row.base_name)
     for wrapper_row, chosen in zip(row.wrappers, options, strict=True):
@@ -260,6 +253,22 @@ def _row(env_name: str) -> EnvironmentRow:
     if row is None:
         raise UnknownEnvironment(env_name, registered_envs())
     return row
+
+
+def _base(
+    env_name: str,
+    row: EnvironmentRow,
+    material: Material | None,
+    options: Mapping[str, Any],
+) -> Env:
+    """Returns the environment inside all wrappers."""
+    if material is not None and not isinstance(material, Material):
+        raise TypeError(
+            f"material={material!r}: allowed: None, newton_qd.robots.Material"
+        )
+    _require_keywords(env_name, row.base, options)
+    env = row.base(**options)
+    return env if material is None else env.with_material(material)
 
 
 def _require_keywords(

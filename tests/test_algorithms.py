@@ -85,7 +85,7 @@ def test_defaults_of_an_environment_are_accepted(env_name: str) -> None:
             hidden=(4,),
             grid=(4,) * task.descriptor_length,
         )
-        Search(config, task)
+        assert Search(config, task).empty().metrics.shape[0] == 0, name
 
 
 @pytest.mark.slow

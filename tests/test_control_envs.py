@@ -193,6 +193,7 @@ def test_swimmer_weights() -> None:
     _, after, _ = rolled("swimmer", forward_reward_weight=3.0, ctrl_cost_weight=0.5)
     agree(after.metrics["reward_fwd"], 3 * plain.metrics["reward_fwd"])
     agree(after.metrics["reward_ctrl"], 5000 * plain.metrics["reward_ctrl"])
+    assert np.any(plain.metrics["reward_fwd"]) and np.any(plain.metrics["reward_ctrl"])
 
 
 def test_drag_is_that_of_the_links() -> None:

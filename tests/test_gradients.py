@@ -141,6 +141,7 @@ def test_gradient_and_vmap_commute() -> None:
     batch = jax.vmap(value)
     outer = jax.jit(jax.grad(lambda *x: batch(*x).sum(), argnums=(0, 1, 2)))(*states)
     same(outer, inner)
+    assert all(np.any(x) for x in inner)
     pairs = tuple(x.reshape(2, 4, -1) for x in states)
     nested = jax.jit(jax.vmap(jax.vmap(gradient)))(*pairs)
     same([x.reshape(8, -1) for x in nested], inner)

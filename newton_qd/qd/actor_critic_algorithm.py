@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
 from typing import Any
 
 from newton_qd.qd.actor_critic import ActorCritic, ActorCriticSettings, measure_of
 from newton_qd.qd.config import ConfigError, EvolveConfig
 from newton_qd.qd.gradient_options import checked, differentiable
 from newton_qd.qd.parts import Algorithm, Parts, isoline_emitter, settings
-
-TUNED: Mapping[str, Mapping[str, Any]] = {}
-"""Defaults of options that differ for an environment."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -49,8 +45,8 @@ class ActorCriticOptions(ActorCriticSettings):
 
 
 def _options(config: EvolveConfig) -> ActorCriticOptions:
-    """Options of a run, with the defaults of its environment."""
-    return settings(ActorCriticOptions, config, **TUNED.get(config.env_name, {}))
+    """Options of a run."""
+    return settings(ActorCriticOptions, config)
 
 
 def _me_actor_critic(parts: Parts) -> Any:
