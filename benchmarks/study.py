@@ -2,14 +2,14 @@
 
 Every run, of one task, algorithm and seed, has the same budget of seconds: processor
 seconds on a CPU, which depend on what else the machine does only as far as cores share
-caches and memory, and wall-clock seconds on a GPU. Compilation is left out: all functions run once on a state that is
-thrown away before the clock starts. What evaluates the elites again, for corrected
-metrics, runs after the clock has stopped.
+caches and memory, and wall-clock seconds on a GPU. Compilation is left out: all
+functions run once on a state that is thrown away before the clock starts. What
+evaluates the elites again, for corrected metrics, runs after the clock has stopped.
 
 A run is a process of its own and writes one csv file when it is finished; runs whose
 file exists are left out, so that a study can be stopped and continued. Settings of
-tasks are in ``study/TASK.toml``, those of algorithms in ``study/variants.toml``. Which variant is best on a task is found first, with another
-seed:
+tasks are in ``study/TASK.toml``, those of algorithms in ``study/variants.toml``. Which
+variant is best on a task is found first, with another seed:
 
     python benchmarks/study.py --tune --seconds 20 --workers 2 --out tuning
     python benchmarks/study.py --tuned tuning --seconds 60 --workers 2 --out runs

@@ -3,11 +3,13 @@
     python benchmarks/throughput.py [--env ant_uni] [--batches 1024 4096]
     python benchmarks/throughput.py --suite [--batches 1024] [--names humanoid antmaze]
                                     [--clock processor]
+    python benchmarks/throughput.py --ratios [--batches 128] [--names ant hopper]
 
 A figure counts only if every state stays finite; times are medians after a warm-up,
 with the result waited for. ``--suite`` compares every environment with the ant: both
 take turns, so that what else the machine does matters little, and the speed is counted
 per degree of freedom and contact. On a CPU that others use too, compare processor time.
+``--ratios`` says how much longer a step with its gradient takes, for every environment.
 """
 
 from __future__ import annotations
@@ -142,6 +144,21 @@ def size(name: str) -> tuple[int, int]:
     return base.system.nv, len(base.system.contact_body)
 
 
+def ratios(names: list[str], batch: int, options: argparse.Namespace) -> None:
+    """Prints what a gradient costs in every environment, relative to the step."""
+    print(f"batch {batch} on {jax.devices()[0]}, thousand environment steps per second")
+    print("| environment | forward | forward + backward | ratio |\n|---|---|---|---|")
+    for name in names:
+        forward, gradient = measure(
+            name, batch, options.steps, options.horizon, options.repetitions
+        )
+        print(
+            f"| `{name}` | {forward / 1e3:.1f} | {gradient / 1e3:.1f} | "
+            f"{forward / gradient:.1f} |",
+            flush=True,
+        )
+
+
 def main() -> None:
     """Print a table of speeds."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -153,7 +170,12 @@ def main() -> None:
     parser.add_argument("--suite", action="store_true")
     parser.add_argument("--clock", choices=CLOCKS, default="wall")
     parser.add_argument("--names", nargs="+", default=newton_qd.registered_envs())
+    parser.add_argument("--ratios", action="store_true")
     options = parser.parse_args()
+    if options.ratios:
+        for batch in options.batches:
+            ratios(options.names, batch, options)
+        return
     if options.suite:
         for batch in options.batches:
             compare(
