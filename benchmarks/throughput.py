@@ -61,15 +61,16 @@ def measure(
     shape = (steps, batch, env.action_size)
     actions = jax.random.uniform(jax.random.key(1), shape, jnp.float32, -1, 1)
 
-    def rewards(actions: jax.Array) -> tuple[Any, jax.Array]:
+    def totals(actions: jax.Array) -> tuple[Any, jax.Array]:
         def step(carry: Any, action: jax.Array) -> tuple[Any, jax.Array]:
             carry = jax.vmap(env.step)(carry, action)
-            return carry, carry.reward
+            # of the observation, too: a reward may be constant, its gradient nothing
+            return carry, carry.reward + carry.obs.sum(axis=-1)
 
         return jax.lax.scan(step, state, actions)
 
-    forward = jax.jit(rewards)
-    gradient = jax.jit(jax.grad(lambda actions: rewards(actions)[1].sum()))
+    forward = jax.jit(totals)
+    gradient = jax.jit(jax.grad(lambda actions: totals(actions)[1].sum()))
     last = forward(actions)[0]
     slope = gradient(actions[:horizon])
     if not (np.isfinite(last.obs).all() and np.isfinite(slope).all()):
