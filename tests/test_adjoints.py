@@ -190,7 +190,8 @@ def test_every_transformation_gives_the_same(x64: None, name: str) -> None:
 RESET, TOTAL = 3, 6  # steps of an episode, and of two
 
 
-@pytest.mark.parametrize("name", _marked(["hopper_uni", "antmaze"], ("hopper_uni",)))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["hopper_uni", "antmaze"])
 def test_no_gradient_crosses_an_auto_reset(x64: None, name: str) -> None:
     """Rewards of the second episode do not depend on actions of the first, exactly."""
     env = newton_qd.create(name, episode_length=RESET, dtype="float64")

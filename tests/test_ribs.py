@@ -128,6 +128,7 @@ def individuals() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["grid", "cvt"])
 def test_archives_survive_the_way_there_and_back(kind: str, individuals: Any) -> None:
     from ribs.archives import CVTArchive, GridArchive

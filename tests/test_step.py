@@ -211,6 +211,7 @@ def test_runs_are_equal() -> None:
     assert_bitwise(outputs(build_system(ANT, "float32"), states), first)
 
 
+@pytest.mark.slow
 def test_another_process_is_equal(device: jax.Device) -> None:
     script = f"""
 import jax
