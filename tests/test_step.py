@@ -377,7 +377,7 @@ def test_a_diverging_world_is_at_fault(speed: float) -> None:
 def test_bad_number_of_lanes(monkeypatch: pytest.MonkeyPatch, text: str) -> None:
     monkeypatch.setenv("NEWTON_QD_LANES", text)
     with pytest.raises(ValueError, match="NEWTON_QD_LANES"):
-        lane_count()
+        lane_count("step_backward")
 
 
 # Steady state
