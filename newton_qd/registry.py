@@ -214,12 +214,9 @@ def create(
         ValueError: A value or a combination is not allowed.
     """
     row = _row(env_name)
-    for name, flag in (
-        ("auto_reset", auto_reset),
-        ("eval_metrics", eval_metrics),
-        ("fixed_init_state", fixed_init_state),
-    ):
-        check_flag(name, flag)
+    check_flag("auto_reset", auto_reset)
+    check_flag("eval_metrics", eval_metrics)
+    check_flag("fixed_init_state", fixed_init_state)
     options = _wrapper_options(env_name, row, qdax_wrappers_kwargs)
     if episode_length is None and (action_repeat != 1 or eval_metrics):
         raise ValueError(

@@ -148,6 +148,29 @@ def load_parameters(
 
 
 @wp.func
+def return_gears(
+    m: Model,
+    g: Scratch,
+    row: Row,
+    x: wp.array[scalar],
+    x_bar: wp.array[scalar],
+    controls: int,
+    gears: int,
+    size: int,
+    count: int,
+    fault: real,
+    lane: int,
+    lanes: int,
+):
+    """Adjoint of the gears, which scale the controls; both are in ``x`` from there."""
+    for k in range(lane, m.nu, lanes):
+        force = load(g.ctrl, row.ctrl + k)
+        value = force * gather(x, controls + k, size, count)
+        scatter(x_bar, gears + k, size, count, choose(fault, real(), value))
+        store(g.ctrl, row.ctrl + k, force * gather(x, gears + k, size, count))
+
+
+@wp.func
 def return_parameters(
     m: Model,
     g: Scratch,
@@ -198,11 +221,7 @@ def return_parameters(
         value = load(g.parameter, start + 4 + 2 * m.nb + k) * constant(m.damping, k)
         scatter(x_bar, dampings + k, size, count, choose(fault, zero, value))
         store(g.parameter, start + 4 + 2 * m.nb + k, zero)
-    for k in range(lane, m.nu, lanes):
-        force = load(g.ctrl, row.ctrl + k)
-        value = force * gather(x, at - m.nu + k, size, count)
-        scatter(x_bar, gears + k, size, count, choose(fault, zero, value))
-        store(g.ctrl, row.ctrl + k, force * gather(x, gears + k, size, count))
+    return_gears(m, g, row, x, x_bar, at - m.nu, gears, size, count, fault, lane, lanes)
     # every lane has read the adjoint of the total mass
     sync(lane)
     if lane == 0:
