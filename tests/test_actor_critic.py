@@ -107,6 +107,7 @@ def test_the_gradient_is_that_of_the_window() -> None:
     )
 
 
+@pytest.mark.slow
 def test_actors_reach_what_they_aim_at() -> None:
     best, lost = learned(method(), (1.0, 0.0, 0.0))
     assert not np.asarray(lost).any()
@@ -182,6 +183,7 @@ def generations(number: int, measure: Any = reading) -> list[tuple[Any, Any, Any
     return rows
 
 
+@pytest.mark.slow
 def test_individuals_are_actors_and_what_lies_between_them_and_elites() -> None:
     made, rows = parts()[0], generations(3)
     for state, offspring, told in rows:

@@ -154,6 +154,7 @@ def test_vmap_over_some_arguments() -> None:
         np.testing.assert_array_equal(many[world], jax.jit(step)(state, action))
 
 
+@pytest.mark.slow
 def test_derivatives_under_vmap() -> None:
     """vmap of grad, grad of vmap and the rows of a Jacobian agree."""
 

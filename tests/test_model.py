@@ -152,6 +152,7 @@ def test_arrays_are_typed_and_read_only(ant: System) -> None:
 # Newton's model, the file and the reference are one robot.
 
 
+@pytest.mark.slow
 def test_reference_agrees_with_newton(ant: System) -> None:
     path = str(find_urdf("ant.urdf"))
     built = model.newton_builder(path, True, 9.8).finalize()

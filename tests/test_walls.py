@@ -72,9 +72,8 @@ def wall_gap(system: System, q: np.ndarray) -> float:
     return min(gaps)
 
 
-@pytest.mark.parametrize(
-    ("steps", "bound"), [(1, 1e-6), pytest.param(8, 1e-4, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("steps", "bound"), [(1, 1e-6), (8, 1e-4)])
 def test_directional_derivatives(x64: None, steps: int, bound: float) -> None:
     system = physics.load_system(ANT, "float64", TRAP)
     inputs = facing(system, np.random.default_rng(0), 50)
