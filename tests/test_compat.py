@@ -330,7 +330,7 @@ def cma_me(task: Setup) -> Any:
         batch_size=16,
         genotype_dim=flat.shape[1],
         centroids=centroids(task),
-        sigma_g=0.5,
+        sigma_g=0.1,
         min_count=1,
     )
     pool = CMAPoolEmitter(num_states=2, emitter=emitter)
@@ -348,22 +348,20 @@ def centroids(task: Setup) -> Any:
     )
 
 
-SLOW = pytest.mark.slow
+TASKS = ("ant_uni", "walker2d_uni", "pointmaze", "ant_omni", "anttrap")
+ALGORITHMS = (me, pga_me, dcrl_me, qdpg, me_es, cma_me)
 
 
 @pytest.mark.parametrize(
     ("algorithm", "name"),
     [
-        (me, "pointmaze"),
-        pytest.param(me, "ant_uni", marks=SLOW),
-        pytest.param(me, "walker2d_uni", marks=SLOW),
-        pytest.param(me, "ant_omni", marks=SLOW),
-        pytest.param(me, "anttrap", marks=SLOW),
-        pytest.param(pga_me, "ant_uni", marks=SLOW),
-        pytest.param(dcrl_me, "ant_omni", marks=SLOW),
-        pytest.param(qdpg, "anttrap", marks=SLOW),
-        pytest.param(me_es, "walker2d_uni", marks=SLOW),
-        pytest.param(cma_me, "pointmaze", marks=SLOW),
+        pytest.param(
+            algorithm,
+            name,
+            marks=[] if (algorithm, name) == (me, "pointmaze") else [pytest.mark.slow],
+        )
+        for algorithm in ALGORITHMS
+        for name in TASKS
     ],
 )
 def test_the_archive_grows_and_its_best_improves(algorithm: Any, name: str) -> None:
