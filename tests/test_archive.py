@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
+import io
 import os
 from pathlib import Path
 from typing import Any
@@ -80,7 +82,13 @@ def test_what_is_no_archive_is_refused(tmp_path: Path) -> None:
     for change, message in (
         ({"format": np.asarray(2)}, r"has format 2; this version .* reads format 1"),
         ({"colours": np.zeros(3)}, r"holds the arrays .*'colours'"),
-        ({"fitnesses": np.zeros(2)}, r"arrays of different lengths: .*'fitnesses': 2"),
+        ({"format": np.ones(2)}, r"has format \[1. 1.\]"),
+        ({"format": np.asarray("1")}, r"has format 1; this version .* reads format 1"),
+        ({"fitnesses": np.zeros(2)}, r"do not fit together: .*'fitnesses': \(2,\)"),
+        ({"fitnesses": np.zeros((3, 1))}, r"'fitnesses': \(3, 1\)"),
+        ({"descriptors": np.zeros((3, 3))}, r"'descriptors': \(3, 3\)"),
+        ({"genotypes": np.asarray(1.0)}, r"'genotypes': \(\)"),
+        ({"genotypes": np.full((3, 2), "a")}, "genotypes are <U1, not floats"),
     ):
         np.savez(tmp_path / "archive.npz", **{**arrays, **change})
         with pytest.raises(ArchiveError, match=message):
@@ -96,6 +104,21 @@ def test_every_damage_of_an_archive_is_found(tmp_path: Path) -> None:
     flipped = content[:data] + b"\xff" + content[data + 1 :]
     with pytest.raises(ArchiveError, match=r"archive\.npz is damaged.*CRC"):
         load_archive(write(tmp_path, flipped))
+    bare = io.BytesIO()
+    np.save(bare, np.zeros(3))
+    with pytest.raises(ArchiveError, match=r"archive\.npz is damaged"):
+        load_archive(write(tmp_path, bare.getvalue()))
+
+
+def test_no_damaged_byte_raises_anything_else(tmp_path: Path) -> None:
+    content = archive_bytes(small())
+    kept = 0
+    for at in range(len(content)):
+        damaged = content[:at] + bytes([content[at] ^ 0x41]) + content[at + 1 :]
+        with contextlib.suppress(ArchiveError):
+            load_archive(write(tmp_path, damaged))
+            kept += 1
+    assert kept < len(content) / 2  # dates and the like are not read
 
 
 # --- folders that cannot be written to -------------------------------------

@@ -6,6 +6,7 @@ import dataclasses
 import io
 import os
 import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -16,6 +17,21 @@ from newton_qd.qd.checkpoint import npz_bytes
 ARCHIVE = "archive.npz"
 FORMAT = 1
 """Number of the file's format. Who changes it keeps a reader for each earlier one."""
+
+
+# What NumPy and zipfile raise for bytes that are not what they seem.
+_DAMAGE = (
+    AttributeError,
+    EOFError,
+    KeyError,
+    NotImplementedError,
+    OSError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
 
 
 class ArchiveError(RuntimeError):
@@ -61,16 +77,16 @@ def load_archive(folder: str | os.PathLike[str]) -> Archive:
         FileNotFoundError: There is none.
     """
     path = Path(folder) / ARCHIVE
+    # NumPy leaves a file that it cannot read open.
+    content = io.BytesIO(path.read_bytes())
     try:
-        # NumPy leaves a file that it cannot read open.
-        content = io.BytesIO(path.read_bytes())
         with np.load(content, allow_pickle=False) as arrays:
             found = {name: arrays[name] for name in arrays.files}
-    except (AttributeError, EOFError, ValueError, zipfile.BadZipFile) as error:
+    except _DAMAGE as error:
         raise ArchiveError(f"{path} is damaged: {error}") from error
     # The first files of format 1 carry no number.
-    version = int(found.pop("format", FORMAT))
-    if version != FORMAT:
+    version = found.pop("format", np.asarray(FORMAT))
+    if version.shape != () or version.dtype.kind not in "iu" or version != FORMAT:
         raise ArchiveError(
             f"{path} has format {version}; this version of newton_qd reads format "
             f"{FORMAT}"
@@ -85,7 +101,18 @@ def _from_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> Archive:
         raise ArchiveError(
             f"{path} holds the arrays {sorted(arrays)}, not {sorted(names)}"
         )
-    rows = {name: len(arrays[name]) for name in names}
-    if len(set(rows.values())) != 1:
-        raise ArchiveError(f"{path} holds arrays of different lengths: {rows}")
+    shapes = {name: arrays[name].shape for name in names}
+    cells, size = [*shapes["genotypes"], 0, 0][:2]
+    width = [*shapes["centroids"], 0, 0][1]
+    allowed = {
+        "genotypes": (cells, size),
+        "fitnesses": (cells,),
+        "descriptors": (cells, width),
+        "centroids": (cells, width),
+    }
+    if shapes != allowed:
+        raise ArchiveError(f"{path} holds arrays that do not fit together: {shapes}")
+    for name in names:
+        if arrays[name].dtype.kind != "f":
+            raise ArchiveError(f"{path}: {name} are {arrays[name].dtype}, not floats")
     return Archive(**arrays)
