@@ -378,10 +378,11 @@ def unbeatable(genotypes: jax.Array, key: jax.Array) -> tuple:
     [
         (RestartRule.BASIC, 3, [1, 2, 0, 1, 2, 0]),
         (RestartRule.NO_IMPROVEMENT, None, [0, 0, 0, 0, 0, 0]),
+        ("no_improvement", None, [0, 0, 0, 0, 0, 0]),
     ],
 )
 def test_points_restart_from_elites(
-    rule: RestartRule, period: int | None, expected: list[int]
+    rule: Any, period: int | None, expected: list[int]
 ) -> None:
     emitter = CMAMEGAEmitter(
         unbeatable, sigma_g=0.5, batch_size=8, restart_rule=rule, restart_period=period

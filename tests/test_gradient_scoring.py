@@ -37,6 +37,21 @@ def smooth_task() -> Task:
     return Task(SmoothPoint(), get_final_xy_position, (-two, two), rough.labels, 5.0)
 
 
+@pytest.mark.parametrize(
+    "make", [make_scoring_function, make_gradient_scoring_function]
+)
+def test_genotypes_that_are_no_weights(make: Any) -> None:
+    task = smooth_task()
+    policy = make_policy(task.env, (4,))
+    score, key = make(task, policy, STEPS), jax.random.key(1)
+    for shape in ((4, policy.size + 1), (policy.size,)):
+        with pytest.raises(ValueError, match=r"genotypes: shape \(.*allowed: \(N, "):
+            score(jnp.zeros(shape), key)
+    whole = score(jnp.ones((2, policy.size), jnp.int32), key)
+    real = score(jnp.ones((2, policy.size)), key)
+    np.testing.assert_array_equal(whole[0], real[0])
+
+
 def test_scores_are_those_without_gradients_and_point_uphill() -> None:
     task = smooth_task()
     policy = make_policy(task.env, (4,))

@@ -12,6 +12,7 @@ import pytest
 from test_evolve import SMALL, PointEnv, point_task, run
 
 from newton_qd.errors import MissingExtra
+from newton_qd.qd.emitters import GradientsError
 from newton_qd.qd.ribs import from_ribs, make_ribs_evaluation, to_ribs
 from newton_qd.qd.rollout import make_policy, make_scoring_function
 
@@ -77,6 +78,30 @@ def test_faulty_individuals_have_the_worst_objective() -> None:
     np.testing.assert_array_equal(measures, 0.0)
     with pytest.raises(ValueError, match="worst=-inf: allowed: a finite number"):
         make_ribs_evaluation(score, key, limits=LIMITS, worst=-np.inf)
+
+
+def test_what_pyribs_would_refuse_counts_as_faulty() -> None:
+    descriptors = jnp.array([[0.5, 0.5], [0.5, jnp.nan], [0.5, 0.5]])
+    gradients = jnp.ones((3, 4, 3)).at[2, 1, 0].set(jnp.inf)
+
+    def score(genotypes: jax.Array, key: jax.Array) -> Any:
+        return jnp.ones(3), descriptors, {"gradients": gradients}
+
+    common: dict[str, Any] = {"limits": LIMITS, "worst": -100.0}
+    solutions, key = np.zeros((3, 4)), jax.random.key(0)
+    plain = make_ribs_evaluation(score, key, **common)(solutions)
+    np.testing.assert_array_equal(plain[0], [1, -100, 1])
+    np.testing.assert_array_equal(plain[1], [[0.5, 0.5], [0, 0], [0.5, 0.5]])
+    dqd = make_ribs_evaluation(score, key, jacobian=True, **common)(solutions)
+    np.testing.assert_array_equal(dqd[0], [1, -100, -100])
+    np.testing.assert_array_equal(dqd[2].any(axis=(1, 2)), [True, False, False])
+
+    def without(genotypes: jax.Array, key: jax.Array) -> Any:
+        return jnp.ones(3), descriptors, {}
+
+    evaluate = make_ribs_evaluation(without, key, jacobian=True, **common)
+    with pytest.raises(GradientsError, match=r"'gradients'\] is missing"):
+        evaluate(solutions)
 
 
 @pytest.mark.slow
@@ -169,13 +194,24 @@ def test_what_evolve_has_found_becomes_a_ribs_archive() -> None:
 
 
 def test_what_cannot_be_converted(monkeypatch: pytest.MonkeyPatch) -> None:
-    from ribs.archives import ProximityArchive
+    from ribs.archives import (
+        GridArchive,
+        ProximityArchive,
+        SlidingBoundariesArchive,
+    )
 
     archive = ProximityArchive(
         solution_dim=2, measure_dim=2, k_neighbors=1, novelty_threshold=0.1
     )
     with pytest.raises(TypeError, match="archive=ProximityArchive: allowed: Grid"):
         from_ribs(archive)
+    ranges: Any = [(0, 1), (0, 1)]
+    sliding = SlidingBoundariesArchive(solution_dim=2, dims=(4, 4), ranges=ranges)
+    with pytest.raises(TypeError, match="archive=SlidingBoundariesArchive: allowed"):
+        from_ribs(sliding)
+    matrices = GridArchive(solution_dim=(2, 3), dims=(4, 4), ranges=ranges)
+    with pytest.raises(TypeError, match=r"solution_dim=\(2, 3\): allowed: an integer"):
+        from_ribs(matrices)
     monkeypatch.setitem(sys.modules, "ribs", None)
     with pytest.raises(MissingExtra, match=r"newton_qd\[ribs\]"):
         to_ribs(None, LIMITS)

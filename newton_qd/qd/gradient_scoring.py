@@ -48,7 +48,8 @@ def make_gradient_scoring_function(
         an axis of 1 + D behind; ``normalized_grads``, the same with Euclidean norm 1
         over a genotype, or 0 where the gradient is; ``faulty`` (N,) and ``overflowed``
         (N, 1 + D), whose gradients were set to 0. The fitness of a faulty individual
-        is ``-inf``.
+        is ``-inf``. With a :class:`~newton_qd.qd.Policy` it raises ``ValueError`` for
+        genotypes that are not weights of it.
     """
     flat = isinstance(policy, Policy)
     unravel = {"unravel": policy.unravel} if flat else {}
@@ -64,20 +65,23 @@ def make_gradient_scoring_function(
     def score(
         genotypes: Any, key: jax.Array
     ) -> tuple[jax.Array, jax.Array, dict[str, Any]]:
+        if isinstance(policy, Policy):
+            genotypes = policy.weights(genotypes)
         result: EpisodeGradients = gradient(genotypes, key)
-        unit = jax.vmap(jax.vmap(_unit))(result.gradients)
-        return (
-            result.fitnesses,
-            result.descriptors,
-            {
-                "gradients": _rows_last(result.gradients),
-                "normalized_grads": _rows_last(unit),
-                "faulty": result.faulty,
-                "overflowed": result.overflowed,
-            },
-        )
+        return result.fitnesses, result.descriptors, _extra_scores(result)
 
     return score
+
+
+def _extra_scores(result: EpisodeGradients) -> dict[str, Any]:
+    """Returns gradients in QDax's layout, and what befell them."""
+    unit = jax.vmap(jax.vmap(_unit))(result.gradients)
+    return {
+        "gradients": _rows_last(result.gradients),
+        "normalized_grads": _rows_last(unit),
+        "faulty": result.faulty,
+        "overflowed": result.overflowed,
+    }
 
 
 def _unit(gradient: Any) -> Any:

@@ -33,7 +33,8 @@ def make_ribs_evaluation(
     Args:
         score: As made by ``make_scoring_function``; with ``jacobian`` its third
             result holds ``"gradients"`` (N, size, 1 + D): of the fitness, then of
-            each descriptor, not normalized; ``make_gradient_scoring_function``.
+            each descriptor, not normalized; ``make_gradient_scoring_function``. An
+            individual with anything that is not finite counts as faulty.
         key: Key for the resets.
         limits: Lowest and highest descriptor, (D,) each, as in ``Task.limits``.
         worst: Objective of an individual whose world was faulty; pyribs takes no
@@ -46,7 +47,8 @@ def make_ribs_evaluation(
         and, with ``jacobian``, gradients (N, 1 + D, size).
 
     Raises:
-        ValueError: ``worst`` is not finite.
+        ValueError: ``worst`` is not finite. The function raises ``GradientsError``
+            where gradients are missing or have another shape.
     """
     if not np.isfinite(worst):
         raise ValueError(f"worst={worst!r}: allowed: a finite number")
@@ -55,14 +57,15 @@ def make_ribs_evaluation(
     @jax.jit
     def run(genotypes: jax.Array) -> tuple[jax.Array, ...]:
         fitnesses, descriptors, extra = score(genotypes, key)
-        bad = ~jnp.isfinite(fitnesses)
-        objectives = jnp.where(bad, worst, fitnesses)
-        measures = jnp.where(bad[:, None], low, descriptors)
-        if not jacobian:
-            return objectives, measures
-        gradients = jnp.swapaxes(extra["gradients"], 1, 2)
-        gradients = jnp.where(bad[:, None, None], 0.0, gradients)
-        return objectives, measures, gradients
+        good = jnp.isfinite(fitnesses) & jnp.isfinite(descriptors).all(axis=1)
+        rows: tuple[jax.Array, ...] = ()
+        if jacobian:
+            from newton_qd.qd.emitters.gradients import read_scores
+
+            scores = read_scores(genotypes, fitnesses, descriptors, extra)
+            good, rows = scores.finite, (scores.gradients,)
+        objectives = jnp.where(good, fitnesses, worst)
+        return objectives, jnp.where(good[:, None], descriptors, low), *rows
 
     def evaluate(solutions: np.ndarray) -> tuple[np.ndarray, ...]:
         results = run(jnp.asarray(solutions, jnp.float32))
@@ -132,10 +135,11 @@ def from_ribs(archive: Any) -> Any:
         archive's indices.
 
     Raises:
-        MissingExtra: QDax is not installed.
-        TypeError: The archive has no fixed cells.
+        MissingExtra: QDax or pyribs is not installed.
+        TypeError: The archive is another one, or its solutions are not vectors.
     """
     require_extra("qdax", "qd")
+    require_extra("ribs", "ribs")
     from qdax.core.containers.mapelites_repertoire import MapElitesRepertoire
 
     centroids = _centroids(archive)
@@ -160,12 +164,19 @@ def from_ribs(archive: Any) -> Any:
 
 def _centroids(archive: Any) -> np.ndarray:
     """(cells, D) centres of the cells, in the order of their indices."""
-    if hasattr(archive, "centroids"):
-        return np.asarray(archive.centroids)
-    if not hasattr(archive, "int_to_grid_index"):
+    from ribs.archives import CVTArchive, GridArchive
+
+    # Others have grid indices, too, but cells that move.
+    if not isinstance(archive, CVTArchive | GridArchive):
         raise TypeError(
             f"archive={type(archive).__name__}: allowed: GridArchive, CVTArchive"
         )
+    if not isinstance(archive.solution_dim, int | np.integer):
+        raise TypeError(
+            f"archive with solution_dim={archive.solution_dim!r}: allowed: an integer"
+        )
+    if isinstance(archive, CVTArchive):
+        return np.asarray(archive.centroids)
     index = archive.int_to_grid_index(np.arange(archive.cells))
     fraction = (index + 0.5) / archive.dims
     return archive.lower_bounds + fraction * archive.interval_size

@@ -41,6 +41,21 @@ class Policy:
     ravel: Callable[[Any], jax.Array]
     network: Any
 
+    def weights(self, genotypes: Any) -> jax.Array:
+        """Genotypes (N, size) as floating-point numbers.
+
+        Raises:
+            ValueError: They have another shape.
+        """
+        if jnp.shape(genotypes)[1:] != (self.size,):
+            raise ValueError(
+                f"genotypes: shape {jnp.shape(genotypes)}: allowed: (N, {self.size}), "
+                "the weights of this policy"
+            )
+        array = jnp.asarray(genotypes)
+        whole = not jnp.issubdtype(array.dtype, jnp.floating)
+        return array.astype(jnp.float32) if whole else array
+
 
 def make_policy(env: Any, hidden: tuple[int, ...]) -> Policy:
     """Builds QDax's perceptron for an environment.
@@ -117,12 +132,8 @@ def make_scoring_function(
     def score(
         genotypes: jax.Array, key: jax.Array
     ) -> tuple[jax.Array, jax.Array, dict[str, Any]]:
-        if genotypes.shape[1:] != (policy.size,):
-            raise ValueError(
-                f"genotypes: shape {genotypes.shape}: allowed: (N, {policy.size}), "
-                "the weights of this policy"
-            )
-        outcome = jax.vmap(episode, in_axes=(0, None))(genotypes, key)
+        weights = policy.weights(genotypes)
+        outcome = jax.vmap(episode, in_axes=(0, None))(weights, key)
         fitness = jnp.where(outcome.faulty, -jnp.inf, outcome.fitness)
         extra = {"transitions": outcome.transitions} if transitions else {}
         return fitness, outcome.descriptor, extra

@@ -132,7 +132,7 @@ class ArborescenceEmitter(Emitter, abc.ABC):
         self._population = batch_size
         self._num_emitters = num_emitters
         self._optimizer = optax.sgd(1.0) if optimizer is None else optimizer
-        self._restart_rule = restart_rule or self.default_restart_rule
+        self._restart_rule = RestartRule(restart_rule or self.default_restart_rule)
         self._restart_period = restart_period
         self._start = start
 
