@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 from test_evolve import SMALL, interrupt_after, point_task, run
@@ -13,11 +15,11 @@ from test_steady import compiled
 
 import newton_qd.compat
 from newton_qd import cli
-from newton_qd.qd.algorithms import ALGORITHMS
+from newton_qd.qd.algorithms import ALGORITHMS, CMAMEOptions
 from newton_qd.qd.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
 from newton_qd.qd.config import ConfigError, EvolveConfig, read_config
 from newton_qd.qd.emitters import GradientLineEmitter
-from newton_qd.qd.evolve import evolve
+from newton_qd.qd.evolution import evolve
 from newton_qd.qd.gradient_algorithms import GRADIENT_ALGORITHMS
 from newton_qd.qd.gradient_options import TUNED
 from newton_qd.qd.search import Search
@@ -148,7 +150,7 @@ def test_what_does_not_exist_is_refused(tmp_path: Path) -> None:
 
 
 def test_shares_of_a_batch_that_do_not_fit_are_refused() -> None:
-    for options in ({"ga_batch_size": 9}, {"dcrl_batch_size": 0, "ga_batch_size": 12}):
+    for options in ({"ga_batch_size": 9}, {"dcrl_batch_size": 5, "ga_batch_size": 12}):
         config = SMALL.replace(algorithm="dcrl-me", options=options)
         with pytest.raises(ConfigError, match=r"must .* add up to batch_size \(16\)"):
             run(config)
@@ -163,6 +165,8 @@ def test_shares_of_a_batch_that_do_not_fit_are_refused() -> None:
     ("name", "options", "message"),
     [
         ("me-gradient", {"share": 0}, r"share must be in \(0, 1\], got 0"),
+        ("me-gradient", {"share": "a"}, "share must be a finite number, .* got 'a'"),
+        ("me-gradient", {"branches": 1.5}, "branches must be an integer, .* got 1.5"),
         ("me-gradient", {"branches": 0}, "branches must be at least 1, got 0"),
         ("me-gradient", {"branches": 9}, "holds no parent with branches = 9"),
         ("me-gradient", {"shortest": 3.0}, "0 < shortest <= longest, got shortest"),
@@ -174,11 +178,21 @@ def test_shares_of_a_batch_that_do_not_fit_are_refused() -> None:
         ),
         ("me-actor-critic", {"steered": 2.0}, r"steered must be in \[0, 1\], got 2.0"),
         ("me-actor-critic", {}, "copies = 8 are more than batch_size = 16"),
-        ("omg-mega", {"sigma_g": -1.0}, "sigma_g must be positive, got -1.0"),
-        ("omg-mega", {"window": -1}, "window=-1: allowed: None, integers from 1"),
+        ("me-actor-critic", {"fitness": float("nan")}, "fitness must be .*, got nan"),
+        ("omg-mega", {"sigma_g": 0.0}, "sigma_g must be positive, got 0.0"),
+        ("omg-mega", {"window": -1}, "window must be an integer, at least 0, got -1"),
+        ("omg-mega", {"samples": 1}, "samples"),
+        ("omg-mega", {"smooth_width": -1}, "smooth_width must be .* at least 0, got"),
+        ("cma-mega", {"adam": -1.0}, "adam must be a finite number, at least 0, got"),
         ("cma-mega", {"points": 3}, "points must divide batch_size = 16, got 3"),
-        ("cma-mega", {"points": 8}, "batch_size must be at least 3, got 2"),
+        ("cma-mega", {"points": 8}, "points = 8 leave 2 of batch_size = 16 each; at"),
         ("cma-maega", {"learning_rate": 2.0}, r"learning_rate must be in \[0, 1\]"),
+        ("cma-me", {"emitters": 0}, "emitters must be an integer, at least 1, got 0"),
+        ("cma-me", {"sigma_g": 0}, "sigma_g must be positive, got 0.0"),
+        ("pga-me", {"proportion_mutation_ga": 2}, "proportion_mutation_ga = 2.0 of"),
+        ("pga-me", {"critic_hidden_layer_size": 3}, "must be positive integers, got 3"),
+        ("me-es", {"adam_optimizer": "a"}, "adam_optimizer must be true or false, got"),
+        ("me-es", {"novelty_nearest_neighbors": 0}, "neighbors must be an integer, at"),
     ],
 )
 def test_options_out_of_range_are_refused(
@@ -186,6 +200,45 @@ def test_options_out_of_range_are_refused(
 ) -> None:
     with pytest.raises(ConfigError, match=message):
         run(SMALL.replace(algorithm=name, options=options))
+
+
+@pytest.mark.parametrize("name", ["cma-me", "pga-me", "me-es"])
+def test_one_individual_is_too_few(name: str) -> None:
+    config = SMALL.replace(algorithm=name, batch_size=1)
+    with pytest.raises(ConfigError, match=f"must be at least 2 for '{name}', got 1"):
+        run(config)
+    newton_qd.compat.uninstall()
+
+
+@pytest.mark.parametrize("name", ["cma-me", "pga-me", "dcrl-me", "me-es"])
+def test_algorithms_of_one_precision(name: str) -> None:
+    with (
+        jax.enable_x64(True),
+        pytest.raises(ConfigError, match=f"'{name}' is QDax's and mixes precisions"),
+    ):
+        run(SMALL.replace(algorithm=name))
+
+
+def test_a_whole_number_is_a_number() -> None:
+    parts: Any = importlib.import_module("newton_qd.qd.parts")
+    config = SMALL.replace(algorithm="cma-me", options={"sigma_g": 1}, iso_sigma=1)
+    options = parts.settings(CMAMEOptions, config)
+    assert type(options.sigma_g) is float and options.sigma_g == 1.0
+    assert type(config.iso_sigma) is float
+
+
+@pytest.mark.slow
+def test_a_resume_may_write_a_number_in_another_way(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = SMALL.replace(
+        algorithm="cma-me", options={"emitters": 2, "sigma_g": 1}, iterations=2
+    )
+    with monkeypatch.context() as patch:
+        interrupt_after(patch, 1)
+        run(config, out=tmp_path)
+    again = config.replace(options={"emitters": 2, "sigma_g": 1.0})
+    assert not run(again, out=tmp_path, resume=True).interrupted
 
 
 @pytest.mark.slow
@@ -274,6 +327,10 @@ def test_settings_from_toml(tmp_path: Path) -> None:
         ("emitters", 2),
         ("sigma_g", 0.25),
     )
+    path.write_text("iterations = 1")
+    assert read_config(path, "anttrap")[0].env_name == "anttrap"
+    with pytest.raises(ConfigError, match=r"run\.toml: env_name is missing"):
+        read_config(path)
     path.write_text("env_name = ")
     with pytest.raises(ConfigError, match=r"run\.toml is not valid TOML"):
         read_config(path)

@@ -32,7 +32,7 @@ from newton_qd.qd import plot, search
 from newton_qd.qd.archive import Archive, load_archive
 from newton_qd.qd.checkpoint import CheckpointError
 from newton_qd.qd.config import ConfigError, EvolveConfig, read_config
-from newton_qd.qd.evolve import EvolveResult, evolve
+from newton_qd.qd.evolution import EvolveResult, evolve
 from newton_qd.qd.folder import RunFolder
 from newton_qd.qd.interrupt import INTERRUPTED, graceful_stop
 from newton_qd.qd.progress import Progress
@@ -736,6 +736,11 @@ def test_a_config_file_returns_the_settings(reference: Path) -> None:
         ('{"format": 1, "settings": []}', "must be an object"),
         ('{"format": 1, "settings": {"seed": "a"}}', "seed must be an integer"),
         ('{"format": 1, "settings": {"sed": 1}}', "unknown setting 'sed'"),
+        ('{"format": 1, "settings": {"seed": 1}}', "env_name is missing"),
+        (
+            '{"format": 1, "settings": {}, "environment": {"packages": null}}',
+            "'environment' must be facts by name",
+        ),
     ],
 )
 def test_bad_config_files(tmp_path: Path, text: str, message: str) -> None:

@@ -204,6 +204,14 @@ def test_import_is_light(tmp_path: Path) -> None:
     assert not list(cache.rglob("*")), "importing compiled or loaded kernels"
 
 
+@pytest.mark.parametrize("init", sorted(PACKAGE.rglob("__init__.py")))
+def test_no_name_is_hidden_by_a_submodule(init: Path) -> None:
+    """Importing a submodule sets its name in the package, over a lazy one."""
+    homes = re.search(r"^_HOME.*?^}", init.read_text(encoding="utf-8"), re.M | re.S)
+    names = re.findall(r'^    "(\w+)":', homes[0] if homes else "", re.M)
+    assert not [name for name in names if (init.parent / f"{name}.py").exists()]
+
+
 def test_facade() -> None:
     names = {
         "Env",

@@ -16,7 +16,7 @@ import pytest
 from test_algorithms import CRITIC
 
 from newton_qd.qd.config import ConfigError, EvolveConfig
-from newton_qd.qd.evolve import evolve
+from newton_qd.qd.evolution import evolve
 from newton_qd.qd.sharding import device_mesh
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -21,7 +21,7 @@ from newton_qd.qd.config import (
 from newton_qd.qd.interrupt import INTERRUPTED, graceful_stop
 
 if TYPE_CHECKING:
-    from newton_qd.qd.evolve import EvolveResult
+    from newton_qd.qd.evolution import EvolveResult
     from newton_qd.qd.task import Task
 
 _DEFAULTS = EvolveConfig()
@@ -176,7 +176,7 @@ def run(
     # exception in the middle of an extension module's import could end in a crash.
     with graceful_stop(b"\nstopping\n") as stop:
         from newton_qd.physics.precision import quiet
-        from newton_qd.qd.evolve import evolve
+        from newton_qd.qd.evolution import evolve
         from newton_qd.qd.search import SearchError
         from newton_qd.qd.task import make_task
     if stop.requested:
@@ -215,7 +215,7 @@ def _settle(arguments: argparse.Namespace) -> tuple[EvolveConfig, Path]:
     }
     base = None
     if arguments.config is not None:
-        base, facts = read_config(arguments.config)
+        base, facts = read_config(arguments.config, given.get("env_name"))
         _warn_of_changes(facts)
     out = arguments.out
     if out is None:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from newton_qd.qd.archive import Archive, ArchiveError, load_archive
     from newton_qd.qd.checkpoint import CheckpointError
     from newton_qd.qd.config import ConfigError, EvolveConfig
-    from newton_qd.qd.evolve import EvolveResult, evolve
+    from newton_qd.qd.evolution import EvolveResult, evolve
     from newton_qd.qd.gradient_scoring import make_gradient_scoring_function
     from newton_qd.qd.plot import plot_archive
     from newton_qd.qd.rollout import Policy, make_policy, make_scoring_function
@@ -58,11 +58,11 @@ _HOME = {
     "CheckpointError": "checkpoint",
     "ConfigError": "config",
     "EvolveConfig": "config",
-    "EvolveResult": "evolve",
+    "EvolveResult": "evolution",
     "Policy": "rollout",
     "SearchError": "search",
     "Task": "task",
-    "evolve": "evolve",
+    "evolve": "evolution",
     "load_archive": "archive",
     "make_gradient_scoring_function": "gradient_scoring",
     "make_policy": "rollout",

@@ -7,7 +7,7 @@ from typing import Any
 
 from newton_qd.qd.actor_critic import ActorCritic, ActorCriticSettings, measure_of
 from newton_qd.qd.config import ConfigError, EvolveConfig
-from newton_qd.qd.gradient_options import checked, differentiable
+from newton_qd.qd.gradient_options import differentiable
 from newton_qd.qd.parts import Algorithm, Parts, isoline_emitter, settings
 
 
@@ -98,7 +98,7 @@ def _actor_critic_scale(config: EvolveConfig) -> float:
 
 
 ME_ACTOR_CRITIC = Algorithm(
-    checked(_me_actor_critic),
+    _me_actor_critic,
     evaluations=lambda config: config.batch_size + _actor_critic_episodes(config),
     gradients=_actor_critic_episodes,
     initial_scale=_actor_critic_scale,

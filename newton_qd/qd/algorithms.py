@@ -105,7 +105,9 @@ def _cma_me(parts: Parts) -> Any:
     from qdax.core.emitters.cma_improvement_emitter import CMAImprovementEmitter
     from qdax.core.emitters.cma_pool_emitter import CMAPoolEmitter
 
-    options = settings(CMAMEOptions, parts.config)
+    options = settings(CMAMEOptions, parts.config, least=1)
+    if not options.sigma_g > 0:
+        raise ConfigError(f"options: sigma_g must be positive, got {options.sigma_g}")
     emitter = CMAImprovementEmitter(
         batch_size=parts.config.batch_size,
         genotype_dim=parts.policy.size,
@@ -129,10 +131,17 @@ def _pga_me(parts: Parts) -> Any:
     options = settings(
         PGAMEConfig,
         parts.config,
+        least=1,
         env_batch_size=parts.config.batch_size,
         replay_buffer_size=_REPLAY_BUFFER,
     )
     _require_batch_size(parts.config, "env_batch_size", options.env_batch_size)
+    mutated = int(options.proportion_mutation_ga * parts.config.batch_size)
+    if not 0 < mutated < parts.config.batch_size:
+        raise ConfigError(
+            f"options: proportion_mutation_ga = {options.proportion_mutation_ga} of "
+            f"batch_size = {parts.config.batch_size} must be some individuals, not all"
+        )
     emitter = PGAMEEmitter(
         options, parts.policy.network, parts.task.env, isoline(parts.config)
     )
@@ -151,6 +160,7 @@ def _dcrl_me(parts: Parts) -> Any:
     options = settings(
         DCRLMEConfig,
         config,
+        least=1,
         ga_batch_size=config.batch_size - 2 * quarter,
         dcrl_batch_size=quarter,
         ai_batch_size=quarter,
@@ -202,8 +212,12 @@ def _me_es(parts: Parts) -> Any:
     from qdax.core.emitters.mees_emitter import MEESConfig, MEESEmitter
 
     samples = parts.config.batch_size
-    options = settings(MEESConfig, parts.config, sample_number=samples)
+    options = settings(MEESConfig, parts.config, least=1, sample_number=samples)
     _require_batch_size(parts.config, "sample_number", options.sample_number)
+    if options.sample_mirror and samples % 2:
+        raise ConfigError(
+            f"batch_size must be even for 'me-es' with sample_mirror, got {samples}"
+        )
     emitter = MEESEmitter(
         options,
         # The archive of its novelty holds one descriptor for each generation.
@@ -218,12 +232,16 @@ def _me_es(parts: Parts) -> Any:
 
 ALGORITHMS: Mapping[str, Algorithm] = {
     "me": Algorithm(_me),
-    "cma-me": Algorithm(_cma_me),
-    "pga-me": Algorithm(_pga_me, transitions=True),
-    "dcrl-me": Algorithm(_dcrl_me, transitions=True),
+    "cma-me": Algorithm(_cma_me, smallest=2, double=False),
+    "pga-me": Algorithm(_pga_me, transitions=True, smallest=2, double=False),
+    "dcrl-me": Algorithm(_dcrl_me, transitions=True, double=False),
     # The samples of a gradient, and the individual that they lead to.
     "me-es": Algorithm(
-        _me_es, evaluates=True, evaluations=lambda config: config.batch_size + 1
+        _me_es,
+        evaluates=True,
+        evaluations=lambda config: config.batch_size + 1,
+        smallest=2,
+        double=False,
     ),
     **GRADIENT_ALGORITHMS,
 }

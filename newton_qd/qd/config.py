@@ -81,6 +81,8 @@ class EvolveConfig:
                 object.__setattr__(self, name, tuple(value))
         object.__setattr__(self, "options", _pairs(self.options))
         self._check()
+        for name in ("iso_sigma", "line_sigma"):
+            object.__setattr__(self, name, float(getattr(self, name)))
 
     def _check(self) -> None:
         if not isinstance(self.env_name, str) or not self.env_name:
@@ -217,23 +219,31 @@ def config_to_json(config: EvolveConfig, facts: dict[str, Any]) -> str:
 
 
 def settings_text(config: EvolveConfig) -> str:
-    """Settings as one line that is equal for equal settings."""
+    """Settings as one line, for ``equal_settings``."""
     return json.dumps(dataclasses.asdict(config), sort_keys=True)
 
 
-def read_config(path: Path) -> tuple[EvolveConfig, dict[str, Any]]:
+def equal_settings(one: str, other: str) -> bool:
+    """Whether two lines of ``settings_text`` say the same; 1 and 1.0 are equal."""
+    return json.loads(one) == json.loads(other)
+
+
+def read_config(
+    path: Path, env_name: str | None = None
+) -> tuple[EvolveConfig, dict[str, Any]]:
     """Reads a ``config.json``, or settings that were written by hand as TOML.
 
     Args:
         path: File to read. One that ends in ``.toml`` holds the names of settings
             with their values, and those of ``options`` in a table of that name.
+        env_name: Environment where the file names none.
 
     Returns:
         Settings and the facts of the machine that wrote them (maybe empty).
 
     Raises:
-        ConfigError: The file is missing, is not such a file, or holds a bad
-            setting.
+        ConfigError: The file is missing, is not such a file, holds a bad setting, or
+            there is no environment.
     """
     written_by_hand = path.suffix == ".toml"
     kind, parse = ("TOML", tomllib.loads) if written_by_hand else ("JSON", json.loads)
@@ -256,8 +266,15 @@ def read_config(path: Path) -> tuple[EvolveConfig, dict[str, Any]]:
     if not isinstance(settings, dict):
         raise ConfigError(f"{path}: 'settings' must be an object, got {settings!r}")
     facts = document.get("environment", {})
+    if not isinstance(facts, dict) or not isinstance(facts.get("packages", {}), dict):
+        raise ConfigError(f"{path}: 'environment' must be facts by name, got {facts!r}")
+    if env_name is not None:
+        settings = {"env_name": env_name, **settings}
     try:
-        return EvolveConfig().replace(**settings), dict(facts)
+        config = EvolveConfig().replace(**settings)
+        if "env_name" not in settings:
+            raise ConfigError("env_name is missing: name an environment")
+        return config, facts
     except (ConfigError, TypeError, ValueError) as error:
         raise ConfigError(f"{path}: {error}") from error
 

@@ -31,6 +31,7 @@ from newton_qd.qd.config import (
     EvolveConfig,
     changed_facts,
     config_to_json,
+    equal_settings,
     read_config,
     settings_text,
 )
@@ -176,7 +177,7 @@ class RunFolder:
         if not path.exists():
             return None, warnings
         checkpoint = load_checkpoint(path)
-        if checkpoint.settings != settings_text(config):
+        if not equal_settings(checkpoint.settings, settings_text(config)):
             raise CheckpointError(
                 f"{path} belongs to a run with other settings than {CONFIG}"
             )

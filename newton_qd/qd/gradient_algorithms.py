@@ -13,7 +13,6 @@ from newton_qd.qd.config import ConfigError, EvolveConfig
 from newton_qd.qd.gradient_options import (
     FlowOptions,
     MixedOptions,
-    checked,
     differentiable,
     flow_options,
 )
@@ -21,6 +20,8 @@ from newton_qd.qd.gradient_scoring import make_gradient_scoring_function
 from newton_qd.qd.parts import Algorithm, Parts, isoline_emitter
 from newton_qd.qd.rollout import Policy, ScoringFunction
 from newton_qd.qd.task import Task
+
+_SMALLEST_POPULATION = 3  # a solution point and two offspring
 
 
 def _scoring(
@@ -166,14 +167,20 @@ class CMAMEGAOptions(MixedOptions):
         """Individuals of a generation that belong to one solution point.
 
         Raises:
-            ConfigError: The points do not divide a generation.
+            ConfigError: The points do not divide a generation, or are too many.
         """
         if self.points < 1 or config.batch_size % self.points:
             raise ConfigError(
                 f"options: points must divide batch_size = {config.batch_size}, got "
                 f"{self.points!r}"
             )
-        return config.batch_size // self.points
+        each = config.batch_size // self.points
+        if each < _SMALLEST_POPULATION:
+            raise ConfigError(
+                f"options: points = {self.points} leave {each} of batch_size = "
+                f"{config.batch_size} each; at least {_SMALLEST_POPULATION}"
+            )
+        return each
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -237,7 +244,7 @@ def _scale(kind: Any, config: EvolveConfig) -> float:
 def _row(make: Any, kind: Any) -> Algorithm:
     """A row for an emitter that evaluates the gradients of its solution points."""
     return Algorithm(
-        checked(make),
+        make,
         evaluations=lambda config: config.batch_size + _points(kind, config),
         gradients=functools.partial(_points, kind),
         takes_faulty=True,
@@ -247,14 +254,14 @@ def _row(make: Any, kind: Any) -> Algorithm:
 
 GRADIENT_ALGORITHMS: Mapping[str, Algorithm] = {
     "me-gradient": Algorithm(
-        checked(_me_gradient),
+        _me_gradient,
         evaluations=lambda config: config.batch_size + _me_gradients(config),
         gradients=_me_gradients,
         initial_scale=functools.partial(_scale, MEGradientOptions),
     ),
     "me-actor-critic": ME_ACTOR_CRITIC,
     "omg-mega": Algorithm(
-        checked(_omg_mega),
+        _omg_mega,
         evaluations=_omg_mega_gradients,
         gradients=_omg_mega_gradients,
         scoring=_omg_mega_scoring,

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from newton_qd.gradients.exact import make_episode_gradient
 from newton_qd.gradients.flow import GradientOptions
 from newton_qd.gradients.mixed import make_mixed_gradient
 from newton_qd.gradients.smooth import with_smooth_descriptor
-from newton_qd.qd.config import ConfigError, EvolveConfig
-from newton_qd.qd.parts import Parts, settings
+from newton_qd.qd.config import EvolveConfig
+from newton_qd.qd.parts import refused_options, settings
 from newton_qd.qd.task import Task
 
 # A robot that falls ends its episode, which no gradient sees: short steps only.
@@ -105,10 +105,8 @@ def flow_options(kind: Any, config: EvolveConfig) -> Any:
     names = {field.name for field in dataclasses.fields(kind)}
     tuned = TUNED.get(config.env_name, {}).items()
     options = settings(kind, config, **{k: v for k, v in tuned if k in names})
-    try:
+    with refused_options():
         options.flow()
-    except (TypeError, ValueError) as error:
-        raise ConfigError(f"options: {error}") from error
     return options
 
 
@@ -116,17 +114,3 @@ def differentiable(task: Task, smooth_width: float) -> Task:
     """The task with a descriptor of the same values that has a gradient."""
     env = with_smooth_descriptor(task.env, smooth_width, straight_through=True)
     return dataclasses.replace(task, env=env)
-
-
-def checked(make: Callable[[Parts], Any]) -> Callable[[Parts], Any]:
-    """Makes an emitter; a value that it refuses is a wrong setting."""
-
-    def made(parts: Parts) -> Any:
-        try:
-            return make(parts)
-        except ConfigError:
-            raise
-        except ValueError as error:
-            raise ConfigError(f"options: {error}") from error
-
-    return made

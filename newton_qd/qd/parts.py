@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
-from collections.abc import Callable
+import math
+import typing
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -56,6 +59,8 @@ class Algorithm:
         takes_faulty: Whether the emitter hears of the fitness ``-inf`` of a faulty
             individual; if not, it hears of the worst finite one.
         initial_scale: Factor of the weights of the initial population.
+        smallest: Least individuals of a generation.
+        double: Whether the emitter runs in JAX's 64-bit mode.
     """
 
     make: Callable[[Parts], Any]
@@ -66,19 +71,41 @@ class Algorithm:
     scoring: Callable[[EvolveConfig, Task, Policy], ScoringFunction] | None = None
     takes_faulty: bool = False
     initial_scale: Callable[[EvolveConfig], float] = lambda config: 1.0
+    smallest: int = 1
+    double: bool = True
 
 
-def settings(kind: Any, config: EvolveConfig, **defaults: Any) -> Any:
+@contextlib.contextmanager
+def refused_options() -> Iterator[None]:
+    """What refuses a value in here refuses an option.
+
+    Raises:
+        ConfigError: A value was refused.
+    """
+    try:
+        yield
+    except ConfigError:
+        raise
+    except ValueError as error:
+        raise ConfigError(f"options: {error}") from error
+
+
+def settings(
+    kind: Any, config: EvolveConfig, *, least: int = 0, **defaults: Any
+) -> Any:
     """Fills the settings of an emitter with the options of a run.
 
     Args:
         kind: Dataclass of the settings.
         config: Settings of the run.
+        least: Least value of a setting that is an integer.
         **defaults: Settings that differ from those of the dataclass.
 
     Raises:
-        ConfigError: There is no option of this name.
+        ConfigError: There is no option of this name, its value is of another type
+            than the setting, not finite, negative or less than ``least``.
     """
+    types = typing.get_type_hints(kind)
     allowed = {field.name for field in dataclasses.fields(kind)}
     for name, value in config.options:
         if name not in allowed:
@@ -86,8 +113,36 @@ def settings(kind: Any, config: EvolveConfig, **defaults: Any) -> Any:
                 f"options: {config.algorithm!r} has no {name!r}; allowed: "
                 f"{', '.join(sorted(allowed)) or 'none'}"
             )
-        defaults[name] = value
+        defaults[name] = _fitting(name, value, types[name], least)
     return kind(**defaults)
+
+
+def _fitting(name: str, value: Any, wanted: Any, least: int) -> Any:
+    """The value of an option in the type of its setting."""
+    if wanted is bool:
+        if isinstance(value, bool):
+            return value
+        allowed = "true or false"
+    elif wanted is int:
+        if _is_integer(value) and value >= least:
+            return value
+        allowed = f"an integer, at least {least}"
+    elif wanted is float:
+        number = _is_integer(value) or isinstance(value, float)
+        if number and math.isfinite(value) and value >= 0:
+            return float(value)
+        allowed = "a finite number, at least 0"
+    elif typing.get_origin(wanted) is tuple:
+        if isinstance(value, tuple) and all(_is_integer(x) and x > 0 for x in value):
+            return value
+        allowed = "positive integers"
+    else:
+        raise TypeError(f"{name}: a setting of type {wanted} cannot be an option")
+    raise ConfigError(f"options: {name} must be {allowed}, got {value!r}")
+
+
+def _is_integer(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
 
 
 def isoline(config: EvolveConfig) -> Any:

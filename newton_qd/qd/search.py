@@ -19,7 +19,7 @@ from newton_qd.qd.config import ConfigError, EvolveConfig, settings_text
 from newton_qd.qd.corrected import Corrected, correct
 from newton_qd.qd.extras import require_extra
 from newton_qd.qd.folder import COLUMNS
-from newton_qd.qd.parts import Parts
+from newton_qd.qd.parts import Algorithm, Parts, refused_options
 from newton_qd.qd.rollout import ScoringFunction, make_policy, make_scoring_function
 from newton_qd.qd.sharding import on_mesh, shard_scoring
 from newton_qd.qd.task import Task
@@ -66,15 +66,11 @@ class Search:
 
         Raises:
             MissingExtra: QDax is not installed.
-            ConfigError: The algorithm or one of its options does not exist.
+            ConfigError: The algorithm or one of its options does not exist, or it
+                does not run with these settings.
         """
         require_extra("qdax", "qd")
-        if config.algorithm not in ALGORITHMS:
-            raise ConfigError(
-                f"algorithm: {config.algorithm!r} does not exist; allowed: "
-                f"{', '.join(ALGORITHMS)}"
-            )
-        self._algorithm = ALGORITHMS[config.algorithm]
+        self._algorithm = _row(config)
         self._config = config
         self._task = task
         self._mesh = mesh
@@ -85,17 +81,18 @@ class Search:
         self._key_emitter = jax.random.fold_in(self._key_generations, 0)
         self._policy = make_policy(task.env, config.hidden)
         self._centroids = cell_centroids(config, task.limits, key_centroids)
-        score = self._scoring()
-        self._emitter = self._algorithm.make(
-            Parts(
-                config,
-                task,
-                self._policy,
-                lambda genotypes, _: score(genotypes, self._key_reset),
-                self._key_reset,
-                self._centroids,
+        with refused_options():
+            score = self._scoring()
+            self._emitter = self._algorithm.make(
+                Parts(
+                    config,
+                    task,
+                    self._policy,
+                    lambda genotypes, _: score(genotypes, self._key_reset),
+                    self._key_reset,
+                    self._centroids,
+                )
             )
-        )
         learns_on_mesh = self._algorithm.evaluates
         self._score = self._compiled(score)
         self._ask = jax.jit(self._proposed)
@@ -309,6 +306,27 @@ class Search:
         finite = jnp.isfinite(fitnesses) & jnp.all(jnp.isfinite(found), axis=1)
         metrics = default_qd_metrics(repertoire, qd_offset=offset)
         return {**metrics, "rejected": jnp.sum(~finite)}
+
+
+def _row(config: EvolveConfig) -> Algorithm:
+    """The row of a run's algorithm; raises where it cannot run."""
+    row = ALGORITHMS.get(config.algorithm)
+    if row is None:
+        raise ConfigError(
+            f"algorithm: {config.algorithm!r} does not exist; allowed: "
+            f"{', '.join(ALGORITHMS)}"
+        )
+    if config.batch_size < row.smallest:
+        raise ConfigError(
+            f"batch_size must be at least {row.smallest} for {config.algorithm!r}, got "
+            f"{config.batch_size}"
+        )
+    if jax.config.read("jax_enable_x64") and not row.double:
+        raise ConfigError(
+            f"algorithm: {config.algorithm!r} is QDax's and mixes precisions in JAX's "
+            "64-bit mode; run it without jax_enable_x64"
+        )
+    return row
 
 
 def _strongly_typed(tree: Any) -> Any:
