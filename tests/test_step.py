@@ -310,6 +310,18 @@ def test_lanes_change_nothing(
     assert errors.max() < 1e-4
 
 
+@pytest.mark.gpu
+def test_one_lane_gives_the_same_gradient_twice(
+    device: jax.Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The deterministic mode: a world's only thread adds in the program's order."""
+    monkeypatch.setenv("NEWTON_QD_LANES", "1")
+    system, states = single_states(4096)
+    first = gradients(system, states)
+    for _ in range(3):
+        assert_bitwise(gradients(system, states), first)
+
+
 @pytest.mark.parametrize("text", ["0", "-1", "two", "", "1.5"])
 def test_bad_number_of_threads(monkeypatch: pytest.MonkeyPatch, text: str) -> None:
     monkeypatch.setenv("NEWTON_QD_THREADS", text)
