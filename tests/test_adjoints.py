@@ -264,6 +264,7 @@ def chained(system: System, x: np.ndarray, weights: np.ndarray) -> np.ndarray:
     return total
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robot", [ANT, HALFCHEETAH], ids=lambda robot: robot.name)
 def test_the_bridge_agrees_with_a_tape(x64: None, device: Any, robot: Robot) -> None:
     """Four control steps: the chain of Warp's tapes is ``jax.grad``, to 1e-6."""

@@ -327,6 +327,7 @@ def proportions(env: Any, steps: int = 40) -> Any:
     return jax.jit(jax.value_and_grad(lambda a: run(a)[0].sum())), jax.jit(run)
 
 
+@pytest.mark.slow
 def test_smooth_proportion_goes_to_the_boolean_one() -> None:
     """As the width goes to 0, and a straight-through one is it at any width."""
     plain: Any = newton_qd.create("hopper_uni", auto_reset=False)

@@ -27,6 +27,7 @@ def trap_of_the_ant() -> tuple[System, int, int]:
     return system, int(back[0]), int(back[1])
 
 
+@pytest.mark.slow
 def test_nearest_points(x64: None, folder: Path) -> None:
     system, _, foot = trap_of_the_ant()
     radius, half = system.obstacle_size[1, :2]

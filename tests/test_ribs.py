@@ -183,6 +183,7 @@ def test_archives_survive_the_way_there_and_back(kind: str, individuals: Any) ->
     np.testing.assert_array_equal(again.genotypes, repertoire.genotypes)
 
 
+@pytest.mark.slow
 def test_what_evolve_has_found_becomes_a_ribs_archive() -> None:
     result = run(SMALL.replace(iterations=2))
     for grid in (None, (4, 4)):

@@ -139,6 +139,7 @@ def moving_ants(device: jax.Device) -> Loop:
     return loop
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("worlds", [1, 3])
 def test_same_trajectory_as_the_step(worlds: int, device: jax.Device) -> None:
     q, actions = standing_ants(worlds, 12)
