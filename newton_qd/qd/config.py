@@ -89,30 +89,25 @@ class EvolveConfig:
             raise ConfigError(f"env_name must be a name, got {self.env_name!r}")
         if not isinstance(self.algorithm, str) or not self.algorithm:
             raise ConfigError(f"algorithm must be a name, got {self.algorithm!r}")
-        _check_integer("seed", self.seed, 0, 2**32 - 1)
-        _check_integer("iterations", self.iterations, 0)
-        _check_integer("batch_size", self.batch_size, 1)
-        _check_integer("reevaluations", self.reevaluations, 0)
-        _check_integer("episode_length", self.episode_length, 1)
-        _check_integers("hidden", self.hidden, 1)
-        for name in ("iso_sigma", "line_sigma"):
-            value = getattr(self, name)
-            number = isinstance(value, int | float) and not isinstance(value, bool)
-            if not number or not math.isfinite(value) or value < 0:
-                raise ConfigError(
-                    f"{name} must be a finite number of at least 0, got {value!r}"
-                )
+        check_integer("seed", self.seed, 0, 2**32 - 1)
+        check_integer("iterations", self.iterations, 0)
+        check_integer("batch_size", self.batch_size, 1)
+        check_integer("reevaluations", self.reevaluations, 0)
+        check_integer("episode_length", self.episode_length, 1)
+        check_integers("hidden", self.hidden, 1)
+        check_number("iso_sigma", self.iso_sigma)
+        check_number("line_sigma", self.line_sigma)
         if self.grid is not None and self.centroids is not None:
             raise ConfigError(
                 f"grid {self.grid} and centroids {self.centroids} exclude each other"
             )
         if self.grid is not None:
-            _check_integers("grid", self.grid, 1)
+            check_integers("grid", self.grid, 1)
             if not self.grid:
                 raise ConfigError("grid must name at least one dimension, got ()")
-            _check_integer("grid's number of cells", math.prod(self.grid), 2, MAX_CELLS)
+            check_integer("grid's number of cells", math.prod(self.grid), 2, MAX_CELLS)
         if self.centroids is not None:
-            _check_integer("centroids", self.centroids, 2, MAX_CELLS)
+            check_integer("centroids", self.centroids, 2, MAX_CELLS)
 
     def resolve(self, descriptor_length: int) -> EvolveConfig:
         """Fills in the grid and checks it against the descriptor.
@@ -174,18 +169,29 @@ def _pairs(options: Any) -> tuple[tuple[str, Any], ...]:
     return tuple(sorted(pairs.items()))
 
 
-def _check_integer(name: str, value: Any, low: int, high: int | None = None) -> None:
+def check_number(name: str, value: Any) -> None:
+    """Raises ``ConfigError`` for what is not a finite number of at least 0."""
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not number or not math.isfinite(value) or value < 0:
+        raise ConfigError(
+            f"{name} must be a finite number of at least 0, got {value!r}"
+        )
+
+
+def check_integer(name: str, value: Any, low: int, high: int | None = None) -> None:
+    """Raises ``ConfigError`` for what is not an integer from low to high."""
     bad_type = not isinstance(value, int) or isinstance(value, bool)
     if bad_type or value < low or (high is not None and value > high):
         allowed = f"at least {low}" if high is None else f"{low} to {high}"
         raise ConfigError(f"{name} must be an integer, {allowed}; got {value!r}")
 
 
-def _check_integers(name: str, values: Any, low: int) -> None:
+def check_integers(name: str, values: Any, low: int) -> None:
+    """Raises ``ConfigError`` for what is not a tuple of integers from low on."""
     if not isinstance(values, tuple):
         raise ConfigError(f"{name} must be a tuple of integers, got {values!r}")
     for value in values:
-        _check_integer(f"every entry of {name}", value, low)
+        check_integer(f"every entry of {name}", value, low)
 
 
 def environment_facts() -> dict[str, Any]:

@@ -5,14 +5,19 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
-import math
 import typing
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
 
-from newton_qd.qd.config import ConfigError, EvolveConfig
+from newton_qd.qd.config import (
+    ConfigError,
+    EvolveConfig,
+    check_integer,
+    check_integers,
+    check_number,
+)
 from newton_qd.qd.rollout import Policy, ScoringFunction
 from newton_qd.qd.task import Task
 
@@ -119,30 +124,20 @@ def settings(
 
 def _fitting(name: str, value: Any, wanted: Any, least: int) -> Any:
     """The value of an option in the type of its setting."""
-    if wanted is bool:
-        if isinstance(value, bool):
-            return value
-        allowed = "true or false"
-    elif wanted is int:
-        if _is_integer(value) and value >= least:
-            return value
-        allowed = f"an integer, at least {least}"
-    elif wanted is float:
-        number = _is_integer(value) or isinstance(value, float)
-        if number and math.isfinite(value) and value >= 0:
-            return float(value)
-        allowed = "a finite number, at least 0"
+    name = f"options: {name}"
+    if wanted is float:
+        check_number(name, value)
+        return float(value)
+    if wanted is int:
+        check_integer(name, value, least)
+    elif wanted is bool:
+        if not isinstance(value, bool):
+            raise ConfigError(f"{name} must be true or false, got {value!r}")
     elif typing.get_origin(wanted) is tuple:
-        if isinstance(value, tuple) and all(_is_integer(x) and x > 0 for x in value):
-            return value
-        allowed = "positive integers"
+        check_integers(name, value, 1)
     else:
         raise TypeError(f"{name}: a setting of type {wanted} cannot be an option")
-    raise ConfigError(f"options: {name} must be {allowed}, got {value!r}")
-
-
-def _is_integer(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool)
+    return value
 
 
 def isoline(config: EvolveConfig) -> Any:
