@@ -8,6 +8,7 @@ from newton_qd.physics.bridge import (
 )
 from newton_qd.physics.inspection import (
     bias_forces,
+    contact_gaps,
     forward_kinematics,
     lowest_contact,
     mass_matrix,
@@ -25,6 +26,7 @@ __all__ = [
     "PhysicsState",
     "System",
     "bias_forces",
+    "contact_gaps",
     "default_params",
     "episode_final",
     "episode_proportion",

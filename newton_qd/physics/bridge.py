@@ -229,6 +229,13 @@ def dynamics(system: System, q: jax.Array, v: jax.Array) -> tuple[jax.Array, jax
     return y[: nv * nv].reshape(nv, nv), y[nv * nv :]
 
 
+def contact_gaps(system: System, q: jax.Array) -> jax.Array:
+    """Gaps (nc,) of one world."""
+    call = _kernel_call(system, "contact_gaps", system.nq + system.nv)
+    row = jnp.concatenate([q, jnp.zeros((system.nv,), q.dtype)])
+    return call(row, output_dims=len(system.contact_body))[0]
+
+
 @functools.cache
 def _episode_call(name: str, dtype: str, steps: int, nd: int) -> Any:
     """A kernel of ``kernels.episodes`` as a function of one episode's row."""

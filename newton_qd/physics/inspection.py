@@ -1,4 +1,4 @@
-"""Functions for checking and control: kinematics, mass matrix, bias forces."""
+"""Functions for checking and control: kinematics, gaps, mass matrix, bias forces."""
 
 from __future__ import annotations
 
@@ -91,6 +91,26 @@ def bias_forces(system: System, q: jax.Array, v: jax.Array) -> jax.Array:
     q = _checked(system, "q", q, system.nq)
     v = _checked(system, "v", v, system.nv)
     return bridge.dynamics(system, q, v)[1]
+
+
+def contact_gaps(system: System, q: jax.Array) -> jax.Array:
+    """Distances of all that can touch, as the step sees them; without a gradient.
+
+    Args:
+        system: The system.
+        q: (nq,) coordinates [m or rad].
+
+    Returns:
+        (nc,) gap of each row of the system's contact tables [m], negative where the two
+        are pressed into each other; both rows of a pair have the same.
+
+    Raises:
+        ValueError: ``q`` has another shape.
+    """
+    q = _checked(system, "q", q, system.nq)
+    if not len(system.contact_body):
+        return jnp.zeros((0,), q.dtype)
+    return bridge.contact_gaps(system, q)
 
 
 def lowest_contact(system: System, q: jax.Array) -> jax.Array:

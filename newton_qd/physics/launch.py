@@ -15,9 +15,12 @@ from newton_qd.physics.workers import Worker
 
 LANES = (1, 2, 4, 8, 16, 32)
 BODY_SIZE = 16  # entries of a body: the fields of Kinematics
-# Kernel modules other than ``inspect``, whose kernels are written for one lane; each is
-# compiled as a whole.
-_MODULES = {"step_forward": "forward", "step_backward": "backward"}
+# Kernel modules other than ``inspect``; each is compiled as a whole.
+_MODULES = {
+    "step_forward": "forward",
+    "step_backward": "backward",
+    "contact_gaps": "gaps",
+}
 # The fastest at 4,096 and at 16,384 worlds of the ant on an H200.
 _LANES = {"step_forward": 16, "step_backward": 8}
 # Packs below which another thread costs more than it takes over, without and with
@@ -49,7 +52,7 @@ def lane_count(kernel: str) -> int:
     """Lanes per world of a GPU launch: ``NEWTON_QD_LANES``, or the fastest.
 
     Args:
-        kernel: Name of the kernel; those of ``inspect`` are written for one lane.
+        kernel: Name of the kernel; all but those of the step are written for one lane.
 
     Raises:
         ValueError: The environment variable is not one of ``LANES``.

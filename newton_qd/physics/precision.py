@@ -50,7 +50,7 @@ def _load(dtype: str, width: int, parametric: bool, boxes: bool) -> SimpleNamesp
     package.boxes = boxes  # type: ignore[attr-defined]
     sys.modules[name] = package
     spec.loader.exec_module(package)
-    modules = ("structs", "world", "forward", "backward", "inspect", "episodes")
+    modules = ("structs", "world", "forward", "backward", "inspect", "gaps", "episodes")
     loaded = {
         module: importlib.import_module(f"{name}.{module}")
         for module in modules

@@ -1,0 +1,48 @@
+"""The kernel that shows how far apart everything is that can touch.
+
+Inputs: q and v of each world, as in :mod:`.inspect`. Outputs: the gap of each contact.
+"""
+
+import warp as wp
+
+from . import real, scalar, vec3
+from .inspect import load_views
+from .memory import load, scatter
+from .nearest import touch_obstacle
+from .pair import touch_partner
+from .simulate import kinematics
+from .structs import Model, Row, Scratch, row_at
+from .world import pack_at
+
+
+@wp.func
+def gap_of(m: Model, sc: Scratch, row: Row, c: int):
+    """Gap of contact ``c``; negative where the two are pressed into each other [m]."""
+    _point = vec3()
+    _normal = vec3()
+    gap = real()
+    if load(m.contact_partner, c) < 0:
+        _point, _normal, gap = touch_obstacle(m, sc, row, c)
+    else:
+        _point, _normal, gap = touch_partner(m, sc, row, c)
+    return gap
+
+
+@wp.kernel(enable_backward=False)
+def contact_gaps(
+    m: Model,
+    first: int,
+    slot_stride: int,
+    worlds: int,
+    lanes: int,
+    sc: Scratch,
+    x: wp.array[scalar],
+    y: wp.array[scalar],
+):
+    """Gaps of all contacts."""
+    pack = pack_at(wp.tid(), first, worlds, slot_stride)
+    row = row_at(m, pack.slot, 0, 0, 0)
+    load_views(m, sc, sc, row, x, x, pack)
+    kinematics(m, sc, row, 0, 1)
+    for c in range(m.nc):
+        scatter(y, pack.first * m.nc + c, m.nc, pack.count, gap_of(m, sc, row, c))
