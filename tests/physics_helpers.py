@@ -65,6 +65,21 @@ def random_states(system: System, rng: np.random.Generator, worlds: int) -> Arra
     return q, v, rng.uniform(-1.0, 1.0, (worlds, system.nu))
 
 
+def beside_a_wall(
+    system: System, q: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:
+    """The coordinates with every second robot moved within reach of the first wall."""
+    frame, (radius, half, _) = system.obstacle_frame[1], system.obstacle_size[1]
+    axis = reference.rotation_matrix(frame[3:])[:, 2]
+    aside = np.cross(axis, [0.0, 0.0, 1.0])
+    count = len(q[::2])
+    along = rng.uniform(-0.8, 0.8, (count, 1)) * half * axis
+    reach = radius + rng.uniform(0.2, 0.6, (count, 1))
+    moved = q.copy()
+    moved[::2, :2] = (frame[:3] + along + reach * aside)[:, :2]
+    return moved
+
+
 def one_step(system: System) -> Callable[..., tuple[jax.Array, ...]]:
     """The step of one world as a function of arrays: q, v, impulse, normal, fault."""
 

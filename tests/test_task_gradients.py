@@ -8,14 +8,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from physics_helpers import directional_errors, random_states, report
+from physics_helpers import (
+    beside_a_wall,
+    directional_errors,
+    random_states,
+    report,
+)
 
 import newton_qd
 from newton_qd import physics
 from newton_qd.envs.base import PhysicsEnv
 from newton_qd.envs.state import State
-from newton_qd.physics import reference
-from newton_qd.physics.system import System
 from newton_qd.wrappers import FeetContactWrapper
 
 WORLDS, STEPS = 50, 16
@@ -37,21 +40,6 @@ def task(name: str) -> Any:
     if isinstance(env, FeetContactWrapper):
         return FeetContactWrapper(env.env, name.removesuffix("_uni"), smooth_width=0.02)
     return env
-
-
-def beside_a_wall(
-    system: System, q: np.ndarray, rng: np.random.Generator
-) -> np.ndarray:
-    """The coordinates with every second robot moved within reach of the first wall."""
-    frame, (radius, half, _) = system.obstacle_frame[1], system.obstacle_size[1]
-    axis = reference.rotation_matrix(frame[3:])[:, 2]
-    aside = np.cross(axis, [0.0, 0.0, 1.0])
-    count = len(q[::2])
-    along = rng.uniform(-0.8, 0.8, (count, 1)) * half * axis
-    reach = radius + rng.uniform(0.2, 0.6, (count, 1))
-    moved = q.copy()
-    moved[::2, :2] = (frame[:3] + along + reach * aside)[:, :2]
-    return moved
 
 
 @pytest.mark.parametrize("name", NAMES)
