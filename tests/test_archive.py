@@ -22,8 +22,7 @@ from test_evolve import (
     writes_of,
 )
 
-from newton_qd import cli
-from newton_qd.qd import checkpoint as checkpoint_module
+from newton_qd import cli, files
 from newton_qd.qd.archive import Archive, ArchiveError, archive_bytes, load_archive
 from newton_qd.qd.checkpoint import CheckpointError, load_checkpoint
 from newton_qd.qd.config import read_config
@@ -133,7 +132,7 @@ def fail_at(patch: pytest.MonkeyPatch, moment: int) -> None:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         fsync(descriptor)
 
-    patch.setattr(checkpoint_module.os, "fsync", full)
+    patch.setattr(files.os, "fsync", full)
 
 
 @pytest.mark.slow
@@ -163,7 +162,7 @@ def test_a_read_only_folder_is_named(
     def refuse(path: Path, mode: str) -> Any:
         raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(path))
 
-    monkeypatch.setattr(checkpoint_module, "open", refuse, raising=False)
+    monkeypatch.setattr(files, "open", refuse, raising=False)
     out = tmp_path / "run"
     arguments = ["evolve", "point", "--quiet", "--out", str(out)]
     assert cli.main(arguments, task_factory=point_task) == cli.FAILED

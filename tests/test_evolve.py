@@ -25,9 +25,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from newton_qd import files
 from newton_qd.errors import MissingExtra, UnknownEnvironment
 from newton_qd.extractors import get_feet_contact_proportion
-from newton_qd.qd import checkpoint as checkpoint_module
 from newton_qd.qd import plot, search
 from newton_qd.qd.archive import Archive, load_archive
 from newton_qd.qd.checkpoint import CheckpointError
@@ -405,7 +405,7 @@ def writes_of(
     replace = os.replace
     with monkeypatch.context() as patch:
         patch.setattr(
-            checkpoint_module.os,
+            files.os,
             "replace",
             lambda a, b: (written.append(str(b)), replace(a, b)),
         )
@@ -429,7 +429,7 @@ def kill_at(patch: pytest.MonkeyPatch, moment: int) -> None:
         if call == moment // 3:
             raise Killed
 
-    patch.setattr(checkpoint_module.os, "replace", replace_or_die)
+    patch.setattr(files.os, "replace", replace_or_die)
 
 
 PROGRAM = (

@@ -1,4 +1,4 @@
-"""Files that are either whole or absent, and the checkpoint of a run.
+"""The checkpoint of a run.
 
 A checkpoint is one file: a line with a format number and the SHA-256 of the rest,
 then a NumPy archive. The digest turns every kind of damage into one clear error.
@@ -6,14 +6,14 @@ then a NumPy archive. The digest turns every kind of damage into one clear error
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import hashlib
 import io
-import os
 from pathlib import Path
 
 import numpy as np
+
+from newton_qd.files import write_atomically
 
 # The number changes with what a checkpoint holds, columns of the metrics included.
 _MAGIC = b"newton_qd checkpoint 2 "
@@ -46,37 +46,6 @@ class Checkpoint:
     centroids: np.ndarray
     metrics: np.ndarray
     emitter: tuple[np.ndarray, ...] = ()
-
-
-def temporary_name(path: Path) -> Path:
-    """Name under which a file is written before it replaces ``path``."""
-    return path.with_name(f".{path.name}.tmp")
-
-
-def write_atomically(path: Path, content: bytes) -> None:
-    """Writes a file so that a reader sees the old or the new one, never a part.
-
-    Args:
-        path: File to write or replace.
-        content: Everything that the file shall hold.
-
-    Raises:
-        OSError: The disk is full, or the folder cannot be written to; the old file
-            is as it was.
-    """
-    temporary = temporary_name(path)
-    try:
-        with open(temporary, "wb") as file:
-            file.write(content)
-            file.flush()
-            # Without this a power cut after the rename can leave an empty file.
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
-        # The system's message, which does not always say for which file.
-        raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 def npz_bytes(**arrays: np.ndarray) -> bytes:

@@ -17,14 +17,13 @@ from typing import Any
 
 import numpy as np
 
+from newton_qd.files import temporary_name, write_atomically
 from newton_qd.qd.archive import ARCHIVE, Archive, archive_bytes
 from newton_qd.qd.checkpoint import (
     Checkpoint,
     CheckpointError,
     load_checkpoint,
     save_checkpoint,
-    temporary_name,
-    write_atomically,
 )
 from newton_qd.qd.config import (
     ConfigError,
