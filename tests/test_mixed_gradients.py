@@ -118,9 +118,38 @@ def test_samples_that_are_not_finite_are_left_out() -> None:
     np.testing.assert_allclose(result.gradients[2, 0, 0, 0], 1.0, atol=0.6)
 
 
+def test_slopes_whose_squares_are_no_numbers() -> None:
+    """Squares above 1e38 are infinite in float32: the zeroth order takes over."""
+
+    def reward(action: jax.Array) -> jax.Array:
+        # a slope of 1 under ripples whose own slope is 1e25
+        return action[0] + 1e-3 * jnp.sin(1e28 * action[1])
+
+    result = estimate(reward, np.zeros((1, 1, 3)), sigma=0.1, samples=512)
+    assert np.isfinite(result.gradients).all() and not result.overflowed.any()
+    assert np.isinf(result.first_variance[0, 0]) and result.order[0, 0] < 1e-6
+    # of a slope under noise, in three directions: 3 + 1, and what the ripples add
+    assert 3.0 < result.zeroth_variance[0, 0] < 5.0
+    np.testing.assert_allclose(result.gradients[0, 0, 0, 0], 1.0, atol=0.3)
+
+
+@pytest.mark.parametrize("sigma", [1e-30, 1e-38])
+def test_noise_whose_square_is_no_number(sigma: float) -> None:
+    result = estimate(lambda a: a @ WEIGHTS, np.zeros((1, 1, 3)), sigma=sigma)
+    np.testing.assert_allclose(result.gradients[0, 0, 0], WEIGHTS, rtol=1e-5)
+    assert np.isfinite(result.order).all()
+
+
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("samples", 1), ("samples", 2.0), ("sigma", 0.0), ("tolerance", -1.0)],
+    [
+        ("samples", 1),
+        ("samples", 2.0),
+        ("sigma", 0.0),
+        ("sigma", math.inf),
+        ("tolerance", -1.0),
+        ("tolerance", math.nan),
+    ],
 )
 def test_bad_settings(name: str, value: Any) -> None:
     with pytest.raises(ValueError, match=f"{name}={value}: allowed"):

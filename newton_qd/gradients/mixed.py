@@ -12,10 +12,12 @@ import jax
 import jax.numpy as jnp
 
 from newton_qd.envs.state import select
+from newton_qd.gradients.checks import check_integer, check_positive
 from newton_qd.gradients.episode import Policy, make_episode
 from newton_qd.gradients.exact import (
     EpisodeGradient,
     EpisodeGradients,
+    finite_rows,
     make_episode_gradient,
 )
 from newton_qd.gradients.flow import GradientOptions
@@ -27,12 +29,14 @@ class MixedGradients(EpisodeGradients):
     """Gradients of smoothed episodes, and what their two estimates are worth.
 
     Fitness, descriptor and ``faulty`` are those of the genotype without noise.
-    ``overflowed``: fewer than two pairs of samples were sound.
+    ``overflowed``: fewer than two pairs of samples were sound, or neither order was
+    finite.
 
     Attributes:
         order: (N, 1 + D) weight of the first-order estimate, 0 to 1 [-].
         first_variance: (N, 1 + D) variance of a first-order sample, summed over the
-            genotype; infinite where a sample was not finite.
+            genotype; infinite where a sample was not finite, or it is too large for
+            a number itself.
         zeroth_variance: (N, 1 + D) likewise of a zeroth-order sample.
         bias: (N, 1 + D) distance between the means of the two, less what their
             variance explains.
@@ -85,9 +89,12 @@ def make_mixed_gradient(
         Function of genotypes and a key: the reset's, which gives the noise too.
 
     Raises:
-        ValueError: A setting is out of its range.
+        TypeError: A setting is no number.
+        ValueError: It is out of its range.
     """
-    _check(samples, sigma=sigma, tolerance=tolerance)
+    check_integer("samples", samples, 2)
+    check_positive("sigma", sigma)
+    check_positive("tolerance", tolerance, endless=True)
     subject = (env, policy, descriptor_extractor)
     common: dict[str, Any] = {"episode_length": episode_length, "unravel": unravel}
     episode = make_episode(*subject, **common)
@@ -101,15 +108,6 @@ def make_mixed_gradient(
         return jax.vmap(combine)(centre, found, noise)
 
     return mixed
-
-
-def _check(samples: int, **positive: float) -> None:
-    """Raises for settings out of their range."""
-    if isinstance(samples, bool) or not isinstance(samples, int) or samples < 2:
-        raise ValueError(f"samples={samples!r}: allowed: integers from 2")
-    for name, value in positive.items():
-        if not value > 0:
-            raise ValueError(f"{name}={value!r}: allowed: above 0")
 
 
 def _pairs(
@@ -155,7 +153,7 @@ def _combined(
     mixed = mixture(
         values, found.gradients, noise, sound, lost, sigma=sigma, tolerance=tolerance
     )
-    few = jnp.broadcast_to(sound.sum() < 2, lost.shape)
+    few = (sound.sum() < 2) | (lost & jnp.isinf(mixed.zeroth_variance))
     zeros = jax.tree.map(jnp.zeros_like, mixed.gradients)
     return MixedGradients(
         fitnesses=jnp.where(centre.faulty, -jnp.inf, centre.fitness),
@@ -201,39 +199,97 @@ def mixture(
         gradients: Leaves (samples, 2, rows, ...): their gradients there.
         noise: Leaves (samples, ...): w.
         sound: (samples,) which pairs count.
-        lost: (rows,) which first orders do not.
+        lost: (rows,) which first orders do not; a zeroth order that is not finite
+            does not, either.
         sigma: Standard deviation of the noise.
         tolerance: Error allowed where the two disagree.
     """
-    slope = jnp.where(sound[:, None], values[:, 0] - values[:, 1], 0) / (2 * sigma**2)
-    zeroth = jax.tree.map(lambda w: jax.vmap(jnp.multiply.outer)(slope, w), noise)
-    first = jax.tree.map(lambda g: g.mean(axis=1), gradients)
+    first, zeroth, missing = _samples(values, gradients, noise, sound, lost, sigma)
+    # squares of numbers above 1e19 are none in float32: variances are taken in units
+    # of the largest number of a row
     spread = functools.partial(_mean_and_variance, sound=sound)
+    first_unit, zeroth_unit = _unit(first), _unit(zeroth)
+    first_own = spread(_scaled(first, first_unit))[1]
+    zeroth_own = spread(_scaled(zeroth, zeroth_unit))[1]
+    unit = jnp.maximum(first_unit, zeroth_unit)
+    first, zeroth = _scaled(first, unit), _scaled(zeroth, unit)
     first_mean, first_variance = spread(first)
     zeroth_mean, zeroth_variance = spread(zeroth)
     apart, apart_variance = spread(jax.tree.map(jnp.subtract, first, zeroth))
-    first_variance = jnp.where(lost, jnp.inf, first_variance)
     pairs = jnp.maximum(sound.sum(), 1)
     # what the scatter of the samples adds to the distance of their means
     distance = _squared(apart)
-    explained = jnp.where(jnp.isfinite(first_variance), apart_variance / pairs, 0)
+    explained = jnp.where(lost, 0, apart_variance / pairs)
+    error = jnp.sqrt(zeroth_variance / pairs)
+    excess = jnp.maximum(tolerance / unit - error, 0)
+    allowed = excess / jnp.maximum(jnp.sqrt(distance), 1e-30)
     total = zeroth_variance + first_variance
     flat = total == 0
     order = jnp.where(flat, 1, zeroth_variance / jnp.where(flat, 1, total))
-    error = jnp.sqrt(zeroth_variance / pairs)
-    allowed = jnp.maximum(tolerance - error, 0) / jnp.maximum(jnp.sqrt(distance), 1e-30)
-    order = jnp.where(lost, 0, jnp.minimum(order, allowed))
+    order = jnp.where(missing, 1, jnp.minimum(order, allowed))
+    order = jnp.where(lost, 0, order)
+    back = functools.partial(jax.tree.map, lambda x: x * _like(unit, x))
+    share = functools.partial(_like, order)
     return Mixture(
-        gradients=jax.tree.map(
-            lambda a, b: b + _like(order, a) * (a - b), first_mean, zeroth_mean
+        gradients=back(
+            jax.tree.map(lambda a, b: b + share(a) * (a - b), first_mean, zeroth_mean)
         ),
-        first=first_mean,
-        zeroth=zeroth_mean,
+        first=back(first_mean),
+        zeroth=back(zeroth_mean),
         order=order,
-        first_variance=first_variance,
-        zeroth_variance=zeroth_variance,
-        bias=jnp.sqrt(jnp.maximum(distance - explained, 0)),
+        first_variance=jnp.where(lost, jnp.inf, first_own * first_unit**2),
+        zeroth_variance=jnp.where(missing, jnp.inf, zeroth_own * zeroth_unit**2),
+        bias=jnp.sqrt(jnp.maximum(distance - explained, 0)) * unit,
     )
+
+
+def _samples(
+    values: jax.Array,
+    gradients: Any,
+    noise: Any,
+    sound: jax.Array,
+    lost: jax.Array,
+    sigma: float,
+) -> tuple[Any, Any, jax.Array]:
+    """Samples of first and zeroth order (n, rows, ...), and which of these are none.
+
+    Those that are not finite, ``lost`` ones and those of the zeroth order that the last
+    value (rows,) marks, are 0.
+    """
+    # sigma^2 may be too small for a number
+    slope = jnp.where(sound[:, None], values[:, 0] - values[:, 1], 0) / (2 * sigma)
+    zeroth = jax.tree.map(
+        lambda w: jax.vmap(jnp.multiply.outer)(slope, w / sigma), noise
+    )
+    first = jax.tree.map(lambda g: 0.5 * g[:, 0] + 0.5 * g[:, 1], gradients)
+    missing = ~jax.vmap(finite_rows)(zeroth).all(axis=0)
+
+    def without(samples: Any, gone: jax.Array) -> Any:
+        return jax.tree.map(lambda x: jnp.where(_rows(gone, x), 0, x), samples)
+
+    return without(first, lost), without(zeroth, missing), missing
+
+
+def _rows(factors: jax.Array, samples: jax.Array) -> jax.Array:
+    """Factors (rows,) that multiply samples (n, rows, ...)."""
+    return factors.reshape(-1, *[1] * (samples.ndim - 2))
+
+
+def _scaled(samples: Any, unit: jax.Array) -> Any:
+    """Samples (n, rows, ...) in units (rows,)."""
+    return jax.tree.map(lambda x: x / _rows(unit, x), samples)
+
+
+def _unit(samples: Any) -> jax.Array:
+    """Power of two (rows,) near the largest number of samples (n, rows, ...), or 1."""
+    sizes = [
+        jnp.abs(jnp.moveaxis(x, 1, 0)).reshape(x.shape[1], -1).max(axis=1, initial=0)
+        for x in jax.tree.leaves(samples)
+    ]
+    largest = functools.reduce(jnp.maximum, sizes)
+    exponent = jnp.frexp(largest)[1] - 1  # exact: it changes no digit
+    one = jnp.ones_like(largest)
+    return jnp.where(largest > 0, jnp.ldexp(one, exponent), one)
 
 
 def _mean_and_variance(samples: Any, sound: jax.Array) -> tuple[Any, jax.Array]:
