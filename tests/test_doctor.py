@@ -14,6 +14,7 @@ import pytest
 import newton_qd
 from newton_qd import cli
 from newton_qd.envs.state import State
+from newton_qd.errors import FaultError
 from newton_qd.gradients import GradientReport, diagnose_gradients
 
 
@@ -101,16 +102,64 @@ def test_policies_are_diagnosed_too() -> None:
     [
         ({"horizons": (4, 2)}, "horizons=.*ascending"),
         ({"horizons": ()}, "horizons=.*ascending"),
+        ({"horizons": (1.5, 2)}, "every one of horizons=1.5: allowed: integers"),
+        ({"horizons": (1, 10**12)}, "horizons=1000000000000: allowed"),
+        ({"seed": 10**30}, "seed=1000.*allowed: integers from 0"),
+        ({"sigma": float("inf")}, "sigma=inf: allowed: finite"),
+        ({"worlds": 10**12}, "worlds=1000000000000: allowed"),
         ({"worlds": 0}, "worlds=0: allowed"),
         ({"samples": 1}, "samples=1: allowed"),
         ({"sigma": 0.0}, "sigma=0.0: allowed"),
-        ({"genotypes": 1}, "policy and genotypes"),
+        ({"genotypes": 1}, "genotypes: leaves of shapes"),
+        ({"genotypes": np.zeros((2, 3, 1))}, "plans of 3 steps given.*at least 64"),
+        ({"genotypes": np.zeros((2, 16, 2))}, r"allowed: actions \(worlds, steps, 1\)"),
+        ({"policy": lambda x, y: y}, "policy and genotypes: the second is None"),
     ],
 )
 def test_bad_settings(options: dict[str, Any], message: str) -> None:
     env: Any = Growing(1.0)
     with pytest.raises(ValueError, match=message):
         diagnose_gradients(env, **options)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"horizons": 5}, {"horizons": "12"}, {"sigma": "a"}, {"env": None}],
+    ids=str,
+)
+def test_bad_types(options: dict[str, Any]) -> None:
+    given: dict[str, Any] = {"env": Growing(1.0), **options}
+    with pytest.raises(TypeError, match=f"{next(iter(options))}=.*allowed"):
+        diagnose_gradients(**given)
+
+
+def test_plans_of_ones_own_are_diagnosed_too() -> None:
+    """In any precision, as many as there are, as far as the longest horizon."""
+    plans = np.linspace(-1.0, 1.0, 2 * 20, dtype=np.float32).reshape(2, 20, 1)
+    report = diagnose(Growing(0.5), genotypes=plans)
+    assert report.open_loop and report.exact_horizon == 16
+    one = diagnose_gradients(Growing(0.5), genotypes=plans, horizons=(1,))  # pyright: ignore[reportArgumentType]
+    assert np.isnan(one.growth) and "The norm grows" not in str(one)
+    assert "up to 1 control step (0.1 s)" in str(one)
+
+
+class Failing(Growing):
+    """At fault where x is above 2."""
+
+    def _state(self, x: jax.Array, steps: jax.Array) -> State:
+        fault = (x[0] > 2.0).astype(jnp.int32)
+        sound = super()._state(jnp.where(fault == 0, x, 0.0), steps)
+        return sound.replace(info={"fault": fault})
+
+
+def test_faults_are_no_agreement() -> None:
+    """Gradients of worlds at fault are 0, as are their differences."""
+    plans = np.zeros((2, 16, 1))
+    plans[1, 4] = 3.0
+    with pytest.raises(FaultError, match=r"1 of 2 worlds.*first one in control step 5"):
+        diagnose(Failing(0.5), genotypes=plans)
+    with pytest.raises(FaultError, match=r"sigma=100.0: fewer than two pairs"):
+        diagnose(Failing(0.5), sigma=100.0, samples=2)
 
 
 def test_single_precision_is_refused() -> None:
@@ -131,4 +180,9 @@ def test_command(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     bad = ["doctor", "gradients", "hopper", "--horizons", "4,2"]
     assert cli.main(bad) == cli.BAD_ARGUMENTS
     assert "ascending" in capsys.readouterr().err
+    (tmp_path / "file").write_text("")
+    taken = ["doctor", "gradients", "hopper", *small, "--out", str(tmp_path / "file")]
+    assert cli.main(taken) == cli.BAD_ARGUMENTS
+    captured = capsys.readouterr()
+    assert "--out" in captured.err and not captured.out  # before any work
     assert cli.main(["doctor", "gradients", "nothing"]) == cli.BAD_ARGUMENTS

@@ -6,7 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from newton_qd.cli.arguments import BAD_ARGUMENTS, OK, complain, widths
+from newton_qd.cli.arguments import BAD_ARGUMENTS, FAILED, OK, complain, widths
+from newton_qd.errors import FaultError
 
 
 def add_parser(commands: Any) -> None:
@@ -62,6 +63,11 @@ def run(arguments: argparse.Namespace) -> int:
     from newton_qd.physics.precision import quiet
 
     quiet()
+    if arguments.out is not None:  # before minutes of work, not after
+        try:
+            arguments.out.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            return complain(arguments, f"--out: {error}", BAD_ARGUMENTS)
     try:
         report = newton_qd.diagnose_gradients(
             arguments.env_name,
@@ -74,6 +80,8 @@ def run(arguments: argparse.Namespace) -> int:
         )
     except ValueError as error:
         return complain(arguments, error, BAD_ARGUMENTS)
+    except FaultError as error:
+        return complain(arguments, error, FAILED)
     print(report)
     if arguments.out is not None:
         report.write(arguments.out)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,13 +12,19 @@ import jax.numpy as jnp
 import numpy as np
 
 from newton_qd.envs.base import Env
-from newton_qd.gradients.episode import Policy
+from newton_qd.errors import FaultError
+from newton_qd.gradients.doctor_input import (
+    checked_genotypes,
+    checked_settings,
+    made_env,
+    refuse_faults,
+)
+from newton_qd.gradients.episode import Policy, at_fault
 from newton_qd.gradients.exact import finite_rows
 from newton_qd.gradients.flow import tree_norm
 from newton_qd.gradients.mixed import Mixture, mixture
 from newton_qd.gradients.report import ContactRow, GradientReport, HorizonRow
 from newton_qd.physics.system import PhysicsState
-from newton_qd.registry import create
 
 DISTANCES = (1e-4, 1e-6, 1e-8, 1e-10)
 """Steps of the central differences; the one that agrees best counts.
@@ -41,8 +46,8 @@ class _Subject:
     steps: int
     key: jax.Array
 
-    def rewards(self, genotype: Any) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-        """Rewards (steps,), 0 after the end; who is alive, which bodies touch."""
+    def rewards(self, genotype: Any) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+        """Rewards (steps,), 0 after the end; who is alive, what touches, faults."""
 
         def advance(carry: Any, action: jax.Array | None) -> Any:
             state, over = carry
@@ -55,27 +60,32 @@ class _Subject:
             touching = jnp.zeros((0,), bool)
             if isinstance(physics, PhysicsState):
                 touching = physics.normal_impulse > 0
-            return (state, over | (state.done > 0)), (reward, ~over, touching & ~over)
+            seen = (reward, ~over, touching & ~over, at_fault(state) & ~over)
+            return (state, over | (state.done > 0)), seen
 
         start = (self.env.reset(self.key), jnp.zeros((), bool))
         plan = genotype if self.policy is None else None
         body = jax.checkpoint(advance, prevent_cse=False)
-        _, (rewards, alive, touching) = jax.lax.scan(
-            body, start, plan, length=self.steps
-        )
-        return rewards, (alive, touching)
+        _, (rewards, *seen) = jax.lax.scan(body, start, plan, length=self.steps)
+        return rewards, tuple(seen)
 
-    def returns(self, genotype: Any, ends: np.ndarray) -> jax.Array:
+    def returns(
+        self, genotype: Any, ends: np.ndarray
+    ) -> tuple[jax.Array, tuple[jax.Array, ...]]:
         """Sums (rows,) of the rewards up to the ends (rows,) of several horizons."""
-        rewards, _ = self.rewards(genotype)
+        rewards, seen = self.rewards(genotype)
         rows = np.arange(self.steps)[None] < ends[:, None]
-        return jnp.asarray(rows, rewards.dtype) @ rewards
+        return jnp.asarray(rows, rewards.dtype) @ rewards, seen
 
-    def gradients(self, genotype: Any, ends: np.ndarray) -> tuple[jax.Array, Any]:
-        """Returns up to the ends and their gradients, leaves (rows, ...)."""
-        values, pull = jax.vjp(lambda x: self.returns(x, ends), genotype)
+    def gradients(
+        self, genotype: Any, ends: np.ndarray
+    ) -> tuple[jax.Array, Any, jax.Array]:
+        """Returns up to the ends, gradients (rows, ...), and faults (steps,)."""
+        values, pull, seen = jax.vjp(
+            lambda x: self.returns(x, ends), genotype, has_aux=True
+        )
         (rows,) = jax.vmap(pull)(jnp.eye(len(ends), dtype=values.dtype))
-        return values, rows
+        return values, rows, seen[-1]
 
 
 def diagnose_gradients(
@@ -100,13 +110,15 @@ def diagnose_gradients(
     validity, and when.
 
     Args:
-        env: Name, or an environment of one world in float64 without auto-reset.
+        env: Name, or an environment of one world in float64. Rewards count up to the
+            first ``done``.
         policy: Maps a genotype and an observation to an action; ``None``: genotypes
             are open-loop actions.
-        genotypes: Pytree with one entry a world in front; ``None``: uniform random
-            actions.
+        genotypes: Pytree with one entry a world in front; without a policy plans of
+            actions (worlds, steps, nu). ``None``: uniform random actions.
         horizons: Numbers of control steps, ascending.
-        worlds: Number of random plans; they share one reset.
+        worlds: Number of random plans; not read where there are genotypes. All worlds
+            share one reset.
         directions: Random directions of the differences, in each world.
         samples: Pairs of noisy samples, in each world.
         sigma: Standard deviation of the noise, in the units of the genotype.
@@ -116,31 +128,28 @@ def diagnose_gradients(
         The report: ``print`` it, or ``write`` it to a folder.
 
     Raises:
+        TypeError: A setting is of another type.
         ValueError: A setting is out of its range, or the environment in float32.
+        FaultError: A world is at fault, or too many of its noisy samples are.
     """
     counts = {"worlds": worlds, "directions": directions, "samples": samples}
-    _check(horizons, policy, genotypes, sigma, **counts)
+    horizons = checked_settings(horizons, policy, genotypes, sigma, seed, **counts)
     with jax.enable_x64(True):
-        made = _made(env)
+        made = made_env(env)
         reset_key, plan_key, *keys = jax.random.split(jax.random.key(seed), 4)
         subject = _Subject(made, policy, int(horizons[-1]), reset_key)
         if genotypes is None:
             shape = (worlds, subject.steps, made.action_size)
             genotypes = jax.random.uniform(plan_key, shape, made.dtype, -1, 1)
-        rows, contacts = _found(
-            subject, genotypes, keys, horizons, directions, samples, sigma
-        )
-        return GradientReport(
-            name=env if isinstance(env, str) else made.name,
-            dt=made.dt,
-            open_loop=policy is None,
-            sigma=sigma,
-            horizons=rows,
-            contacts=contacts,
+        genotypes = checked_genotypes(genotypes, made, policy, subject.steps)
+        name = env if isinstance(env, str) else made.name
+        return _report(
+            name, subject, genotypes, keys, horizons, directions, samples, sigma
         )
 
 
-def _found(
+def _report(
+    name: str,
     subject: _Subject,
     genotypes: Any,
     keys: Sequence[jax.Array],
@@ -148,50 +157,27 @@ def _found(
     directions: int,
     samples: int,
     sigma: float,
-) -> tuple[tuple[HorizonRow, ...], tuple[ContactRow, ...]]:
-    """The rows of a report; the keys are those of the directions and of the noise."""
+) -> GradientReport:
+    """The findings; the keys are those of the directions and of the noise."""
     ends = np.asarray(horizons, np.int32)
     difference, gradients = _differences(subject, genotypes, keys[0], directions)
+    refuse_faults(difference.faulty)
     centre = jax.tree.map(lambda x: x[:, ends - 1], gradients)
     noise = jax.tree.map(lambda x: sigma * x, _normal(keys[1], genotypes, samples))
-    mixed, slopes = _sampled(subject, genotypes, centre, noise, sigma, ends)
-    rows = _rows(ends, subject.env.dt, difference, mixed, slopes)
-    return rows, _contacts(subject.env, difference)
-
-
-def _check(
-    horizons: Sequence[int],
-    policy: Any,
-    genotypes: Any,
-    sigma: float,
-    **counts: int,
-) -> None:
-    ascending = all(a < b for a, b in itertools.pairwise(horizons))
-    if not horizons or horizons[0] < 1 or not ascending:
-        raise ValueError(f"horizons={horizons!r}: allowed: ascending integers from 1")
-    for name, value in counts.items():
-        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-            raise ValueError(f"{name}={value!r}: allowed: integers from 1")
-    if counts["samples"] < 2:
-        raise ValueError(f"samples={counts['samples']!r}: allowed: integers from 2")
-    if not sigma > 0:
-        raise ValueError(f"sigma={sigma!r}: allowed: above 0")
-    if (policy is None) != (genotypes is None):
-        raise ValueError(
-            "policy and genotypes: one of them is None; allowed: both or neither"
+    mixed, slopes, sound = _sampled(subject, genotypes, centre, noise, sigma, ends)
+    if (sound < 2).any():
+        raise FaultError(
+            f"sigma={sigma!r}: fewer than two pairs of noisy samples of a world stay "
+            "sound; allowed: less noise, or more samples"
         )
-
-
-def _made(env: Env | str) -> Any:
-    """The environment to diagnose."""
-    if isinstance(env, str):
-        return create(env, episode_length=None, auto_reset=False, dtype="float64")
-    if env.dtype != np.float64:
-        raise ValueError(
-            f"env: in {env.dtype}; allowed: float64, as create({env.name!r}, "
-            "dtype='float64', auto_reset=False) under jax.enable_x64(True)"
-        )
-    return env
+    return GradientReport(
+        name=name,
+        dt=subject.env.dt,
+        open_loop=subject.policy is None,
+        sigma=sigma,
+        horizons=_rows(ends, subject.env.dt, difference, mixed, slopes),
+        contacts=_contacts(subject.env, difference),
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -204,6 +190,7 @@ class _Differences:
         central: (worlds, directions, distances, steps) central differences over
             ``DISTANCES``, then over ``REACH``.
         alive: (worlds, steps) whether the episode goes on before each step.
+        faulty: (worlds, steps) whether the world is at fault after each step.
         switched: (worlds, directions, steps, nb) whether a body touches on one side of
             ``REACH`` and not on the other.
     """
@@ -212,6 +199,7 @@ class _Differences:
     exact: np.ndarray
     central: np.ndarray
     alive: np.ndarray
+    faulty: np.ndarray
     switched: np.ndarray
 
 
@@ -224,7 +212,7 @@ def _differences(
 
     def one(genotype: Any, drawn: Any) -> tuple[dict[str, jax.Array], Any]:
         along = jax.vmap(_unit)(drawn)
-        gradients = subject.gradients(genotype, every)[1]
+        _, gradients, faulty = subject.gradients(genotype, every)
         components = jax.vmap(jax.vmap(_inner, (0, None)), (None, 0))
 
         def at(direction: Any, distance: jax.Array) -> Any:
@@ -232,7 +220,7 @@ def _differences(
             return subject.rewards(there)
 
         moved = jax.vmap(jax.vmap(jax.vmap(at, (None, 0)), (None, 0)), (0, None))
-        rewards, (alive, touching) = moved(along, jnp.asarray(sides))
+        rewards, (alive, touching, _) = moved(along, jnp.asarray(sides))
         returns = jnp.cumsum(rewards, axis=-1)
         central = (returns[:, :, 0] - returns[:, :, 1]) / (2 * sides[:, :1])
         return {
@@ -240,6 +228,7 @@ def _differences(
             "exact": components(gradients, along),
             "central": central,
             "alive": alive[0, 0, 0],
+            "faulty": faulty,
             "switched": touching[:, -1, 0] != touching[:, -1, 1],
         }, gradients
 
@@ -280,7 +269,7 @@ def _sampled(
     noise: Any,
     sigma: float,
     ends: np.ndarray,
-) -> tuple[Mixture, np.ndarray]:
+) -> tuple[Mixture, np.ndarray, np.ndarray]:
     """First- and zeroth-order estimates (worlds, horizons) under noise.
 
     Args:
@@ -292,26 +281,30 @@ def _sampled(
         ends: (horizons,) control steps.
 
     Returns:
-        The estimates, and the components (worlds, 2, horizons) of their means along
-        the gradient without noise, which few samples tell apart.
+        The estimates; the components (worlds, 2, horizons) of their means along the
+        gradient without noise, which few samples tell apart; and how many pairs of
+        samples of each world (worlds,) stay sound.
     """
 
-    def one(genotype: Any, centre: Any, noise: Any) -> tuple[Mixture, jax.Array]:
+    def one(
+        genotype: Any, centre: Any, noise: Any
+    ) -> tuple[Mixture, jax.Array, jax.Array]:
         pairs = jax.tree.map(
             lambda x, w: jnp.stack([x + w, x - w], axis=1), genotype, noise
         )
         both = jax.vmap(jax.vmap(functools.partial(subject.gradients, ends=ends)))
-        values, gradients = both(pairs)
-        sound = jnp.isfinite(values).all(axis=(1, 2))
+        values, gradients, faulty = both(pairs)
+        sound = jnp.isfinite(values).all(axis=(1, 2)) & ~faulty.any(axis=(1, 2))
         lost = ~jax.vmap(jax.vmap(finite_rows))(gradients).all(axis=(0, 1))
         mixed = mixture(values, gradients, noise, sound, lost, sigma=sigma)
         uphill = jax.vmap(_unit)(centre)
         inner = jax.vmap(_inner)
         slopes = [inner(mean, uphill) for mean in (mixed.first, mixed.zeroth)]
-        return mixed, jnp.stack(slopes)
+        slopes[0] = jnp.where(lost, jnp.nan, slopes[0])
+        return mixed, jnp.stack(slopes), sound.sum()
 
-    mixed, slopes = jax.jit(jax.vmap(one))(genotypes, centre, noise)
-    return mixed, np.asarray(slopes)
+    mixed, slopes, sound = jax.jit(jax.vmap(one))(genotypes, centre, noise)
+    return mixed, np.asarray(slopes), np.asarray(sound)
 
 
 def _rows(

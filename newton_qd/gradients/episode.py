@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable
+from types import NoneType
 from typing import Any, Protocol
 
 import jax
@@ -13,6 +15,7 @@ import numpy as np
 
 from newton_qd.envs.state import State, select
 from newton_qd.extractors import Trajectories
+from newton_qd.gradients.checks import check_integer
 from newton_qd.gradients.flow import GradientOptions, passed_back
 from newton_qd.types import Params
 
@@ -93,7 +96,16 @@ def make_episode(
         Function of the genotype, of the key of the reset or a first state, and of
         physical parameters, if any. Under ``jax.vmap`` the worlds share the launches,
         and so do the rows of a Jacobian.
+
+    Raises:
+        TypeError: ``env`` is no environment, or ``options`` something else.
+        ValueError: ``episode_length`` is not an integer from 1.
     """
+    check_integer("episode_length", episode_length, 1)
+    if not hasattr(env, "step"):
+        raise TypeError(f"env={env!r}: allowed: an environment, as create() makes it")
+    if not isinstance(options, (GradientOptions, NoneType)):
+        raise TypeError(f"options={options!r}: allowed: None, or GradientOptions")
     kept = options or GradientOptions(checkpoint_every=None)
     return _Run(
         env, policy, descriptor_extractor, episode_length, unravel, kept, transitions
@@ -119,12 +131,13 @@ class _Run:
         parameters = self.unravel(genotype)
         is_key = isinstance(start, (jax.Array, np.ndarray))
         first = self.env.reset(start) if is_key else start
+        self._check_first(first)
         dtype, steps = first.reward.dtype, self.episode_length
         rows: dict[str, Any] = {}
         if not self.options.exact:
             rows["factor"] = self.options.factors(steps).astype(dtype)
         if self.policy is None:
-            rows["action"] = parameters.reshape(steps, self.env.action_size)
+            rows["action"] = self._plan(parameters)
         no = jnp.zeros((), bool)
         (_, fitness, _, bad), (readings, over, taken) = _scan(
             functools.partial(self._advance, parameters, first, params),
@@ -139,6 +152,35 @@ class _Run:
             descriptor = self.descriptor_extractor(data, mask)[0]
         bad = bad | ~jnp.isfinite(fitness) | ~jnp.all(jnp.isfinite(descriptor))
         return Outcome(fitness, descriptor, bad, taken)
+
+    def _check_first(self, first: Any) -> None:
+        """Raises for what no episode can begin from."""
+        if not hasattr(first, "reward"):
+            raise TypeError(
+                f"start: {type(first).__name__} given; allowed: a key of jax.random, "
+                "or a state of the environment"
+            )
+        if jnp.ndim(first.reward):
+            raise ValueError(
+                f"start: a state of a batch of shape {jnp.shape(first.reward)} given; "
+                "allowed: of one world, under jax.vmap for more"
+            )
+        described = self.descriptor_extractor is not None or self.transitions
+        if described and "state_descriptor" not in first.info:
+            raise ValueError(
+                "env: its states have no state descriptor; allowed: QD tasks, as "
+                "ant_uni, or descriptor_extractor=None without transitions"
+            )
+
+    def _plan(self, parameters: Any) -> jax.Array:
+        """Open-loop actions (episode_length, nu)."""
+        shape = (self.episode_length, self.env.action_size)
+        if np.size(parameters) != math.prod(shape):
+            raise ValueError(
+                f"genotype: shape {np.shape(parameters)} given; allowed: actions of "
+                f"shape {shape} for each world"
+            )
+        return jnp.asarray(parameters).reshape(shape)
 
     def _advance(
         self, parameters: Any, first: State, params: Params, carry: tuple, row: Any
@@ -159,7 +201,7 @@ class _Run:
         # The sum runs in time order here, not in a reduction over time, so that a
         # row's return does not depend on the size of the batch.
         fitness = jnp.where(over, fitness, fitness + state.reward)
-        bad = bad | (~over & _at_fault(state))
+        bad = bad | (~over & at_fault(state))
         reading = None
         if self.descriptor_extractor is not None:
             reading = begin.info["state_descriptor"]
@@ -215,7 +257,7 @@ def _transition(begin: Any, action: jax.Array, end: Any) -> dict[str, jax.Array]
     }
 
 
-def _at_fault(state: Any) -> jax.Array:
+def at_fault(state: Any) -> jax.Array:
     """Whether the physics contained a value that is not finite."""
     if "fault" in state.info:
         return state.info["fault"] != 0

@@ -5,11 +5,14 @@ from __future__ import annotations
 import csv
 import dataclasses
 import importlib.util
+import io
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from newton_qd.errors import MissingExtra
+from newton_qd.files import write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -92,11 +95,14 @@ class GradientReport:
 
     @property
     def growth(self) -> float:
-        """Factor by which the norm grows with a step, over the later half of them."""
+        """Factor by which the norm grows with a step, over the later half of them.
+
+        Not a number where a single horizon, or a norm of 0, tells nothing of it.
+        """
         last = self.horizons[-1]
         middle = min(self.horizons, key=lambda row: abs(row.steps - last.steps / 2))
         if middle is last or not (middle.norm > 0 and last.norm > 0):
-            return 1.0
+            return math.nan
         return (last.norm / middle.norm) ** (1 / (last.steps - middle.steps))
 
     @property
@@ -153,7 +159,8 @@ class GradientReport:
         return f"{agrees}; {guides}. {advice}{note}"
 
     def _time(self, steps: int) -> str:
-        return f"{steps} control steps ({steps * self.dt:g} s)"
+        unit = "step" if steps == 1 else "steps"
+        return f"{steps} control {unit} ({steps * self.dt:g} s)"
 
     def __str__(self) -> str:
         kind = "open-loop actions" if self.open_loop else "a policy"
@@ -189,7 +196,8 @@ class GradientReport:
                 for row in self.horizons
             ],
         )
-        lines += ["", f"The norm grows by a factor of {self.growth:.3f} a step."]
+        if math.isfinite(self.growth):
+            lines += ["", f"The norm grows by a factor of {self.growth:.3f} a step."]
         if self.contacts:
             lines += ["", "Where a finite change leaves the gradient:", ""]
             lines += _table(
@@ -209,18 +217,26 @@ class GradientReport:
     def write(self, folder: Path | str) -> None:
         """Writes ``horizons.csv``, ``contacts.csv``, ``report.txt``, ``gradients.png``.
 
+        Each file is written whole or left as it was.
+
         Args:
             folder: Where to; made if it does not exist.
 
         Raises:
             MissingExtra: matplotlib is not installed; the other files are written.
+            OSError: The folder cannot be made or written to.
         """
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        _write_csv(folder / "horizons.csv", HorizonRow, self.horizons)
-        _write_csv(folder / "contacts.csv", ContactRow, self.contacts)
-        (folder / "report.txt").write_text(f"{self}\n", encoding="utf-8")
-        self.plot().savefig(folder / "gradients.png", dpi=120)
+        for name, text in (
+            ("horizons.csv", _csv_text(HorizonRow, self.horizons)),
+            ("contacts.csv", _csv_text(ContactRow, self.contacts)),
+            ("report.txt", f"{self}\n"),
+        ):
+            write_atomically(folder / name, text.encode())
+        picture = io.BytesIO()
+        self.plot().savefig(picture, dpi=120, format="png")
+        write_atomically(folder / "gradients.png", picture.getvalue())
 
     def plot(self) -> Figure:
         """Draws norm, agreement and scatter over the horizon.
@@ -292,9 +308,10 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     ]
 
 
-def _write_csv(path: Path, kind: type, rows: Sequence[Any]) -> None:
+def _csv_text(kind: type, rows: Sequence[Any]) -> str:
     names = [field.name for field in dataclasses.fields(kind)]
-    with open(path, "w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(names)
-        writer.writerows([getattr(row, name) for name in names] for row in rows)
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(names)
+    writer.writerows([getattr(row, name) for name in names] for row in rows)
+    return text.getvalue()

@@ -1,0 +1,112 @@
+"""What the gradient doctor is given: settings, environment, genotypes."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from newton_qd.envs.base import Env
+from newton_qd.errors import FaultError
+from newton_qd.gradients.checks import check_integer, check_positive
+from newton_qd.gradients.episode import Policy
+from newton_qd.registry import create
+
+
+def refuse_faults(faulty: np.ndarray) -> None:
+    """Raises where a world (worlds, steps) is at fault: a gradient of 0 says nothing.
+
+    Raises:
+        FaultError: One is.
+    """
+    worlds = faulty.any(axis=1)
+    if worlds.any():
+        step = int(faulty.any(axis=0).argmax()) + 1
+        raise FaultError(
+            f"genotypes: {np.sum(worlds)} of {np.size(worlds)} worlds are at fault, "
+            f"the first one in control step {step}; allowed: those that stay sound "
+            "over the longest horizon (newton_qd.check says what went wrong)"
+        )
+
+
+def checked_settings(
+    horizons: Sequence[int],
+    policy: Any,
+    genotypes: Any,
+    sigma: float,
+    seed: int,
+    **counts: int,
+) -> tuple[int, ...]:
+    """Raises for a setting out of its range; returns the horizons."""
+    for name, value in counts.items():
+        check_integer(name, value, 2 if name == "samples" else 1)
+    check_integer("seed", seed, 0, 2**32 - 1)
+    check_positive("sigma", sigma)
+    if policy is not None and genotypes is None:
+        raise ValueError(
+            "policy and genotypes: the second is None; allowed: genotypes for the "
+            "policy, or plans of actions without one"
+        )
+    allowed = f"horizons={horizons!r}: allowed: ascending integers from 1"
+    if isinstance(horizons, str) or not isinstance(horizons, (Sequence, np.ndarray)):
+        raise TypeError(allowed)
+    for steps in horizons:
+        check_integer("every one of horizons", steps, 1)
+    found = tuple(int(steps) for steps in horizons)
+    if not found or not all(a < b for a, b in itertools.pairwise(found)):
+        raise ValueError(allowed)
+    return found
+
+
+def checked_genotypes(
+    genotypes: Any, env: Env, policy: Policy | None, length: int
+) -> Any:
+    """Genotypes in the precision of the environment; plans as long as is needed.
+
+    Raises:
+        ValueError: The leaves differ in the number of worlds, or plans are no actions
+            (worlds, steps, nu) for all steps.
+    """
+    dtype = env.dtype
+    arrays = jax.tree.map(np.asarray, genotypes)
+    genotypes = jax.tree.map(
+        lambda x: jnp.asarray(x, dtype if x.dtype.kind == "f" else None), arrays
+    )
+    shapes = [np.shape(x) for x in jax.tree.leaves(genotypes)]
+    worlds = {shape[:1] for shape in shapes}
+    if len(worlds) != 1 or worlds & {(), (0,)}:
+        raise ValueError(
+            f"genotypes: leaves of shapes {shapes} given; allowed: (worlds, ...) each"
+        )
+    if policy is not None:
+        return genotypes
+    plan = (length, env.action_size)
+    if len(shapes) > 1 or len(shapes[0]) != 3 or shapes[0][2] != plan[1]:
+        raise ValueError(
+            f"genotypes: leaves of shapes {shapes} given without a policy; allowed: "
+            f"actions (worlds, steps, {plan[1]})"
+        )
+    if shapes[0][1] < plan[0]:
+        raise ValueError(
+            f"genotypes: plans of {shapes[0][1]} steps given; allowed: at least "
+            f"{plan[0]}, the longest of horizons"
+        )
+    return jax.tree.map(lambda x: jnp.asarray(x[:, : plan[0]], dtype), genotypes)
+
+
+def made_env(env: Env | str) -> Any:
+    """The environment to diagnose."""
+    if isinstance(env, str):
+        return create(env, episode_length=None, auto_reset=False, dtype="float64")
+    if not hasattr(env, "step"):
+        raise TypeError(f"env={env!r}: allowed: a name, or an environment")
+    if env.dtype != np.float64:
+        raise ValueError(
+            f"env: in {env.dtype}; allowed: float64, as create({env.name!r}, "
+            "dtype='float64', auto_reset=False) under jax.enable_x64(True)"
+        )
+    return env
