@@ -51,6 +51,7 @@ def randomize_params(
         Parameters for ``env.step``, or where ``worlds`` is given for its ``vmap``.
 
     Raises:
+        TypeError: ``env`` is no environment.
         ValueError: The environment has no physical parameters, or a range is not one;
             names it and what is allowed.
     """
@@ -78,12 +79,15 @@ def randomize_params(
 
 def _default(env: Env, worlds: int | None) -> PhysicsParams:
     """Returns the parameters of one world as in the files."""
+    if not isinstance(env, Env):
+        raise TypeError(f"env={env!r}; allowed: an environment, as create() makes it")
     default = env.unwrapped.default_params
     if not isinstance(default, PhysicsParams):
         raise ValueError(
             f"env: {env.name} has no physical parameters; allowed: simulated robots"
         )
-    if worlds is not None and (isinstance(worlds, bool) or worlds < 1):
+    integer = isinstance(worlds, (int, np.integer)) and not isinstance(worlds, bool)
+    if worlds is not None and not (integer and worlds >= 1):
         raise ValueError(f"worlds={worlds!r}; allowed: None, or integers from 1")
     return default
 

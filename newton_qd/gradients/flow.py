@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import math
 from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+from newton_qd.envs.options import is_number
+from newton_qd.gradients.checks import check_positive
 
 Tree = TypeVar("Tree")
 
@@ -50,8 +52,10 @@ class GradientOptions:
             whole = isinstance(value, int) and not isinstance(value, bool)
             if value is not None and not (whole and value >= 1):
                 raise ValueError(f"{name}={value!r}: allowed: None, integers from 1")
-        if self.clip is not None and not 0 < self.clip < math.inf:
-            raise ValueError(f"clip={self.clip!r}: allowed: None, or finite above 0")
+        if self.clip is not None:
+            check_positive("clip", self.clip)
+        if not is_number(self.discount):
+            raise TypeError(f"discount={self.discount!r}: allowed: 0 to 1")
         if not 0 <= self.discount <= 1:
             raise ValueError(f"discount={self.discount!r}: allowed: 0 to 1")
 

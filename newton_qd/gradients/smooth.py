@@ -6,6 +6,8 @@ import copy
 from typing import Any
 
 from newton_qd.envs.base import Env
+from newton_qd.envs.options import check_flag
+from newton_qd.gradients.checks import check_positive
 from newton_qd.wrappers import FeetContactWrapper
 from newton_qd.wrappers.base import Wrapper
 
@@ -28,8 +30,14 @@ def with_smooth_descriptor(
             that of the smooth reading.
 
     Raises:
-        ValueError: ``width`` is not above 0.
+        TypeError: ``env`` is no environment, ``width`` no number or
+            ``straight_through`` neither true nor false.
+        ValueError: ``width`` is not finite and above 0.
     """
+    if not isinstance(env, Env):
+        raise TypeError(f"env={env!r}: allowed: an environment, as create() makes it")
+    check_positive("width", width)
+    check_flag("straight_through", straight_through)
     if not isinstance(env, Wrapper):
         return env
     if isinstance(env, FeetContactWrapper):

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Sequence
 from typing import Any
 
-from newton_qd.envs.base import PhysicsEnv
+from newton_qd.envs.base import Env, PhysicsEnv
+from newton_qd.gradients.checks import check_positive
 from newton_qd.robots import Material
 
 _LENGTHS = ("static_penetration", "smoothing", "slip_velocity")
@@ -26,10 +26,12 @@ def softened(material: Material, factor: float) -> Material:
             stiffer, and nearer to rigid bodies.
 
     Raises:
+        TypeError: ``factor`` is no number, or ``material`` no material.
         ValueError: ``factor`` is not finite and above 0.
     """
-    if not 0 < factor < math.inf:
-        raise ValueError(f"factor={factor!r}: allowed: finite, above 0")
+    check_positive("factor", factor)
+    if not isinstance(material, Material):
+        raise TypeError(f"material={material!r}: allowed: newton_qd.robots.Material")
     changes = {name: factor * getattr(material, name) for name in _LENGTHS + _ANGLES}
     return dataclasses.replace(material, **changes)
 
@@ -45,9 +47,14 @@ def soft_to_stiff(env: Any, factors: Sequence[float] = (4, 2, 1)) -> tuple[Any, 
         factors: One for each environment that is returned.
 
     Raises:
+        TypeError: ``env`` is no environment, or a factor no number.
         ValueError: A factor is not finite and above 0.
         NotImplementedError: The environment inside is not a simulated robot.
     """
+    if not isinstance(env, Env):
+        raise TypeError(f"env={env!r}: allowed: an environment, as create() makes it")
+    if not isinstance(factors, Sequence) or isinstance(factors, str):
+        raise TypeError(f"factors={factors!r}: allowed: a sequence of numbers above 0")
     base = env.unwrapped
     if not isinstance(base, PhysicsEnv):
         raise NotImplementedError(

@@ -94,7 +94,7 @@ def bias_forces(system: System, q: jax.Array, v: jax.Array) -> jax.Array:
 
 
 def contact_gaps(system: System, q: jax.Array) -> jax.Array:
-    """Distances of all that can touch, as the step sees them; without a gradient.
+    """Distances of all that can touch, as the step sees them; not differentiable.
 
     Args:
         system: The system.
