@@ -79,7 +79,7 @@ def randomize_params(
 
 def _default(env: Env, worlds: int | None) -> PhysicsParams:
     """Returns the parameters of one world as in the files."""
-    if not isinstance(env, Env):
+    if not hasattr(env, "unwrapped"):
         raise TypeError(f"env={env!r}; allowed: an environment, as create() makes it")
     default = env.unwrapped.default_params
     if not isinstance(default, PhysicsParams):

@@ -34,7 +34,7 @@ def with_smooth_descriptor(
             ``straight_through`` neither true nor false.
         ValueError: ``width`` is not finite and above 0.
     """
-    if not isinstance(env, Env):
+    if not hasattr(env, "step"):
         raise TypeError(f"env={env!r}: allowed: an environment, as create() makes it")
     check_positive("width", width)
     check_flag("straight_through", straight_through)

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
-from newton_qd.envs.base import Env, PhysicsEnv
+from newton_qd.envs.base import PhysicsEnv
 from newton_qd.gradients.checks import check_positive
 from newton_qd.robots import Material
 
@@ -51,7 +51,7 @@ def soft_to_stiff(env: Any, factors: Sequence[float] = (4, 2, 1)) -> tuple[Any, 
         ValueError: A factor is not finite and above 0.
         NotImplementedError: The environment inside is not a simulated robot.
     """
-    if not isinstance(env, Env):
+    if not hasattr(env, "unwrapped"):
         raise TypeError(f"env={env!r}: allowed: an environment, as create() makes it")
     if not isinstance(factors, Sequence) or isinstance(factors, str):
         raise TypeError(f"factors={factors!r}: allowed: a sequence of numbers above 0")
