@@ -14,6 +14,9 @@ import warp as wp
 
 _TEMPLATE = Path(__file__).parent / "kernels"
 _VECTOR_BYTES = 32
+# Warp's default for CPUs. For CUDA it has 3, which compiles twice as long for kernels
+# that are 3 % faster (docs/verification.md).
+_OPTIMIZATION = 2
 SCALARS = {"float32": wp.float32, "float64": wp.float64}
 
 
@@ -56,6 +59,10 @@ def _load(dtype: str, width: int, parametric: bool, boxes: bool) -> SimpleNamesp
         for module in modules
         if (_TEMPLATE / f"{module}.py").exists()
     }
+    level = wp.config.optimization_level
+    level = _OPTIMIZATION if level is None else level
+    for module in loaded.values():
+        wp.set_module_options({"optimization_level": level}, module)
     return SimpleNamespace(package=package, **loaded)
 
 
