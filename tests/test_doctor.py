@@ -105,7 +105,7 @@ def test_policies_are_diagnosed_too() -> None:
         ({"horizons": (1.5, 2)}, "every one of horizons=1.5: allowed: integers"),
         ({"horizons": (1, 10**12)}, "horizons=1000000000000: allowed"),
         ({"seed": 10**30}, "seed=1000.*allowed: integers from 0"),
-        ({"sigma": float("inf")}, "sigma=inf: allowed: finite"),
+        ({"sigma": float("inf")}, "sigma=inf: allowed: a finite"),
         ({"worlds": 10**12}, "worlds=1000000000000: allowed"),
         ({"worlds": 0}, "worlds=0: allowed"),
         ({"samples": 1}, "samples=1: allowed"),
@@ -113,7 +113,7 @@ def test_policies_are_diagnosed_too() -> None:
         ({"genotypes": 1}, "genotypes: leaves of shapes"),
         ({"genotypes": np.zeros((2, 3, 1))}, "plans of 3 steps given.*at least 64"),
         ({"genotypes": np.zeros((2, 16, 2))}, r"allowed: actions \(worlds, steps, 1\)"),
-        ({"policy": lambda x, y: y}, "policy and genotypes: the second is None"),
+        ({"policy": lambda x, y: y}, "genotypes=None: allowed with a policy"),
     ],
 )
 def test_bad_settings(options: dict[str, Any], message: str) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from newton_qd.cli import doctor, envs, evolve
 from newton_qd.cli.arguments import BAD_ARGUMENTS, FAILED, OK, complain
-from newton_qd.errors import MissingExtra, UnknownEnvironment
+from newton_qd.errors import FaultError, MissingExtra, UnknownEnvironment
 from newton_qd.qd.checkpoint import CheckpointError
 from newton_qd.qd.config import ConfigError, EvolveConfig
 from newton_qd.qd.interrupt import INTERRUPTED
@@ -48,7 +48,7 @@ def main(
         return arguments.run(arguments)
     except (ConfigError, UnknownEnvironment) as error:
         return complain(arguments, error, BAD_ARGUMENTS)
-    except (CheckpointError, MissingExtra, OSError) as error:
+    except (CheckpointError, FaultError, MissingExtra, OSError) as error:
         return complain(arguments, error, FAILED)
     except KeyboardInterrupt:
         return complain(arguments, "interrupted", INTERRUPTED)

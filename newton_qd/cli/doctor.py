@@ -6,8 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from newton_qd.cli.arguments import BAD_ARGUMENTS, FAILED, OK, complain, widths
-from newton_qd.errors import FaultError
+from newton_qd.cli.arguments import BAD_ARGUMENTS, OK, complain, widths
 
 
 def add_parser(commands: Any) -> None:
@@ -63,11 +62,10 @@ def run(arguments: argparse.Namespace) -> int:
     from newton_qd.physics.precision import quiet
 
     quiet()
-    if arguments.out is not None:  # before minutes of work, not after
-        try:
-            arguments.out.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            return complain(arguments, f"--out: {error}", BAD_ARGUMENTS)
+    out = arguments.out
+    if out is not None and out.exists() and not out.is_dir():  # before minutes of work
+        refused = f"--out {out}: is no folder; allowed: a folder, or a new name"
+        return complain(arguments, refused, BAD_ARGUMENTS)
     try:
         report = newton_qd.diagnose_gradients(
             arguments.env_name,
@@ -80,10 +78,8 @@ def run(arguments: argparse.Namespace) -> int:
         )
     except ValueError as error:
         return complain(arguments, error, BAD_ARGUMENTS)
-    except FaultError as error:
-        return complain(arguments, error, FAILED)
     print(report)
-    if arguments.out is not None:
-        report.write(arguments.out)
-        print(f"written to {arguments.out}")
+    if out is not None:
+        report.write(out)
+        print(f"written to {out}")
     return OK

@@ -76,15 +76,46 @@ def check_flag(name: str, value: Any) -> None:
         raise TypeError(f"{name}={value!r}: allowed: True, False")
 
 
-def check_count(name: str, value: Any) -> None:
+def check_count(name: str, value: Any, least: int = 1, most: int = 2**31 - 1) -> None:
     """Raises where a number of things is none.
 
+    Args:
+        name: Name of the option.
+        value: What was given.
+        least: Smallest that is allowed.
+        most: Largest; by default what JAX counts with.
+
     Raises:
-        ValueError: It is no integer, or below 1.
+        ValueError: It is no integer, or out of its range.
     """
     integer = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
-    if not integer or value < 1:
-        raise ValueError(f"{name}={value!r}: allowed: integers from 1")
+    if not integer or not least <= value <= most:
+        raise ValueError(f"{name}={value!r}: allowed: integers from {least} to {most}")
+
+
+def check_positive(
+    name: str, value: Any, *, endless: bool = False, optional: bool = False
+) -> None:
+    """Raises where a number is not above 0.
+
+    Args:
+        name: Name of the option.
+        value: What was given.
+        endless: Whether it may be infinite.
+        optional: Whether it may be ``None``.
+
+    Raises:
+        TypeError: It is no number.
+        ValueError: It is not above 0, or infinite.
+    """
+    allowed = f"a {'' if endless else 'finite '}number above 0"
+    allowed = f"allowed: {'None, or ' if optional else ''}{allowed}"
+    if optional and value is None:
+        return
+    if not is_number(value):
+        raise TypeError(f"{name}={value!r}: {allowed}")
+    if not value > 0 or (value == math.inf and not endless):
+        raise ValueError(f"{name}={value!r}: {allowed}")
 
 
 def float_type(dtype: Any) -> np.dtype:

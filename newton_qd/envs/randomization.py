@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from newton_qd.envs.base import Env
+from newton_qd.envs.options import check_count
 from newton_qd.physics.parameters import FIELDS, PhysicsParams, check_bounds
 from newton_qd.types import RNGKey
 
@@ -86,9 +87,8 @@ def _default(env: Env, worlds: int | None) -> PhysicsParams:
         raise ValueError(
             f"env: {env.name} has no physical parameters; allowed: simulated robots"
         )
-    integer = isinstance(worlds, (int, np.integer)) and not isinstance(worlds, bool)
-    if worlds is not None and not (integer and worlds >= 1):
-        raise ValueError(f"worlds={worlds!r}; allowed: None, or integers from 1")
+    if worlds is not None:
+        check_count("worlds", worlds)
     return default
 
 

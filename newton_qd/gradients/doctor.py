@@ -12,10 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from newton_qd.envs.base import Env
+from newton_qd.envs.options import check_count, check_positive
 from newton_qd.errors import FaultError
 from newton_qd.gradients.doctor_input import (
     checked_genotypes,
-    checked_settings,
+    checked_horizons,
     made_env,
     refuse_faults,
 )
@@ -112,10 +113,9 @@ def diagnose_gradients(
     Args:
         env: Name, or an environment of one world in float64. Rewards count up to the
             first ``done``.
-        policy: Maps a genotype and an observation to an action; ``None``: genotypes
-            are open-loop actions.
+        policy: Maps a genotype and an observation to an action, or ``None``.
         genotypes: Pytree with one entry a world in front; without a policy plans of
-            actions (worlds, steps, nu). ``None``: uniform random actions.
+            actions (worlds, steps, nu), by default uniform random ones.
         horizons: Numbers of control steps, ascending.
         worlds: Number of random plans; not read where there are genotypes. All worlds
             share one reset.
@@ -132,20 +132,23 @@ def diagnose_gradients(
         ValueError: A setting is out of its range, or the environment in float32.
         FaultError: A world is at fault, or too many of its noisy samples are.
     """
-    counts = {"worlds": worlds, "directions": directions, "samples": samples}
-    horizons = checked_settings(horizons, policy, genotypes, sigma, seed, **counts)
+    check_count("worlds", worlds)
+    check_count("directions", directions)
+    check_count("samples", samples, 2)
+    check_count("seed", seed, 0, 2**32 - 1)
+    check_positive("sigma", sigma)
+    horizons = checked_horizons(horizons)
     with jax.enable_x64(True):
         made = made_env(env)
         reset_key, plan_key, *keys = jax.random.split(jax.random.key(seed), 4)
         subject = _Subject(made, policy, int(horizons[-1]), reset_key)
-        if genotypes is None:
+        if genotypes is None and policy is None:
             shape = (worlds, subject.steps, made.action_size)
             genotypes = jax.random.uniform(plan_key, shape, made.dtype, -1, 1)
         genotypes = checked_genotypes(genotypes, made, policy, subject.steps)
         name = env if isinstance(env, str) else made.name
-        return _report(
-            name, subject, genotypes, keys, horizons, directions, samples, sigma
-        )
+        counts = (directions, samples)
+        return _report(name, subject, genotypes, keys, horizons, *counts, sigma)
 
 
 def _report(

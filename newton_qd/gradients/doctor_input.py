@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from newton_qd.envs.base import Env
+from newton_qd.envs.options import check_count
 from newton_qd.errors import FaultError
-from newton_qd.gradients.checks import check_integer, check_positive
 from newton_qd.gradients.episode import Policy
 from newton_qd.registry import create
 
@@ -33,29 +33,18 @@ def refuse_faults(faulty: np.ndarray) -> None:
         )
 
 
-def checked_settings(
-    horizons: Sequence[int],
-    policy: Any,
-    genotypes: Any,
-    sigma: float,
-    seed: int,
-    **counts: int,
-) -> tuple[int, ...]:
-    """Raises for a setting out of its range; returns the horizons."""
-    for name, value in counts.items():
-        check_integer(name, value, 2 if name == "samples" else 1)
-    check_integer("seed", seed, 0, 2**32 - 1)
-    check_positive("sigma", sigma)
-    if policy is not None and genotypes is None:
-        raise ValueError(
-            "policy and genotypes: the second is None; allowed: genotypes for the "
-            "policy, or plans of actions without one"
-        )
+def checked_horizons(horizons: Any) -> tuple[int, ...]:
+    """Numbers of control steps.
+
+    Raises:
+        TypeError: They are no sequence.
+        ValueError: They are no ascending integers.
+    """
     allowed = f"horizons={horizons!r}: allowed: ascending integers from 1"
     if isinstance(horizons, str) or not isinstance(horizons, (Sequence, np.ndarray)):
         raise TypeError(allowed)
     for steps in horizons:
-        check_integer("every one of horizons", steps, 1)
+        check_count("every one of horizons", steps)
     found = tuple(int(steps) for steps in horizons)
     if not found or not all(a < b for a, b in itertools.pairwise(found)):
         raise ValueError(allowed)
@@ -68,9 +57,11 @@ def checked_genotypes(
     """Genotypes in the precision of the environment; plans as long as is needed.
 
     Raises:
-        ValueError: The leaves differ in the number of worlds, or plans are no actions
-            (worlds, steps, nu) for all steps.
+        ValueError: There are none, the leaves differ in the number of worlds, or plans
+            are no actions (worlds, steps, nu) for all steps.
     """
+    if genotypes is None:
+        raise ValueError("genotypes=None: allowed with a policy: what it acts by")
     dtype = env.dtype
     arrays = jax.tree.map(np.asarray, genotypes)
     genotypes = jax.tree.map(

@@ -13,9 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from newton_qd.envs.options import check_count
 from newton_qd.envs.state import State, select
 from newton_qd.extractors import Trajectories
-from newton_qd.gradients.checks import check_integer
 from newton_qd.gradients.flow import GradientOptions, passed_back
 from newton_qd.types import Params
 
@@ -101,7 +101,7 @@ def make_episode(
         TypeError: ``env`` is no environment, or ``options`` something else.
         ValueError: ``episode_length`` is not an integer from 1.
     """
-    check_integer("episode_length", episode_length, 1)
+    check_count("episode_length", episode_length)
     if not hasattr(env, "step"):
         raise TypeError(f"env={env!r}: allowed: an environment, as create() makes it")
     if not isinstance(options, (GradientOptions, NoneType)):

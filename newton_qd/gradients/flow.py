@@ -10,8 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from newton_qd.envs.options import is_number
-from newton_qd.gradients.checks import check_positive
+from newton_qd.envs.options import check_positive, is_number
 
 Tree = TypeVar("Tree")
 
@@ -52,8 +51,7 @@ class GradientOptions:
             whole = isinstance(value, int) and not isinstance(value, bool)
             if value is not None and not (whole and value >= 1):
                 raise ValueError(f"{name}={value!r}: allowed: None, integers from 1")
-        if self.clip is not None:
-            check_positive("clip", self.clip)
+        check_positive("clip", self.clip, optional=True)
         if not is_number(self.discount):
             raise TypeError(f"discount={self.discount!r}: allowed: 0 to 1")
         if not 0 <= self.discount <= 1:

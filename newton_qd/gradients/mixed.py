@@ -11,8 +11,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from newton_qd.envs.options import check_count, check_positive
 from newton_qd.envs.state import select
-from newton_qd.gradients.checks import check_integer, check_positive
 from newton_qd.gradients.episode import Policy, make_episode
 from newton_qd.gradients.exact import (
     EpisodeGradient,
@@ -92,7 +92,7 @@ def make_mixed_gradient(
         TypeError: A setting is no number.
         ValueError: It is out of its range.
     """
-    check_integer("samples", samples, 2)
+    check_count("samples", samples, 2)
     check_positive("sigma", sigma)
     check_positive("tolerance", tolerance, endless=True)
     subject = (env, policy, descriptor_extractor)

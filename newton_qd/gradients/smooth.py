@@ -6,8 +6,7 @@ import copy
 from typing import Any
 
 from newton_qd.envs.base import Env
-from newton_qd.envs.options import check_flag
-from newton_qd.gradients.checks import check_positive
+from newton_qd.envs.options import check_flag, check_positive
 from newton_qd.wrappers import FeetContactWrapper
 from newton_qd.wrappers.base import Wrapper
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from newton_qd.envs.base import PhysicsEnv
-from newton_qd.gradients.checks import check_positive
+from newton_qd.envs.options import check_positive
 from newton_qd.robots import Material
 
 _LENGTHS = ("static_penetration", "smoothing", "slip_velocity")

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import math
-
 import jax
 import jax.numpy as jnp
 
 from newton_qd.envs.base import Env, PhysicsEnv, QDEnv
-from newton_qd.envs.options import is_number
+from newton_qd.envs.options import check_positive
 from newton_qd.envs.state import State
 from newton_qd.physics.system import PhysicsState
 from newton_qd.types import Action, Descriptor, Params, RNGKey
@@ -51,8 +49,7 @@ class FeetContactWrapper(Wrapper, QDEnv):
                 f"This wrapper does not support {env_name} yet. Allowed: simulated "
                 "robots with feet"
             )
-        if smooth_width is not None:
-            _check_width(smooth_width)
+        check_positive("smooth_width", smooth_width, optional=True)
         if straight_through and smooth_width is None:
             raise ValueError(
                 "straight_through=True, smooth_width=None: allowed: a width above 0, "
@@ -114,12 +111,3 @@ class FeetContactWrapper(Wrapper, QDEnv):
 def _with_feet_width(env: Env, width: float) -> Env:
     assert isinstance(env, PhysicsEnv)
     return env.with_feet_width(width)
-
-
-def _check_width(width: float) -> None:
-    """Raises for a width that no reading can rise over."""
-    allowed = "allowed: None, or a finite number above 0"
-    if not is_number(width):
-        raise TypeError(f"smooth_width={width!r}: {allowed}")
-    if not 0 < width < math.inf:
-        raise ValueError(f"smooth_width={width!r}: {allowed}")
