@@ -17,8 +17,8 @@ from newton_qd import physics
 from newton_qd.envs.base import PhysicsEnv
 from newton_qd.envs.state import State
 from newton_qd.gradients import with_smooth_descriptor
+from newton_qd.physics.model.rest import raising_coordinate
 from newton_qd.physics.parameters import FIELDS
-from newton_qd.physics.rest import raising_coordinate
 
 WORLDS = 8
 INPUTS = ("q", "v", "action", *FIELDS)

@@ -16,7 +16,7 @@ from urdf_text import row, write
 from newton_qd import physics
 from newton_qd.physics import reference
 from newton_qd.physics.model import build_system
-from newton_qd.physics.rest import raising_coordinate
+from newton_qd.physics.model.rest import raising_coordinate
 from newton_qd.physics.system import JointKind, PhysicsState, System
 from newton_qd.robots import ROBOTS, Contact, Material, Robot
 

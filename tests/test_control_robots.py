@@ -16,9 +16,9 @@ from newton_qd import physics
 from newton_qd.assets import find_urdf
 from newton_qd.envs import Acrobot
 from newton_qd.physics import reference
-from newton_qd.physics.description import Shape, read_description
+from newton_qd.physics.model.description import Shape, read_description
+from newton_qd.physics.model.xml_reader import RobotDescriptionError
 from newton_qd.physics.system import JointKind
-from newton_qd.physics.xml_reader import RobotDescriptionError
 from newton_qd.robots import HUMANOID_STANDUP, REACHERANGLE, ROBOTS
 
 Vector = tuple[float, float, float]

@@ -19,8 +19,8 @@ from physics_helpers import (
 from newton_qd import physics
 from newton_qd.physics import reference
 from newton_qd.physics.model import build_system
+from newton_qd.physics.model.xml_reader import RobotDescriptionError
 from newton_qd.physics.system import System
-from newton_qd.physics.xml_reader import RobotDescriptionError
 from newton_qd.robots import HALFCHEETAH, ROBOTS, Contact
 
 

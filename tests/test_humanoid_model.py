@@ -9,7 +9,7 @@ from physics_helpers import batched_step, report, rollout, variant
 
 from newton_qd.assets import find_urdf
 from newton_qd.physics import load_system, reference
-from newton_qd.physics.description import read_description
+from newton_qd.physics.model.description import read_description
 from newton_qd.physics.system import System
 from newton_qd.robots import HUMANOID
 

@@ -15,12 +15,12 @@ import warp as wp
 from urdf_text import joint, link, row, sphere, write
 
 from newton_qd.assets import find_urdf
-from newton_qd.physics import model, reference
-from newton_qd.physics.description import read_description
-from newton_qd.physics.model import build_system, load_system
+from newton_qd.physics import reference
+from newton_qd.physics.model import build, build_system, load_system
+from newton_qd.physics.model.description import read_description
+from newton_qd.physics.model.verify import ModelMismatchError
+from newton_qd.physics.model.xml_reader import RobotDescriptionError
 from newton_qd.physics.system import JointKind, ObstacleKind, System
-from newton_qd.physics.verify import ModelMismatchError
-from newton_qd.physics.xml_reader import RobotDescriptionError
 from newton_qd.robots import ANT, ROBOTS, Contact, Robot
 
 ROOT_HALF = math.sqrt(0.5)
@@ -155,7 +155,7 @@ def test_arrays_are_typed_and_read_only(ant: System) -> None:
 @pytest.mark.slow
 def test_reference_agrees_with_newton(ant: System) -> None:
     path = str(find_urdf("ant.urdf"))
-    built = model.newton_builder(path, True, 9.8).finalize()
+    built = build.newton_builder(path, True, 9.8).finalize()
     rng = np.random.default_rng(0)
     for _ in range(5):
         q = rng.normal(size=ant.nq)
@@ -225,27 +225,27 @@ MISBUILT = {
 @pytest.mark.parametrize("case", MISBUILT)
 def test_misbuilt_model_is_refused(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
     change, message = MISBUILT[case]
-    builder = model.newton_builder
+    builder = build.newton_builder
 
     def misbuild(*arguments: object) -> newton.ModelBuilder:
         built = builder(*arguments)  # type: ignore[arg-type]
         change(built)
         return built
 
-    monkeypatch.setattr(model, "newton_builder", misbuild)
+    monkeypatch.setattr(build, "newton_builder", misbuild)
     with pytest.raises(ModelMismatchError, match=re.escape(message)):
         build_system(ANT, "float32")
 
 
 def test_joint_without_a_kind_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    builder = model.newton_builder
+    builder = build.newton_builder
 
     def misbuild(*arguments: object) -> newton.ModelBuilder:
         built = builder(*arguments)  # type: ignore[arg-type]
         built.joint_type[3] = newton.JointType.D6
         return built
 
-    monkeypatch.setattr(model, "newton_builder", misbuild)
+    monkeypatch.setattr(build, "newton_builder", misbuild)
     message = "joint 'ant/hip_2' is of Newton's type D6; allowed: FREE, REVOLUTE"
     with pytest.raises(RobotDescriptionError, match=message):
         build_system(ANT, "float32")

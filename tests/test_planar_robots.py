@@ -16,7 +16,7 @@ from physics_helpers import passive, report, rollout
 from newton_qd import physics
 from newton_qd.assets import find_urdf
 from newton_qd.physics import reference
-from newton_qd.physics.description import read_description
+from newton_qd.physics.model.description import read_description
 from newton_qd.physics.system import JointKind
 from newton_qd.robots import HALFCHEETAH, HOPPER, ROBOTS, WALKER2D, Robot
 

@@ -18,7 +18,7 @@ from newton_qd import physics
 from newton_qd.assets import find_urdf
 from newton_qd.envs import Pusher
 from newton_qd.physics import reference
-from newton_qd.physics.description import read_description
+from newton_qd.physics.model.description import read_description
 from newton_qd.robots import PUSHER
 
 Vector = tuple[float, float, float]

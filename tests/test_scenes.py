@@ -14,9 +14,9 @@ from urdf_text import joint, link, row, sphere, write
 from newton_qd.assets import AssetNotFoundError, find_urdf
 from newton_qd.physics import reference
 from newton_qd.physics.model import build_system, load_system, newton_builder
-from newton_qd.physics.scene import read_scene
+from newton_qd.physics.model.scene import read_scene
+from newton_qd.physics.model.xml_reader import RobotDescriptionError
 from newton_qd.physics.system import ObstacleKind, System
-from newton_qd.physics.xml_reader import RobotDescriptionError
 from newton_qd.robots import ANT, Contact
 from newton_qd.scenes import HUMANOID_TRAP, MAZE, SCENES, TRAP, Scene
 

@@ -17,7 +17,7 @@ from newton_qd.assets import find_urdf
 from newton_qd.envs.base import PhysicsEnv
 from newton_qd.physics import reference
 from newton_qd.physics.model import build_system, load_system
-from newton_qd.physics.rest import raising_coordinate
+from newton_qd.physics.model.rest import raising_coordinate
 from newton_qd.physics.system import PhysicsState, System
 from newton_qd.robots import HOPPER, ROBOTS, Contact
 

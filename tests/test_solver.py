@@ -16,8 +16,8 @@ from urdf_text import row, sphere, write
 
 from newton_qd import physics
 from newton_qd.assets import find_urdf
-from newton_qd.physics.description import read_description
 from newton_qd.physics.model import newton_builder
+from newton_qd.physics.model.description import read_description
 from newton_qd.physics.reference import rotation_matrix
 from newton_qd.physics.solver import NewtonQDSolver
 from newton_qd.robots import ANT, Robot

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from newton_qd import physics
-from newton_qd.physics.rest import grounding_coordinate
+from newton_qd.physics.model.rest import grounding_coordinate
 from newton_qd.physics.system import JointKind, PhysicsState, System
 
 _LIGHTEST = 1e-5  # [kg]

@@ -15,8 +15,8 @@ from newton_qd.physics.inspection import (
     seen_bodies,
 )
 from newton_qd.physics.model import load_system
+from newton_qd.physics.model.rest import grounding_coordinate, raising_coordinate
 from newton_qd.physics.parameters import PhysicsParams, default_params
-from newton_qd.physics.rest import grounding_coordinate, raising_coordinate
 from newton_qd.physics.step import initial_state, step
 from newton_qd.physics.system import Kinematics, PhysicsState, System
 

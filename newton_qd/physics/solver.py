@@ -15,10 +15,10 @@ from newton.solvers import SolverBase
 from warp._src import context
 
 from newton_qd.assets import find_urdf
-from newton_qd.physics.description import read_description
 from newton_qd.physics.kernels.conventions import pack, unpack
 from newton_qd.physics.launch import Launcher, output_size
 from newton_qd.physics.model import load_system, newton_builder
+from newton_qd.physics.model.description import read_description
 from newton_qd.physics.system import JointKind, System
 from newton_qd.robots import Robot
 

@@ -1,6 +1,6 @@
 """Reads a robot's URDF file in double precision, and refuses what it cannot mean.
 
-This is the independent reading that :mod:`newton_qd.physics.verify` holds against
+This is the independent reading that :mod:`newton_qd.physics.model.verify` holds against
 the model that Newton built. Elements that physics does not need (materials,
 transmissions, simulator extensions) are ignored.
 """
@@ -14,8 +14,12 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from newton_qd.physics.model.xml_reader import (
+    IDENTITY,
+    RobotDescriptionError,
+    XmlReader,
+)
 from newton_qd.physics.reference import compose, rotation_matrix
-from newton_qd.physics.xml_reader import IDENTITY, RobotDescriptionError, XmlReader
 
 WORLD = "world"
 """Name of a root link that is fixed to the world; any other root floats."""

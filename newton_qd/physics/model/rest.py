@@ -7,9 +7,9 @@ import dataclasses
 import numpy as np
 
 from newton_qd.physics import reference
-from newton_qd.physics.row import index_of
+from newton_qd.physics.model.robot_checks import index_of
+from newton_qd.physics.model.xml_reader import RobotDescriptionError
 from newton_qd.physics.system import JointKind, System
-from newton_qd.physics.xml_reader import RobotDescriptionError
 
 
 def raising_coordinate(system: System) -> tuple[int, float] | None:

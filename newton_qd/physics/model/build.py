@@ -1,8 +1,8 @@
 """Builds a System: the URDF file through Newton's model, and the robot's row.
 
 Newton decides the order of bodies and coordinates. It stores single precision, so
-once :mod:`newton_qd.physics.verify` has shown that its numbers are the file's, the
-System takes them in the file's double precision.
+once :mod:`newton_qd.physics.model.verify` has shown that its numbers are the file's,
+the System takes them in the file's double precision.
 """
 
 from __future__ import annotations
@@ -16,33 +16,25 @@ import numpy as np
 
 from newton_qd.assets import find_urdf
 from newton_qd.physics import reference
-from newton_qd.physics.contacts import body_of, contact_tables, pair_shares
-from newton_qd.physics.description import (
+from newton_qd.physics.model.contacts import body_of, contact_tables, pair_shares
+from newton_qd.physics.model.description import (
     UNLIMITED,
     Body,
     Description,
     Shape,
     read_description,
 )
-from newton_qd.physics.rest import rest_coordinates
-from newton_qd.physics.row import check_row, index_of
-from newton_qd.physics.scene import obstacle_tables, read_scene
+from newton_qd.physics.model.rest import rest_coordinates
+from newton_qd.physics.model.robot_checks import check_robot, index_of
+from newton_qd.physics.model.scene import obstacle_tables, read_scene
+from newton_qd.physics.model.verify import BuiltModel, ModelMismatchError, verify
+from newton_qd.physics.model.xml_reader import IDENTITY, RobotDescriptionError
 from newton_qd.physics.system import JointKind, System
-from newton_qd.physics.verify import BuiltModel, ModelMismatchError, verify
-from newton_qd.physics.xml_reader import IDENTITY, RobotDescriptionError
 from newton_qd.robots import Robot
 from newton_qd.scenes import Scene
 
 if TYPE_CHECKING:
     import newton
-
-__all__ = [
-    "ModelMismatchError",
-    "RobotDescriptionError",
-    "build_system",
-    "load_system",
-    "newton_builder",
-]
 
 _DTYPES = ("float32", "float64")
 _EARTH_GRAVITY = 9.81  # [m/s^2]
@@ -234,7 +226,7 @@ def build_system(robot: Robot, dtype: str, scene: Scene | None = None) -> System
         ValueError: ``dtype`` is not allowed, or needs JAX's 64-bit mode.
     """
     _check_dtype(dtype)
-    check_row(robot)
+    check_robot(robot)
     description = read_description(find_urdf(robot.urdf))
     builder = newton_builder(str(description.path), description.floating, robot.gravity)
     # The file's inertias are checked already; Newton would correct some silently.
@@ -331,6 +323,6 @@ def load_system(
     _check_dtype(dtype)
     if feet_width is not None and not feet_width > 0:
         raise ValueError(f"feet_width={feet_width!r}: allowed: None, or above 0")
-    check_row(robot)  # before the cache hashes it
+    check_robot(robot)  # before the cache hashes it
     system = _cached_system(robot, dtype, scene)
     return _cached_variant(system, feet_width, reports_bodies)

@@ -7,16 +7,16 @@ from collections.abc import Iterator
 import numpy as np
 
 from newton_qd.physics import reference
-from newton_qd.physics.description import Body, Shape
-from newton_qd.physics.row import index_of
-from newton_qd.physics.scene import (
+from newton_qd.physics.model.description import Body, Shape
+from newton_qd.physics.model.robot_checks import index_of
+from newton_qd.physics.model.scene import (
     TOUCHING,
     ContactRow,
     wall_contacts,
     whole_collider,
 )
+from newton_qd.physics.model.xml_reader import RobotDescriptionError
 from newton_qd.physics.system import System
-from newton_qd.physics.xml_reader import RobotDescriptionError
 from newton_qd.robots import Contact, Robot
 from newton_qd.scenes import Scene
 

@@ -12,9 +12,9 @@ import dataclasses
 import numpy as np
 from numpy.typing import ArrayLike
 
-from newton_qd.physics.description import Body, Description, Shape
+from newton_qd.physics.model.description import Body, Description, Shape
+from newton_qd.physics.model.xml_reader import IDENTITY, RobotDescriptionError
 from newton_qd.physics.system import JointKind
-from newton_qd.physics.xml_reader import IDENTITY, RobotDescriptionError
 
 # A few roundings of single precision, relative to the largest number compared.
 _TOLERANCE = 2e-6

@@ -8,7 +8,7 @@ import numbers
 import os
 from collections.abc import Callable
 
-from newton_qd.physics.xml_reader import RobotDescriptionError
+from newton_qd.physics.model.xml_reader import RobotDescriptionError
 from newton_qd.robots import Contact, Material, Robot
 
 _MAY_BE_ZERO = ("gravity", "friction", "dissipation")
@@ -161,7 +161,7 @@ def _check_contacts(robot: Robot) -> None:
                 )
 
 
-def check_row(robot: Robot) -> None:
+def check_robot(robot: Robot) -> None:
     """Checks the numbers of a row, and what can be checked without its file.
 
     Raises:

@@ -9,7 +9,7 @@ import numpy as np
 
 from newton_qd.assets import find_urdf
 from newton_qd.physics import reference
-from newton_qd.physics.description import (
+from newton_qd.physics.model.description import (
     WORLD,
     Link,
     Shape,
@@ -18,8 +18,12 @@ from newton_qd.physics.description import (
     read_joints,
     read_link,
 )
+from newton_qd.physics.model.xml_reader import (
+    IDENTITY,
+    RobotDescriptionError,
+    XmlReader,
+)
 from newton_qd.physics.system import ObstacleKind
-from newton_qd.physics.xml_reader import IDENTITY, RobotDescriptionError, XmlReader
 from newton_qd.robots import Robot
 from newton_qd.scenes import Scene
 
