@@ -24,7 +24,7 @@ def functions() -> dict[str, Any]:
     package = kernels("float64", WIDTH).package.__name__
     found = {}
     for part in ("algebra", "numbers", "smooth"):
-        module = importlib.import_module(f"{package}.{part}")
+        module = importlib.import_module(f"{package}.cpp.{part}")
         for name, value in vars(module).items():
             for signature, overload in getattr(value, "user_overloads", {}).items():
                 if overload.adj_native_snippet:

@@ -8,7 +8,7 @@ even time to compile. A thread computes
 ``width`` worlds side by side: as the elements of one vector instruction on a CPU,
 where they fill it, and one on a GPU, whose threads are such elements already. So
 ``real``, ``vec3`` and the other types below hold one value for each world of a pack;
-what :mod:`.algebra` does with them it does with each world by itself, and a world's
+what :mod:`.cpp` does with them it does with each world by itself, and a world's
 result depends neither on its place in the pack nor on its neighbours.
 
 Rules that the adjoint needs (Warp 1.19): every intermediate is stored once per step;

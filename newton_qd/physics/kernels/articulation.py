@@ -11,7 +11,7 @@ implicit in its new velocity and sit on its diagonal D.
 import warp as wp
 
 from . import mat33, real, scalar, stage, vec3
-from .algebra import (
+from .cpp.algebra import (
     add,
     add_diagonal,
     component,
@@ -27,10 +27,10 @@ from .algebra import (
     transpose,
     vector,
 )
-from .memory import constant, load, store
-from .numbers import uniform
+from .cpp.memory import constant, load, store
+from .cpp.numbers import uniform
+from .cpp.smooth import gate, penetration
 from .parameters import body_mass, joint_damping
-from .smooth import gate, penetration
 from .structs import Model, Row, Scratch
 
 

@@ -9,9 +9,9 @@ at most, and the middle of the box, where no face is the nearest, is as smooth.
 import warp as wp
 
 from . import real, scalar, vec3
-from .algebra import add, component, div, dot, mul, neg, sub, vector
-from .numbers import clamp, uniform
-from .smooth import finite_length, gate, penetration
+from .cpp.algebra import add, component, div, dot, mul, neg, sub, vector
+from .cpp.numbers import clamp, uniform
+from .cpp.smooth import finite_length, gate, penetration
 from .structs import Model
 
 # Where the nearest point of a segment is searched: beyond both ends, -1 and 1.

@@ -11,7 +11,7 @@ stays close to its cone.
 import warp as wp
 
 from . import real, scalar, stage, vec3
-from .algebra import (
+from .cpp.algebra import (
     add,
     cross,
     div,
@@ -21,12 +21,12 @@ from .algebra import (
     sub,
     transform_point,
 )
-from .memory import constant, load, store
+from .cpp.memory import constant, load, store
+from .cpp.numbers import sqrt, uniform
+from .cpp.smooth import gate, penetration
 from .nearest import touch_obstacle
-from .numbers import sqrt, uniform
 from .pair import touch_partner
 from .parameters import contact_stiffness, friction, total_mass
-from .smooth import gate, penetration
 from .structs import Model, Row, Scratch
 
 # Hunt-Crossley factor and clipping switch over these fractions of their natural scale.

@@ -6,8 +6,8 @@ Inputs: q and v of each world, as in :mod:`.inspect`. Outputs: the gap of each c
 import warp as wp
 
 from . import real, scalar, vec3
+from .cpp.memory import load, scatter
 from .inspect import load_views
-from .memory import load, scatter
 from .nearest import touch_obstacle
 from .pair import touch_partner
 from .simulate import kinematics

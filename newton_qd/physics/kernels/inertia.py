@@ -1,7 +1,7 @@
 """Rigid inertia and bias wrench of each body about O."""
 
 from . import stage
-from .algebra import (
+from .cpp.algebra import (
     add,
     add_diagonal,
     cross,
@@ -14,7 +14,7 @@ from .algebra import (
     transform_point,
     transpose,
 )
-from .memory import constant, load, store
+from .cpp.memory import constant, load, store
 from .parameters import body_inertia, body_mass
 from .structs import Model, Row, Scratch
 

@@ -7,7 +7,7 @@ matrix, row by row, and the bias forces.
 import warp as wp
 
 from . import mat33, real, scalar, sync, vec3
-from .algebra import (
+from .cpp.algebra import (
     add,
     add_diagonal,
     cross,
@@ -17,9 +17,9 @@ from .algebra import (
     translation,
     vector,
 )
+from .cpp.memory import constant, gather, load, scatter, store
+from .cpp.numbers import uniform
 from .inertia import rigid_inertia
-from .memory import constant, gather, load, scatter, store
-from .numbers import uniform
 from .readings import BODY_SIZE, body_reading, seed_bodies, store_bodies
 from .simulate import kinematics
 from .structs import Model, Row, Scratch, row_at

@@ -1,9 +1,9 @@
 """Semi-implicit Euler: new velocities, then coordinates moved with them."""
 
 from . import scalar, stage
-from .algebra import add, component, mul, normalize, quaternion, vector
-from .memory import load, store
-from .smooth import turn_by
+from .cpp.algebra import add, component, mul, normalize, quaternion, vector
+from .cpp.memory import load, store
+from .cpp.smooth import turn_by
 from .structs import Model, Row, Scratch
 
 

@@ -9,7 +9,7 @@ Gravity enters as an upward acceleration of the world.
 import warp as wp
 
 from . import real, scalar, stage, vec3
-from .algebra import (
+from .cpp.algebra import (
     add,
     cross,
     mul,
@@ -21,10 +21,10 @@ from .algebra import (
     translation,
     vector,
 )
-from .memory import constant, load, store
-from .numbers import uniform
+from .cpp.memory import constant, load, store
+from .cpp.numbers import uniform
+from .cpp.smooth import turn_about
 from .parameters import gravity
-from .smooth import turn_about
 from .structs import Model, Row, Scratch
 
 

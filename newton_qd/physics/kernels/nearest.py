@@ -11,7 +11,8 @@ few degrees, or cross near an end. The obstacle is a plane, a capsule or a box.
 import warp as wp
 
 from . import boxes, real, scalar, vec3
-from .algebra import (
+from .box import box_distance, box_normal, box_share
+from .cpp.algebra import (
     add,
     component,
     div,
@@ -26,10 +27,9 @@ from .algebra import (
     translation,
     vector,
 )
-from .box import box_distance, box_normal, box_share
-from .memory import constant, load
-from .numbers import uniform
-from .smooth import bounded, finite_length
+from .cpp.memory import constant, load
+from .cpp.numbers import uniform
+from .cpp.smooth import bounded, finite_length
 from .structs import Model, Row, Scratch
 
 BOXES = wp.constant(boxes)

@@ -8,11 +8,11 @@ and opposite to the last digit.
 import warp as wp
 
 from . import scalar
-from .algebra import add, div, dot, mul, neg, rotate, rotation, sub, transform_point
-from .memory import constant, load
+from .cpp.algebra import add, div, dot, mul, neg, rotate, rotation, sub, transform_point
+from .cpp.memory import constant, load
+from .cpp.numbers import uniform
+from .cpp.smooth import bounded, finite_length
 from .nearest import segment_share
-from .numbers import uniform
-from .smooth import bounded, finite_length
 from .structs import Model, Row, Scratch
 
 

@@ -11,9 +11,9 @@ Otherwise nothing of this is compiled: the functions below are the model's const
 import warp as wp
 
 from . import parametric, real, scalar, sync
-from .algebra import add, mul, sub
-from .memory import constant, gather, load, scatter, store
-from .numbers import choose, uniform
+from .cpp.algebra import add, mul, sub
+from .cpp.memory import constant, gather, load, scatter, store
+from .cpp.numbers import choose, uniform
 from .structs import Model, Row, Scratch
 
 PARAMETRIC = wp.constant(parametric)

@@ -8,7 +8,7 @@ and the angular velocity (3).
 import warp as wp
 
 from . import real, scalar, stage, vec3
-from .algebra import (
+from .cpp.algebra import (
     add,
     component,
     cross,
@@ -21,9 +21,9 @@ from .algebra import (
     translation,
     vector,
 )
-from .memory import constant, gather, load, scatter, store
-from .numbers import above, choose, uniform
-from .smooth import logistic
+from .cpp.memory import constant, gather, load, scatter, store
+from .cpp.numbers import above, choose, uniform
+from .cpp.smooth import logistic
 from .structs import Model, Row, Scratch, row_at
 
 BODY_SIZE = wp.constant(16)

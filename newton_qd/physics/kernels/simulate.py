@@ -11,10 +11,10 @@ from .contact import (
     contact_predictor,
     contact_slip,
 )
+from .cpp.memory import load
 from .inertia import rigid_inertia
 from .integration import mean_velocity, new_coordinates, new_velocity
 from .kinematics import free_joint, hinge_joint, world_frame
-from .memory import load
 from .readings import body_impulse, body_reading, foot_contact, torso_position
 from .structs import Model, Row, Scratch, row_after, row_at
 from .world import Pack, detect_fault, settle

@@ -3,7 +3,7 @@
 import warp as wp
 
 from . import mat33, real, scalar, transform, vec3
-from .memory import TABLES
+from .cpp.memory import TABLES
 
 _vec3, _mat33, _transform = TABLES[vec3], TABLES[mat33], TABLES[transform]
 

@@ -9,9 +9,9 @@ torso, and, where the model reports them, the bodies as in :mod:`.readings`.
 import warp as wp
 
 from . import real, scalar, stage, sync, width
-from .algebra import add, component, mul
-from .memory import constant, gather, load, scatter, store
-from .numbers import beyond, choose
+from .cpp.algebra import add, component, mul
+from .cpp.memory import constant, gather, load, scatter, store
+from .cpp.numbers import beyond, choose
 from .parameters import (
     PARAMETRIC,
     load_parameters,

@@ -11,7 +11,7 @@ import re
 
 import warp as wp
 
-from . import mat33, quat, real, scalar, transform, vec3, width
+from .. import mat33, quat, real, scalar, transform, vec3, width
 
 _NUMBER = {wp.float32: "float", wp.float64: "double"}[scalar]
 _ARGUMENT = re.compile(r"\b(?:adj_)?([A-Z]+)\b")

@@ -6,7 +6,7 @@ of its angle squared.
 
 import warp as wp
 
-from . import quat, real, scalar, vec3
+from .. import quat, real, scalar, vec3
 from .algebra import add, dot, mul, sub
 from .native import native
 from .numbers import sqrt

@@ -8,7 +8,7 @@ hands it over and clears it; a store is not repeated when a function is replayed
 
 import warp as wp
 
-from . import mat33, real, scalar, transform, vec3, width
+from .. import mat33, real, scalar, transform, vec3, width
 from .native import CPP, PRELUDE
 
 _LOAD = PRELUDE + "return Pack::out(Pack::in(a.data[i]));"

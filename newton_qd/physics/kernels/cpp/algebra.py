@@ -6,7 +6,7 @@ imports them, and its own where none of these fits.
 
 import warp as wp
 
-from . import mat33, quat, real, scalar, transform, vec3
+from .. import mat33, quat, real, scalar, transform, vec3
 from .native import native
 from .numbers import ROOT
 

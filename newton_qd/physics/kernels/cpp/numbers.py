@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from . import real, scalar
+from .. import real, scalar
 from .native import native
 
 ROOT = """
