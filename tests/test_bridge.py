@@ -13,12 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import warp as wp
-from warp._src.jax.ffi import _FFI_CALLABLE_REGISTRY
 
 from newton_qd import physics
+from newton_qd.physics.warp_internals import ffi_module
 from newton_qd.robots import ANT
 
 SYSTEM = physics.load_system(ANT)
+REGISTRY = ffi_module()._FFI_CALLABLE_REGISTRY
 RNG = np.random.default_rng(3)
 ACTIONS = RNG.uniform(-1.0, 1.0, (2, 3, 8)).astype(np.float32)
 
@@ -188,7 +189,7 @@ def test_calls_are_not_traced_again() -> None:
 
 def numbered_calls() -> int:
     """Calls that Warp has seen; it keeps each, and XLA compiles each."""
-    return sum(len(call.call_descriptors) for call in _FFI_CALLABLE_REGISTRY.values())
+    return sum(len(call.call_descriptors) for call in REGISTRY.values())
 
 
 def test_eager_calls_are_not_compiled_again() -> None:

@@ -22,11 +22,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from warp._src.jax import ffi
 
 import newton_qd
 from newton_qd import physics
 from newton_qd.physics import interrupts
+from newton_qd.physics.warp_internals import ffi_module
 from newton_qd.robots import ANT
 
 INTERRUPTS = 20
@@ -113,7 +113,7 @@ class InterruptAt:
 def _in_callback(frame: FrameType | None) -> bool:
     """Whether XLA has called into Warp; told apart by file, not by function."""
     while frame is not None:
-        if frame.f_code.co_filename == ffi.__file__:
+        if frame.f_code.co_filename == ffi_module().__file__:
             return True
         frame = frame.f_back
     return False

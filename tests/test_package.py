@@ -166,6 +166,18 @@ def test_model_does_not_launch(name: str) -> None:
     assert not wrong
 
 
+def test_only_one_file_knows_the_inside_of_warp() -> None:
+    private = "warp" + "._src"
+    allowed = {"newton_qd/physics/warp_internals.py", "tests/test_warp_internals.py"}
+    files = {
+        path.relative_to(ROOT).as_posix()
+        for folder in ("newton_qd", "tests", "benchmarks", "examples", "docs")
+        for path in (ROOT / folder).rglob("*.py")
+        if private in path.read_text(encoding="utf-8")
+    }
+    assert files == allowed
+
+
 def test_no_import_cycles() -> None:
     graph = {
         name: {target for _, target in imports(name) if target in MODULES} - {name}

@@ -15,13 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 import warp as wp
 from jax.core import Tracer
-from warp._src.jax.ffi import FfiCallable
 
 from newton_qd.physics import interrupts
 from newton_qd.physics.launch import BODY_SIZE, Launcher, output_size, thread_count
 from newton_qd.physics.parameters import parameter_count
 from newton_qd.physics.precision import SCALARS, kernels
 from newton_qd.physics.system import Kinematics, System
+from newton_qd.physics.warp_internals import ffi_callback
 
 
 @functools.cache
@@ -306,7 +306,7 @@ def episode_final(state_desc: jax.Array, mask: jax.Array) -> jax.Array:
     return _episode_reduction("final", state_desc.dtype.name, steps, nd, nd)(row)
 
 
-interrupts.protect(FfiCallable.ffi_callback)
+interrupts.protect(ffi_callback())
 
 
 def to_jax(array: Any) -> jax.Array:

@@ -12,6 +12,7 @@ from newton_qd.physics import reference
 from newton_qd.physics.precision import kernels, pack_width
 from newton_qd.physics.system import CONTACT_FRACTION, STANDARD_GRAVITY, System
 from newton_qd.physics.tree import Tree, build_tree, origin_axes
+from newton_qd.physics.warp_internals import field_dtype
 
 # Trials of a substep and solves of a trial. With contacts: a predictor and two
 # correctors of the contacts. Without: two more trials, each at the mean velocity of the
@@ -70,7 +71,7 @@ def build_model(system: System, device: Any, parametric: bool = False) -> Any:
     robot, material = system.robot, system.robot.material
 
     def put(name: str, values: Any) -> None:
-        dtype = space.structs.Model.vars[name].type.dtype
+        dtype = field_dtype(space.structs.Model, name)
         setattr(model, name, wp.array(np.asarray(values), dtype=dtype, device=device))
 
     model.nb, model.nq, model.nv = system.nb, system.nq, system.nv
@@ -227,7 +228,7 @@ def build_scratch(
     values, adjoints = space.structs.Scratch(), space.structs.Scratch()
     size = 0
     for name, count in _entries(system, adjoint).items():
-        dtype = space.structs.Scratch.vars[name].type.dtype
+        dtype = field_dtype(space.structs.Scratch, name)
         array = wp.zeros(
             slots * count, dtype=dtype, device=device, requires_grad=adjoint
         )

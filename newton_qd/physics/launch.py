@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import threading
 from typing import Any
@@ -73,6 +74,31 @@ def output_size(system: System) -> int:
     return size + (BODY_SIZE * system.nb if system.reports_bodies else 0)
 
 
+@dataclasses.dataclass(frozen=True)
+class _Command:
+    """A recorded launch, and the position of its first array among its arguments."""
+
+    launch: Any
+    first_array: int
+
+    def send(
+        self,
+        arrays: tuple[Any, ...],
+        first: int,
+        worlds: int,
+        threads: int,
+        slot_stride: int,
+        lanes: int,
+    ) -> None:
+        """Launch it on ``worlds`` worlds from ``first`` on."""
+        self.launch.set_dim(threads)
+        for index, value in enumerate((first, slot_stride, worlds, lanes), 1):
+            self.launch.set_param_at_index(index, value)
+        for index, array in enumerate(arrays, self.first_array):
+            self.launch.set_param_at_index(index, array)
+        self.launch.launch()
+
+
 class Launcher:
     """The kernels of one system on one device.
 
@@ -96,7 +122,7 @@ class Launcher:
         self.model = buffers.build_model(system, device, parametric)
         self._block = 1 if device.is_cpu else _GPU_BLOCK
         self._scratch: dict[tuple[bool, Any], tuple[int, Any]] = {}
-        self._commands: dict[tuple[str, Any], Any] = {}
+        self._commands: dict[tuple[str, Any], _Command] = {}
         self._workers: list[Worker] = []
         self._lock = threading.Lock()
 
@@ -145,7 +171,7 @@ class Launcher:
         for first in range(0, worlds, resident):
             count = min(resident, worlds - first)
             command = self._command(kernel, owner, resident, arrays, adjoint)
-            _send(command, arrays, first, count, count * lanes, 1, lanes)
+            command.send(arrays, first, count, count * lanes, 1, lanes)
 
     def _kernel(self, name: str) -> Any:
         return getattr(getattr(self.kernels, _MODULES.get(name, "inspect")), name)
@@ -173,10 +199,10 @@ class Launcher:
                 worker.wait()
 
     def _send_share(
-        self, command: Any, arrays: tuple[Any, ...], first: int, end: int
+        self, command: _Command, arrays: tuple[Any, ...], first: int, end: int
     ) -> None:
         worlds = end - first
-        _send(command, arrays, first, worlds, -(-worlds // self.width), 0, 1)
+        command.send(arrays, first, worlds, -(-worlds // self.width), 0, 1)
 
     def _command(
         self,
@@ -185,7 +211,7 @@ class Launcher:
         slots: int,
         arrays: tuple[Any, ...],
         adjoint: bool,
-    ) -> Any:
+    ) -> _Command:
         """The recorded launch of ``kernel`` in an owner's scratch."""
         held = self._scratch.get((adjoint, owner))
         if held is None or held[0] < slots:
@@ -206,38 +232,21 @@ class Launcher:
 
     def _record(
         self, kernel: Any, scratch: Any, arrays: tuple[Any, ...], adjoint: bool
-    ) -> Any:
+    ) -> _Command:
         structs = self.kernels.structs
         held = [scratch.values, *([scratch.adjoints] if adjoint else [])]
         # adjoints travel through the scratch and ``arrays``, not through Warp's
         unused = [structs.Model(), 0, 0, 0, 0, *(structs.Scratch() for _ in held)]
         unused += [None for _ in arrays]
-        return wp.launch(
+        before = [self.model, 0, 0, 0, 1, *held]
+        launch = wp.launch(
             kernel,
             dim=1,
-            inputs=[self.model, 0, 0, 0, 1, *held, *arrays],
+            inputs=[*before, *arrays],
             adj_inputs=unused if adjoint else [],
             adjoint=adjoint,
             device=self.device,
             block_dim=self._block,
             record_cmd=True,
         )
-
-
-def _send(
-    command: Any,
-    arrays: tuple[Any, ...],
-    first: int,
-    worlds: int,
-    threads: int,
-    slot_stride: int,
-    lanes: int,
-) -> None:
-    """Launch a recorded command on ``worlds`` worlds from ``first`` on."""
-    command.set_dim(threads)
-    for index, value in enumerate((first, slot_stride, worlds, lanes), 1):
-        command.set_param_at_index(index, value)
-    begin = len(command.kernel.adj.args) - len(arrays)
-    for index, array in enumerate(arrays, begin):
-        command.set_param_at_index(index, array)
-    command.launch()
+        return _Command(launch, len(before))

@@ -12,7 +12,6 @@ import newton
 import numpy as np
 import warp as wp
 from newton.solvers import SolverBase
-from warp._src import context
 
 from newton_qd.assets import find_urdf
 from newton_qd.physics.kernels.conventions import pack, unpack
@@ -20,6 +19,7 @@ from newton_qd.physics.launch import Launcher, output_size
 from newton_qd.physics.model import load_system, newton_builder
 from newton_qd.physics.model.description import read_description
 from newton_qd.physics.system import JointKind, System
+from newton_qd.physics.warp_internals import tape_is_recording
 from newton_qd.robots import Robot
 
 # Arrays that every world must share with the robot, by what they have a row for.
@@ -148,7 +148,7 @@ class NewtonQDSolver(SolverBase):
         self.validate_observables(observables)
         if not (math.isfinite(dt) and dt > 0.0):
             raise ValueError(f"dt={dt!r}; allowed: positive numbers of seconds")
-        if getattr(context.runtime, "tape", None) is not None:
+        if tape_is_recording():
             raise RuntimeError(
                 "NewtonQDSolver.step inside wp.Tape would record no gradient; "
                 "differentiate newton_qd.physics.step with jax.grad instead"
