@@ -36,8 +36,8 @@ a CPU): {WORLDS:,} untrained policies, perceptrons with two hidden layers of
   tessellation. {WORLDS:,} points spread evenly at random would reach 62 %.
 - *5 % to 95 %*: quantiles of each component of the descriptors, and its limits.
 - *Lowest reward*: of a step of these episodes, and of {WORLDS:,} more with uniform
-  random actions. Minus it, rounded up, is `newton_qd.reward_offset`, which keeps QD
-  scores positive; `newton_qd.original_reward_offset` has the original's.
+  random actions. Minus it, rounded up, is `newton_qd.tables.reward_offset`, which keeps
+  QD scores positive; `newton_qd.tables.original_reward_offset` has the original's.
 
 | task | coverage [%] | 5 % to 95 % (limits) | lowest reward | original | offset |
 |---|---|---|---|---|---|
@@ -140,9 +140,10 @@ def survey(name: str) -> str:
     )
     # in hundredths; a task that is never punished needs none
     offset = max(0, math.ceil(-100 * lowest)) / 100
+    original = newton_qd.tables.original_reward_offset[name]
     return (
         f"| `{name}` | {100 * coverage(task.limits, descriptors):.1f} | {spread} | "
-        f"{lowest:.4f} | {newton_qd.original_reward_offset[name]:g} | {offset:g} |"
+        f"{lowest:.4f} | {original:g} | {offset:g} |"
     )
 
 
@@ -150,7 +151,9 @@ def main() -> None:
     """Writes the page."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path)
-    parser.add_argument("--names", nargs="+", default=list(newton_qd.reward_offset))
+    parser.add_argument(
+        "--names", nargs="+", default=list(newton_qd.tables.reward_offset)
+    )
     options = parser.parse_args()
     text = HEAD
     for name in options.names:

@@ -47,7 +47,7 @@ def _numbers(values: object) -> str:
 
 def _summary(name: str, env: Env) -> tuple[object, ...]:
     descriptor = "-"
-    if name in newton_qd.descriptor_extractor:
+    if name in newton_qd.tables.descriptor_extractor:
         qd = cast(QDEnv, env)
         descriptor = f"`{qd.state_descriptor_name}` ({qd.state_descriptor_length})"
     link = f"[`{name}`](#{name})"
@@ -79,9 +79,9 @@ def _observation(env: PhysicsEnv | PointMaze) -> list[tuple[object, ...]]:
 
 def _descriptor(name: str, env: QDEnv) -> str:
     low, high = env.state_descriptor_limits
-    extractor = newton_qd.descriptor_extractor[name].__name__
-    offset = newton_qd.reward_offset[name]
-    original = newton_qd.original_reward_offset[name]
+    extractor = newton_qd.tables.descriptor_extractor[name].__name__
+    offset = newton_qd.tables.reward_offset[name]
+    original = newton_qd.tables.original_reward_offset[name]
     return (
         f"\nState descriptor: `{env.state_descriptor_name}`, from ({_numbers(low)}) to "
         f"({_numbers(high)}). Descriptor of an episode: `{extractor}`. Reward offset: "
@@ -163,7 +163,7 @@ def page() -> str:
             sections += f"The task of [`{known}`](#{known}) with a state descriptor.\n"
         else:
             sections += f"{_meanings(type(base))[0]}\n"
-        if name in newton_qd.descriptor_extractor:
+        if name in newton_qd.tables.descriptor_extractor:
             sections += _descriptor(name, cast(QDEnv, env))
         if known == name and isinstance(base, PhysicsEnv | PointMaze):
             sections += _tables(base)

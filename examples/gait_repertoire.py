@@ -35,7 +35,7 @@ def main() -> None:
     options = parser.parse_args()
 
     env: Any = newton_qd.create(options.env, auto_reset=False)
-    task = None, newton_qd.descriptor_extractor[options.env]  # without a policy
+    task = None, newton_qd.tables.descriptor_extractor[options.env]  # without a policy
     common: Any = {"episode_length": options.steps, "unravel": jnp.tanh}
     episode = gradients.make_episode(env, *task, **common)
     gradient = gradients.make_directional_gradient(

@@ -34,7 +34,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     gradient = make_episode_gradient(
         with_smooth_descriptor(env),
         None,  # no policy: the genotypes are the actions
-        newton_qd.descriptor_extractor["ant_uni"],
+        newton_qd.tables.descriptor_extractor["ant_uni"],
         episode_length=arguments.steps,
         # contact makes the gradient grow with the steps that it goes back
         options=GradientOptions(clip=10.0),

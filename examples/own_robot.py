@@ -15,15 +15,15 @@ from pathlib import Path
 import newton_qd
 from newton_qd.envs.locomotion import Locomotion
 from newton_qd.extractors import get_feet_contact_proportion, get_final_xy_position
-from newton_qd.registry import WrapperRow
-from newton_qd.robots import Contact, Robot
+from newton_qd.robots import Contact, RobotSpec
 from newton_qd.scenes import Scene
+from newton_qd.tasks import WrapperSpec
 from newton_qd.wrappers import FeetContactWrapper, XYPositionWrapper
 
 HERE = Path(__file__).resolve().parent
 LEGS = ("1", "2", "3")
 
-TRIPOD = Robot(
+TRIPOD = RobotSpec(
     name="tripod",
     urdf=str(HERE / "tripod.urdf"),
     torso="body",
@@ -41,7 +41,7 @@ newton_qd.register(
     "tripod_uni",
     functools.partial(Locomotion, TRIPOD, healthy_z_range=(0.21, 1.0)),
     base_name="tripod",
-    wrappers=(WrapperRow(FeetContactWrapper),),
+    wrappers=(WrapperSpec(FeetContactWrapper),),
     descriptor_extractor=get_feet_contact_proportion,
     reward_offset=2.0,
     robot=TRIPOD,
@@ -54,7 +54,7 @@ newton_qd.register(
     functools.partial(Locomotion, TRIPOD, healthy_z_range=(0.21, 1.0), scene=YARD),
     base_name="tripod",
     wrappers=(
-        WrapperRow(XYPositionWrapper, {"minval": (-1.0, -4.0), "maxval": (8.0, 4.0)}),
+        WrapperSpec(XYPositionWrapper, {"minval": (-1.0, -4.0), "maxval": (8.0, 4.0)}),
     ),
     descriptor_extractor=get_final_xy_position,
     reward_offset=2.0,

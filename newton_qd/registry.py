@@ -1,4 +1,4 @@
-"""Environments by name: what builds them, and tables of what their rows say."""
+"""Environments by name: what builds them, and how to add one."""
 
 from __future__ import annotations
 
@@ -6,15 +6,16 @@ import functools
 import inspect
 import math
 import numbers
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, Generic, TypeVar
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
+from newton_qd import tasks
 from newton_qd.envs.base import Env
 from newton_qd.envs.options import check_flag
 from newton_qd.errors import UnknownEnvironment
-from newton_qd.robots import Material, Robot
-from newton_qd.tasks import ROWS as _ROWS
-from newton_qd.tasks import EnvironmentRow, Extractor, WrapperRow
+from newton_qd.moved import moved_name
+from newton_qd.robots import Material, RobotSpec
+from newton_qd.tasks import EnvironmentSpec, Extractor, WrapperSpec
 from newton_qd.wrappers import (
     AutoResetWrapper,
     CompletedEvalWrapper,
@@ -24,62 +25,27 @@ from newton_qd.wrappers import (
     VectorWrapper,
 )
 
-Value = TypeVar("Value")
+_MOVED = {
+    "COG_NAMES": "newton_qd.tables.COG_NAMES",
+    "EnvironmentRow": "newton_qd.tasks.EnvironmentSpec",
+    "FEET_NAMES": "newton_qd.tables.FEET_NAMES",
+    "FORWARD_REWARD_NAMES": "newton_qd.tables.FORWARD_REWARD_NAMES",
+    "WrapperRow": "newton_qd.tasks.WrapperSpec",
+    "behavior_descriptor_extractor": "newton_qd.tables.behavior_descriptor_extractor",
+    "descriptor_extractor": "newton_qd.tables.descriptor_extractor",
+    "original_reward_offset": "newton_qd.tables.original_reward_offset",
+    "reward_offset": "newton_qd.tables.reward_offset",
+}
 
 
-class _Column(Mapping[str, Value], Generic[Value]):
-    """Read-only table of one attribute of the rows that have it."""
-
-    def __init__(self, attribute: str) -> None:
-        self._attribute = attribute
-
-    def __getitem__(self, env_name: str) -> Value:
-        for name, value in self._items():
-            if name == env_name:
-                return value
-        raise KeyError(
-            f"{env_name!r} has no {self._attribute}; known: {', '.join(self)}"
-        )
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(dict(self._items()))
-
-    def __len__(self) -> int:
-        return sum(1 for _ in self)
-
-    def __repr__(self) -> str:
-        return repr(dict(self))
-
-    def _items(self) -> Iterator[tuple[str, Value]]:
-        for name, row in self._rows():
-            value = getattr(row, self._attribute)
-            if value is not None:
-                yield name, value
-
-    def _rows(self) -> Iterator[tuple[str, EnvironmentRow]]:
-        yield from _ROWS.items()
-
-
-class _BaseColumn(_Column[Value]):
-    """Read-only table of one attribute by the name that the wrappers receive."""
-
-    def _rows(self) -> Iterator[tuple[str, EnvironmentRow]]:
-        for row in _ROWS.values():
-            yield row.base_name, row
-
-
-descriptor_extractor: Mapping[str, Extractor] = _Column("descriptor_extractor")
-behavior_descriptor_extractor: Mapping[str, Extractor] = descriptor_extractor
-reward_offset: Mapping[str, float] = _Column("reward_offset")
-original_reward_offset: Mapping[str, float] = _Column("original_reward_offset")
-FEET_NAMES: Mapping[str, tuple[str, ...]] = _BaseColumn("feet")
-COG_NAMES: Mapping[str, str] = _BaseColumn("torso")
-FORWARD_REWARD_NAMES: Mapping[str, str] = _BaseColumn("forward_reward")
+def __getattr__(name: str) -> Any:
+    """Says where a name that was here has gone."""
+    return moved_name(__name__, name, _MOVED)
 
 
 def registered_envs() -> tuple[str, ...]:
     """Returns the names that ``create`` knows."""
-    return tuple(_ROWS)
+    return tuple(tasks.ENVIRONMENTS)
 
 
 def register(
@@ -87,10 +53,10 @@ def register(
     base: Callable[..., Env],
     *,
     base_name: str | None = None,
-    wrappers: Sequence[WrapperRow] = (),
+    wrappers: Sequence[WrapperSpec] = (),
     descriptor_extractor: Extractor | None = None,
     reward_offset: float | None = None,
-    robot: Robot | None = None,
+    robot: RobotSpec | None = None,
 ) -> None:
     """Adds an environment to the names that ``create`` knows.
 
@@ -101,7 +67,7 @@ def register(
         wrappers: Wrappers, from the inside to the outside.
         descriptor_extractor: Reads the descriptor of an episode, for QD tasks.
         reward_offset: Added to each step's reward to keep QD scores positive.
-        robot: Row of the robot inside, for ``FEET_NAMES`` and ``COG_NAMES``; ``None``:
+        robot: Spec of the robot inside, for ``FEET_NAMES`` and ``COG_NAMES``; ``None``:
             that of the suite called ``base_name``, if there is one.
 
     Raises:
@@ -111,13 +77,12 @@ def register(
     """
     if not isinstance(env_name, str) or not env_name:
         raise ValueError(f"env_name={env_name!r}: allowed: a string that is not empty")
-    if env_name in _ROWS:
-        raise ValueError(
-            f"env_name={env_name!r}: taken; allowed: any but {', '.join(_ROWS)}"
-        )
+    if env_name in tasks.ENVIRONMENTS:
+        taken = ", ".join(registered_envs())
+        raise ValueError(f"env_name={env_name!r}: taken; allowed: any but {taken}")
     if not callable(base):
         raise TypeError(f"base={base!r}: allowed: a class or a function")
-    # A row is read by every table: one that is wrong would break them all.
+    # A spec is read by every table: one that is wrong would break them all.
     if base_name is not None and (not isinstance(base_name, str) or not base_name):
         raise ValueError(
             f"base_name={base_name!r}: allowed: None, or a string that is not empty"
@@ -127,11 +92,13 @@ def register(
             f"descriptor_extractor={descriptor_extractor!r}: allowed: None, or a "
             "function of (data, mask)"
         )
-    if robot is not None and not isinstance(robot, Robot):
-        raise TypeError(f"robot={robot!r}: allowed: None, or a newton_qd.robots.Robot")
+    if robot is not None and not isinstance(robot, RobotSpec):
+        raise TypeError(
+            f"robot={robot!r}: allowed: None, or a newton_qd.robots.RobotSpec"
+        )
     _check_offset(reward_offset)
     _check_wrappers(wrappers)
-    _ROWS[env_name] = EnvironmentRow(
+    tasks.ENVIRONMENTS[env_name] = EnvironmentSpec(
         base,
         env_name if base_name is None else base_name,
         tuple(wrappers),
@@ -153,26 +120,26 @@ def _check_offset(reward_offset: object) -> None:
 
 
 def _check_wrappers(wrappers: object) -> None:
-    """Raises for ``wrappers`` of ``register`` that are not rows of wrappers."""
+    """Raises for ``wrappers`` of ``register`` that are not specs of wrappers."""
     if not isinstance(wrappers, Sequence) or isinstance(wrappers, str):
         raise TypeError(
-            f"wrappers={wrappers!r}: allowed: a tuple or list of WrapperRow, such as "
-            "(WrapperRow(FeetContactWrapper),)"
+            f"wrappers={wrappers!r}: allowed: a tuple or list of WrapperSpec, such as "
+            "(WrapperSpec(FeetContactWrapper),)"
         )
-    for index, row in enumerate(wrappers):
-        if not isinstance(row, WrapperRow):
+    for index, spec in enumerate(wrappers):
+        if not isinstance(spec, WrapperSpec):
             raise TypeError(
-                f"wrappers[{index}]={row!r}: allowed: a WrapperRow, such as "
-                "WrapperRow(FeetContactWrapper)"
+                f"wrappers[{index}]={spec!r}: allowed: a WrapperSpec, such as "
+                "WrapperSpec(FeetContactWrapper)"
             )
-        if not callable(row.wrapper):
+        if not callable(spec.wrapper):
             raise TypeError(
-                f"wrappers[{index}].wrapper={row.wrapper!r}: allowed: a class or a "
+                f"wrappers[{index}].wrapper={spec.wrapper!r}: allowed: a class or a "
                 "function"
             )
-        if not isinstance(row.options, Mapping):
+        if not isinstance(spec.options, Mapping):
             raise TypeError(
-                f"wrappers[{index}].options={row.options!r}: allowed: a mapping of "
+                f"wrappers[{index}].options={spec.options!r}: allowed: a mapping of "
                 "keyword arguments"
             )
 
@@ -202,7 +169,7 @@ def create(
         fixed_init_state: Whether a reset is free of noise.
         qdax_wrappers_kwargs: Keyword arguments for each of the environment's own
             wrappers, replacing those of the registry.
-        material: Softness of contacts and limits; ``None``: that of the robot's row.
+        material: Softness of contacts and limits; ``None``: that of the robot's spec.
         **kwargs: To the environment inside, as ``dtype`` or ``ctrl_cost_weight``.
 
     Returns:
@@ -213,21 +180,21 @@ def create(
         TypeError: A keyword argument is unknown.
         ValueError: A value or a combination is not allowed.
     """
-    row = _row(env_name)
+    spec = _spec(env_name)
     check_flag("auto_reset", auto_reset)
     check_flag("eval_metrics", eval_metrics)
     check_flag("fixed_init_state", fixed_init_state)
-    options = _wrapper_options(env_name, row, qdax_wrappers_kwargs)
+    options = _wrapper_options(env_name, spec, qdax_wrappers_kwargs)
     if episode_length is None and (action_repeat != 1 or eval_metrics):
         raise ValueError(
             f"episode_length=None with action_repeat={action_repeat!r}, eval_metrics="
             f"{eval_metrics!r}; allowed: 1 and False, or an episode length"
         )
-    env = _base(env_name, row, material, kwargs)
+    env = _base(env_name, spec, material, kwargs)
     if fixed_init_state:
-        env = FixedInitialStateWrapper(env, row.base_name)
-    for wrapper_row, chosen in zip(row.wrappers, options, strict=True):
-        env = wrapper_row.wrapper(env, row.base_name, **chosen)
+        env = FixedInitialStateWrapper(env, spec.base_name)
+    for wrapper_spec, chosen in zip(spec.wrappers, options, strict=True):
+        env = wrapper_spec.wrapper(env, spec.base_name, **chosen)
     if episode_length is not None:
         env = EpisodeWrapper(env, episode_length, action_repeat)
     if batch_size:
@@ -244,17 +211,17 @@ def create_fn(env_name: str, **kwargs: Any) -> Callable[..., Env]:
     return functools.partial(create, env_name, **kwargs)
 
 
-def _row(env_name: str) -> EnvironmentRow:
-    """Returns the row of an environment; raises where there is none."""
-    row = _ROWS.get(env_name) if isinstance(env_name, str) else None
-    if row is None:
+def _spec(env_name: str) -> EnvironmentSpec:
+    """Returns the spec of an environment; raises where there is none."""
+    spec = tasks.ENVIRONMENTS.get(env_name) if isinstance(env_name, str) else None
+    if spec is None:
         raise UnknownEnvironment(env_name, registered_envs())
-    return row
+    return spec
 
 
 def _base(
     env_name: str,
-    row: EnvironmentRow,
+    spec: EnvironmentSpec,
     material: Material | None,
     options: Mapping[str, Any],
 ) -> Env:
@@ -263,8 +230,8 @@ def _base(
         raise TypeError(
             f"material={material!r}: allowed: None, newton_qd.robots.Material"
         )
-    _require_keywords(env_name, row.base, options)
-    env = row.base(**options)
+    _require_keywords(env_name, spec.base, options)
+    env = spec.base(**options)
     return env if material is None else env.with_material(material)
 
 
@@ -286,24 +253,24 @@ def _require_keywords(
 
 def _wrapper_options(
     env_name: str,
-    row: EnvironmentRow,
+    spec: EnvironmentSpec,
     given: Sequence[Mapping[str, Any]] | None,
 ) -> list[Mapping[str, Any]]:
-    """Returns the keyword arguments of each wrapper of a row."""
+    """Returns the keyword arguments of each wrapper of a spec."""
     if given is None:
-        return [wrapper_row.options for wrapper_row in row.wrappers]
+        return [wrapper_spec.options for wrapper_spec in spec.wrappers]
     if isinstance(given, Mapping) or not all(isinstance(x, Mapping) for x in given):
         raise TypeError(
             f"qdax_wrappers_kwargs={given!r}: allowed: None, or a sequence of "
             "dictionaries, one for each wrapper"
         )
-    if len(given) != len(row.wrappers):
+    if len(given) != len(spec.wrappers):
         names = ", ".join(
-            getattr(wrapper_row.wrapper, "__name__", repr(wrapper_row.wrapper))
-            for wrapper_row in row.wrappers
+            getattr(wrapper_spec.wrapper, "__name__", repr(wrapper_spec.wrapper))
+            for wrapper_spec in spec.wrappers
         )
         raise ValueError(
             f"qdax_wrappers_kwargs has {len(given)} entries; allowed: None, or "
-            f"{len(row.wrappers)} for {env_name!r} ({names or 'no wrapper'})"
+            f"{len(spec.wrappers)} for {env_name!r} ({names or 'no wrapper'})"
         )
     return list(given)

@@ -1,4 +1,4 @@
-"""Scenes as data: what stands on the ground beside the robot, one row each."""
+"""Scenes as data: what stands on the ground beside the robot, one spec each."""
 
 from __future__ import annotations
 

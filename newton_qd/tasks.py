@@ -1,6 +1,6 @@
-"""The environments as data: one row for each name.
+"""The environments as data: one spec for each name.
 
-To add one, add a row; :func:`newton_qd.register` does so from outside.
+To add one, add a spec; :func:`newton_qd.register` does so from outside.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ from newton_qd.envs.reacher import Reacher, ReacherAngle
 from newton_qd.envs.swimmer import Swimmer
 from newton_qd.envs.walker2d import Walker2d
 from newton_qd.extractors import get_feet_contact_proportion, get_final_xy_position
-from newton_qd.robots import HUMANOID, ROBOTS, Robot
+from newton_qd.moved import moved_name
+from newton_qd.robots import HUMANOID, ROBOTS, RobotSpec
 from newton_qd.wrappers import (
     FeetContactWrapper,
     MazeWrapper,
@@ -36,9 +37,20 @@ from newton_qd.wrappers import (
 
 Extractor = Callable[[Any, Any], Any]
 
+_MOVED = {
+    "EnvironmentRow": "newton_qd.tasks.EnvironmentSpec",
+    "ROWS": "newton_qd.tasks.ENVIRONMENTS",
+    "WrapperRow": "newton_qd.tasks.WrapperSpec",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Says how a name that was here is called now."""
+    return moved_name(__name__, name, _MOVED)
+
 
 @dataclasses.dataclass(frozen=True)
-class WrapperRow:
+class WrapperSpec:
     """A wrapper of an environment, called as ``wrapper(env, name, **options)``.
 
     Attributes:
@@ -51,7 +63,7 @@ class WrapperRow:
 
 
 @dataclasses.dataclass(frozen=True)
-class EnvironmentRow:
+class EnvironmentSpec:
     """Everything about an environment that has a name.
 
     Attributes:
@@ -62,17 +74,17 @@ class EnvironmentRow:
         reward_offset: Added to each step's reward to keep QD scores positive; for the
             tasks of the original measured by ``benchmarks/survey.py``.
         original_reward_offset: That of the original, on its physics.
-        robot: Row of the robot inside; ``None``: that of ``ROBOTS`` called
+        robot: Spec of the robot inside; ``None``: that of ``ROBOTS`` called
             ``base_name``, if there is one.
     """
 
     base: Callable[..., Env]
     base_name: str
-    wrappers: tuple[WrapperRow, ...] = ()
+    wrappers: tuple[WrapperSpec, ...] = ()
     descriptor_extractor: Extractor | None = None
     reward_offset: float | None = None
     original_reward_offset: float | None = None
-    robot: Robot | None = None
+    robot: RobotSpec | None = None
 
     @property
     def feet(self) -> tuple[str, ...] | None:
@@ -95,13 +107,13 @@ class EnvironmentRow:
         return getattr(base, "forward_reward_name", None)
 
     @property
-    def _robot(self) -> Robot | None:
+    def _robot(self) -> RobotSpec | None:
         return self.robot or ROBOTS.get(self.base_name)
 
 
 def _uni(
     base: Callable[..., Env], base_name: str, offsets: tuple[float, float]
-) -> EnvironmentRow:
+) -> EnvironmentSpec:
     """Returns the task of running forward, described by the feet's contacts.
 
     Args:
@@ -109,10 +121,10 @@ def _uni(
         base_name: Name that wrappers receive.
         offsets: Reward offset, and that of the original.
     """
-    return EnvironmentRow(
+    return EnvironmentSpec(
         base,
         base_name,
-        wrappers=(WrapperRow(FeetContactWrapper),),
+        wrappers=(WrapperSpec(FeetContactWrapper),),
         descriptor_extractor=get_feet_contact_proportion,
         reward_offset=offsets[0],
         original_reward_offset=offsets[1],
@@ -125,8 +137,8 @@ def _position(
     offsets: tuple[float, float],
     limits: tuple[tuple[float, float], tuple[float, float]],
     *wrappers: Callable[..., Env],
-    robot: Robot | None = None,
-) -> EnvironmentRow:
+    robot: RobotSpec | None = None,
+) -> EnvironmentSpec:
     """Returns a task described by the last position within limits [m].
 
     Args:
@@ -135,15 +147,15 @@ def _position(
         offsets: Reward offset, and that of the original.
         limits: Lowest and highest x and y.
         *wrappers: Wrappers around the one that describes.
-        robot: Row of the robot inside.
+        robot: Spec of the robot inside.
     """
     options = {"minval": limits[0], "maxval": limits[1]}
-    return EnvironmentRow(
+    return EnvironmentSpec(
         base,
         base_name,
         wrappers=(
-            WrapperRow(XYPositionWrapper, options),
-            *(WrapperRow(wrapper) for wrapper in wrappers),
+            WrapperSpec(XYPositionWrapper, options),
+            *(WrapperSpec(wrapper) for wrapper in wrappers),
         ),
         descriptor_extractor=get_final_xy_position,
         reward_offset=offsets[0],
@@ -154,8 +166,8 @@ def _position(
 
 _ANYWHERE = ((-30.0, -30.0), (30.0, 30.0))
 
-ROWS: dict[str, EnvironmentRow] = {
-    "ant": EnvironmentRow(Ant, "ant"),
+ENVIRONMENTS: dict[str, EnvironmentSpec] = {
+    "ant": EnvironmentSpec(Ant, "ant"),
     "ant_uni": _uni(Ant, "ant", (4.35, 3.24)),
     "ant_omni": _position(Ant, "ant", (2.83, 3.0), _ANYWHERE, NoForwardRewardWrapper),
     "antnotrap": _position(Ant, "ant", (4.35, 3.38), ((0.0, -8.0), (70.0, 8.0))),
@@ -165,16 +177,16 @@ ROWS: dict[str, EnvironmentRow] = {
     "antmaze": _position(
         Ant, "ant", (39.53, 40.32), ((-5.0, -5.0), (40.0, 40.0)), MazeWrapper
     ),
-    "halfcheetah": EnvironmentRow(HalfCheetah, "halfcheetah"),
+    "halfcheetah": EnvironmentSpec(HalfCheetah, "halfcheetah"),
     "halfcheetah_uni": _uni(HalfCheetah, "halfcheetah", (7.59, 9.231)),
-    "hopper": EnvironmentRow(Hopper, "hopper"),
+    "hopper": EnvironmentSpec(Hopper, "hopper"),
     "hopper_uni": _uni(Hopper, "hopper", (0.9, 0.9)),
-    "humanoid": EnvironmentRow(Humanoid, "humanoid"),
+    "humanoid": EnvironmentSpec(Humanoid, "humanoid"),
     "humanoid_uni": _uni(Humanoid, "humanoid", (0.0, 0.0)),
     "humanoid_omni": _position(
         Humanoid, "humanoid", (0.0, 0.0), _ANYWHERE, NoForwardRewardWrapper
     ),
-    "humanoid_w_trap": EnvironmentRow(HumanoidTrap, "humanoid_w_trap", robot=HUMANOID),
+    "humanoid_w_trap": EnvironmentSpec(HumanoidTrap, "humanoid_w_trap", robot=HUMANOID),
     "humanoidtrap": _position(
         HumanoidTrap,
         "humanoid_w_trap",
@@ -182,23 +194,23 @@ ROWS: dict[str, EnvironmentRow] = {
         ((0.0, -8.0), (30.0, 8.0)),
         robot=HUMANOID,
     ),
-    "walker2d": EnvironmentRow(Walker2d, "walker2d"),
+    "walker2d": EnvironmentSpec(Walker2d, "walker2d"),
     "walker2d_uni": _uni(Walker2d, "walker2d", (1.33, 1.413)),
-    "pointmaze": EnvironmentRow(
+    "pointmaze": EnvironmentSpec(
         PointMaze,
         "pointmaze",
         descriptor_extractor=get_final_xy_position,
         reward_offset=2.35,
         original_reward_offset=2.3431,
     ),
-    "acrobot": EnvironmentRow(Acrobot, "acrobot"),
-    "humanoidstandup": EnvironmentRow(HumanoidStandup, "humanoidstandup"),
-    "inverted_double_pendulum": EnvironmentRow(
+    "acrobot": EnvironmentSpec(Acrobot, "acrobot"),
+    "humanoidstandup": EnvironmentSpec(HumanoidStandup, "humanoidstandup"),
+    "inverted_double_pendulum": EnvironmentSpec(
         InvertedDoublePendulum, "inverted_double_pendulum"
     ),
-    "inverted_pendulum": EnvironmentRow(InvertedPendulum, "inverted_pendulum"),
-    "pusher": EnvironmentRow(Pusher, "pusher"),
-    "reacher": EnvironmentRow(Reacher, "reacher"),
-    "reacherangle": EnvironmentRow(ReacherAngle, "reacherangle"),
-    "swimmer": EnvironmentRow(Swimmer, "swimmer"),
+    "inverted_pendulum": EnvironmentSpec(InvertedPendulum, "inverted_pendulum"),
+    "pusher": EnvironmentSpec(Pusher, "pusher"),
+    "reacher": EnvironmentSpec(Reacher, "reacher"),
+    "reacherangle": EnvironmentSpec(ReacherAngle, "reacherangle"),
+    "swimmer": EnvironmentSpec(Swimmer, "swimmer"),
 }

@@ -22,7 +22,7 @@ _REPEATED = {"antnotrap", "humanoid_omni"}
 NAMES = [
     name
     for name in newton_qd.registered_envs()
-    if name in newton_qd.descriptor_extractor and name not in _REPEATED
+    if name in newton_qd.tables.descriptor_extractor and name not in _REPEATED
 ]
 # One with four feet, one with one, one with walls and one without physics; the others
 # share their code with these and run with the slow tests.

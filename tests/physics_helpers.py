@@ -18,7 +18,7 @@ from newton_qd.physics import reference
 from newton_qd.physics.model import build_system
 from newton_qd.physics.model.rest import raising_coordinate
 from newton_qd.physics.system import JointKind, PhysicsState, System
-from newton_qd.robots import ROBOTS, Contact, Material, Robot
+from newton_qd.robots import ROBOTS, Contact, Material, RobotSpec
 
 Arrays = tuple[np.ndarray, ...]
 
@@ -28,7 +28,7 @@ DISTINCT.reverse()
 STANDING = [name for name in DISTINCT if ROBOTS[name].feet]
 
 
-def variant(robot: Robot, dtype: str, **changes: Any) -> System:
+def variant(robot: RobotSpec, dtype: str, **changes: Any) -> System:
     """A system of a changed row; cached, because a system compiles its own calls."""
     return physics.load_system(dataclasses.replace(robot, **changes), dtype)
 

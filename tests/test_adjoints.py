@@ -37,7 +37,7 @@ from newton_qd.physics import bridge, buffers
 from newton_qd.physics.launch import output_size
 from newton_qd.physics.precision import pack_width
 from newton_qd.physics.system import System
-from newton_qd.robots import ANT, HALFCHEETAH, Robot
+from newton_qd.robots import ANT, HALFCHEETAH, RobotSpec
 
 # of the differences; the one that agrees best counts, and the largest is for gravity,
 # on which the readings of a step depend 1e5 times less than their size
@@ -192,7 +192,9 @@ def chained(system: System, x: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("robot", [ANT, HALFCHEETAH], ids=lambda robot: robot.name)
-def test_the_bridge_agrees_with_a_tape(x64: None, device: Any, robot: Robot) -> None:
+def test_the_bridge_agrees_with_a_tape(
+    x64: None, device: Any, robot: RobotSpec
+) -> None:
     """Four control steps: the chain of Warp's tapes is ``jax.grad``, to 1e-6."""
     if device.platform != "cpu":
         pytest.skip("the tape is launched on a CPU")

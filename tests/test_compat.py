@@ -369,7 +369,7 @@ def test_the_archive_grows_and_its_best_improves(algorithm: Any, name: str) -> N
     from qdax.utils.metrics import default_qd_metrics
 
     emitter, task = algorithm(setup(name))
-    offset = newton_qd.reward_offset[name] * task.episode_length
+    offset = newton_qd.tables.reward_offset[name] * task.episode_length
     map_elites = MAPElites(
         task.score, emitter, functools.partial(default_qd_metrics, qd_offset=offset)
     )

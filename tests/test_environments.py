@@ -61,7 +61,7 @@ def test_sizes_are_as_declared(name: str) -> None:
 def test_descriptors_are_as_declared(name: str) -> None:
     env: Any = make(name)
     state = reset(env)(jax.random.key(1))
-    if name not in newton_qd.descriptor_extractor:
+    if name not in newton_qd.tables.descriptor_extractor:
         assert "state_descriptor" not in state.info
         assert not hasattr(env, "descriptor_length")
         return

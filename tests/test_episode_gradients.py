@@ -61,7 +61,9 @@ def task_of(name: str) -> Task:
     env = make(name)
     low, high = (np.asarray(x) for x in env.descriptor_limits)
     labels = tuple("d" * len(low))
-    return Task(env, newton_qd.descriptor_extractor[name], (low, high), labels, 0.0)
+    return Task(
+        env, newton_qd.tables.descriptor_extractor[name], (low, high), labels, 0.0
+    )
 
 
 def norms(tree: Any) -> np.ndarray:

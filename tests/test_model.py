@@ -21,7 +21,7 @@ from newton_qd.physics.model.description import read_description
 from newton_qd.physics.model.verify import ModelMismatchError
 from newton_qd.physics.model.xml_reader import RobotDescriptionError
 from newton_qd.physics.system import JointKind, ObstacleKind, System
-from newton_qd.robots import ANT, ROBOTS, Contact, Robot
+from newton_qd.robots import ANT, ROBOTS, Contact, RobotSpec
 
 ROOT_HALF = math.sqrt(0.5)
 
@@ -271,7 +271,7 @@ PLANAR = f"""<robot name="planar"><link name="world"/><link name="x_slide"/>
 }</robot>"""
 
 
-def planar_row(folder: Path, **changes: object) -> Robot:
+def planar_spec(folder: Path, **changes: object) -> RobotSpec:
     return row(
         write(folder, PLANAR),
         "body",
@@ -283,7 +283,7 @@ def planar_row(folder: Path, **changes: object) -> Robot:
 
 
 def test_planar_root(tmp_path: Path) -> None:
-    system = build_system(planar_row(tmp_path), "float32")
+    system = build_system(planar_spec(tmp_path), "float32")
     assert system.body_names == ("x_slide", "z_slide", "body", "foot")
     assert system.joint_names == ("x", "z", "pitch", "knee")
     assert system.parent.tolist() == [-1, 0, 1, 2]
@@ -307,7 +307,7 @@ def test_a_limit_may_be_zero(limits: tuple[float, float], tmp_path: Path) -> Non
 
 
 def test_rest_height(tmp_path: Path) -> None:
-    planar = build_system(planar_row(tmp_path, rest_height=1.25), "float32")
+    planar = build_system(planar_spec(tmp_path, rest_height=1.25), "float32")
     np.testing.assert_allclose(planar.rest_q, [0, -1.25, 0, 0], atol=1e-15)
     ant = build_system(dataclasses.replace(ANT, rest_height=0.75), "float32")
     assert ant.rest_q[2] == 0.75

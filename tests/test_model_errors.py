@@ -12,13 +12,13 @@ from urdf_text import joint, link, row, write
 
 from newton_qd.assets import AssetNotFoundError, find_urdf
 from newton_qd.physics.model import RobotDescriptionError, build_system, load_system
-from newton_qd.robots import ANT, Contact, Robot
+from newton_qd.robots import ANT, Contact, RobotSpec
 
 ANT_TEXT = find_urdf("ant.urdf").read_text(encoding="utf-8")
 FEET = ("foot_1", "foot_2", "foot_3", "foot_4")
 
 
-def edited(folder: Path, old: str, new: str) -> Robot:
+def edited(folder: Path, old: str, new: str) -> RobotSpec:
     """The ant with the first occurrence of a text in its file replaced."""
     assert old in ANT_TEXT
     return dataclasses.replace(ANT, urdf=write(folder, ANT_TEXT.replace(old, new, 1)))
@@ -162,11 +162,11 @@ def test_file_without_a_robot(text: str, message: str, tmp_path: Path) -> None:
         build_system(row(path, "torso"), "float32")
 
 
-def changed(**changes: object) -> Robot:
+def changed(**changes: object) -> RobotSpec:
     return dataclasses.replace(ANT, **changes)
 
 
-def soft(**changes: object) -> Robot:
+def soft(**changes: object) -> RobotSpec:
     return changed(material=dataclasses.replace(ANT.material, **changes))
 
 
@@ -260,7 +260,7 @@ def test_rows_that_cannot_be_hashed_are_named() -> None:
         load_system(changed(feet=["foot_1"]))
     with pytest.raises(RobotDescriptionError, match=r"gear of 'hip_1'=\[1\]; allowed"):
         load_system(changed(actuators=(("hip_1", [1]),)))
-    with pytest.raises(TypeError, match="robot='ant': allowed: a Robot, such as"):
+    with pytest.raises(TypeError, match="robot='ant': allowed: a RobotSpec, such as"):
         load_system("ant")  # pyright: ignore[reportArgumentType]
     with pytest.raises(RobotDescriptionError, match="name=None; allowed: a text"):
         load_system(changed(name=None))

@@ -24,7 +24,7 @@ from newton_qd.assets import find_urdf
 from newton_qd.physics import reference
 from newton_qd.physics.model import build_system
 from newton_qd.physics.system import JointKind, System
-from newton_qd.robots import ROBOTS, Robot
+from newton_qd.robots import ROBOTS, RobotSpec
 
 STATES = 20
 TOLERANCE = {"float32": 1e-5, "float64": 1e-9}
@@ -99,9 +99,9 @@ OFF_CENTRE = """<?xml version="1.0"?>
 """
 
 
-def off_centre_row(path: Path) -> Robot:
+def off_centre_spec(path: Path) -> RobotSpec:
     """Row of the robot without symmetry, without contacts."""
-    return Robot(
+    return RobotSpec(
         name="off_centre",
         urdf=str(path),
         torso="base",
@@ -115,12 +115,12 @@ def off_centre_row(path: Path) -> Robot:
 
 
 @pytest.fixture(scope="module", params=[*DISTINCT, "off_centre"])
-def robot(request: pytest.FixtureRequest, tmp_path_factory) -> Robot:
+def robot(request: pytest.FixtureRequest, tmp_path_factory) -> RobotSpec:
     if request.param in ROBOTS:
         return ROBOTS[request.param]
     path = tmp_path_factory.mktemp("urdf") / "off_centre.urdf"
     path.write_text(OFF_CENTRE, encoding="utf-8")
-    return off_centre_row(path)
+    return off_centre_spec(path)
 
 
 def random_state(
@@ -145,7 +145,7 @@ def error(ours: np.ndarray, theirs: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
-def test_equations_of_motion(robot: Robot, dtype: str) -> None:
+def test_equations_of_motion(robot: RobotSpec, dtype: str) -> None:
     tolerance = ROUNDED.get((robot.name, dtype), TOLERANCE[dtype])
     with jax.enable_x64(True) if dtype == "float64" else contextlib.nullcontext():
         system = build_system(robot, dtype)
@@ -175,7 +175,7 @@ def _jitted(function: Callable, system: System) -> Callable[..., np.ndarray]:
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
-def test_kinematics(robot: Robot, dtype: str) -> None:
+def test_kinematics(robot: RobotSpec, dtype: str) -> None:
     tolerance = TOLERANCE[dtype]
     with jax.enable_x64(True) if dtype == "float64" else contextlib.nullcontext():
         system = build_system(robot, dtype)
@@ -196,7 +196,7 @@ def test_kinematics(robot: Robot, dtype: str) -> None:
                 assert error(turned, matrix) < tolerance
 
 
-def test_numpy_reference(robot: Robot) -> None:
+def test_numpy_reference(robot: RobotSpec) -> None:
     """The slow reference of the package is a third opinion, in double precision."""
     system = build_system(robot, "float32")
     theirs = MujocoReference(find_urdf(robot.urdf), system)
@@ -218,7 +218,7 @@ def test_off_centre_root_matters(tmp_path: Path) -> None:
     """The conversion is not trivial: without it the two mass matrices differ."""
     path = tmp_path / "off_centre.urdf"
     path.write_text(OFF_CENTRE, encoding="utf-8")
-    system = build_system(off_centre_row(path), "float32")
+    system = build_system(off_centre_spec(path), "float32")
     theirs = MujocoReference(path, system)
     q, v = random_state(system, np.random.default_rng(10))
     theirs.set_state(q, v)

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import newton_qd
-from newton_qd import registry
+from newton_qd import tasks
 from newton_qd.envs.locomotion import Locomotion
 from newton_qd.physics.system import PhysicsState
 
@@ -25,14 +25,14 @@ EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "own_robot.py"
 @pytest.fixture(scope="module")
 def example() -> Iterator[ModuleType]:
     """The example, whose names are known while this file's tests run."""
-    rows = dict(registry._ROWS)
+    rows = dict(tasks.ENVIRONMENTS)
     spec = importlib.util.spec_from_file_location("own_robot", EXAMPLE)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     yield module
-    registry._ROWS.clear()
-    registry._ROWS.update(rows)
+    tasks.ENVIRONMENTS.clear()
+    tasks.ENVIRONMENTS.update(rows)
 
 
 def test_tripod_is_a_task(example: ModuleType) -> None:
@@ -62,14 +62,14 @@ def test_tripod_is_a_task(example: ModuleType) -> None:
 
 def test_tripod_is_in_the_tables(example: ModuleType) -> None:
     del example  # its import registers the names
-    assert newton_qd.FEET_NAMES["tripod"] == ("foot_1", "foot_2", "foot_3")
-    assert newton_qd.COG_NAMES["tripod"] == "body"
-    assert newton_qd.FORWARD_REWARD_NAMES["tripod"] == "reward_forward"
+    assert newton_qd.tables.FEET_NAMES["tripod"] == ("foot_1", "foot_2", "foot_3")
+    assert newton_qd.tables.COG_NAMES["tripod"] == "body"
+    assert newton_qd.tables.FORWARD_REWARD_NAMES["tripod"] == "reward_forward"
 
 
 def test_forward_reward_is_seen_through_partials() -> None:
     inner = functools.partial(Locomotion, healthy_reward=2.0)
-    row = registry.EnvironmentRow(functools.partial(inner, ctrl_cost_weight=0.0), "x")
+    row = tasks.EnvironmentSpec(functools.partial(inner, ctrl_cost_weight=0.0), "x")
     assert row.forward_reward == "reward_forward"
 
 

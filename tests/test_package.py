@@ -28,6 +28,7 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 LAYERS = (
     "errors",
     "files",
+    "moved",
     "types",
     "assets",
     "robots",
@@ -37,6 +38,7 @@ LAYERS = (
     "wrappers",
     "extractors",
     "tasks",
+    "tables",
     "registry",
     "gradients",
     "__init__",

@@ -22,7 +22,7 @@ from newton_qd.envs.base import Env
 from newton_qd.envs.state import State
 from newton_qd.physics.parameters import FIELDS, parameter_shapes
 from newton_qd.physics.system import PhysicsState, System
-from newton_qd.robots import ANT, HOPPER, Robot
+from newton_qd.robots import ANT, HOPPER, RobotSpec
 
 WORLDS = 16
 Params = physics.PhysicsParams
@@ -83,7 +83,7 @@ def changed(system: System, params: Params) -> System:
 
 
 @pytest.mark.parametrize("robot", [ANT, HOPPER], ids=lambda robot: robot.name)
-def test_parameters_are_as_if_in_the_files(x64: None, robot: Robot) -> None:
+def test_parameters_are_as_if_in_the_files(x64: None, robot: RobotSpec) -> None:
     system = physics.load_system(robot, "float64")
     state, control = inputs(system)
     params = draw(system, WORLDS)
@@ -174,7 +174,7 @@ def derivatives(
 
 
 @pytest.mark.parametrize("robot", [ANT, HOPPER], ids=lambda robot: robot.name)
-def test_gradient_of_a_step(x64: None, robot: Robot) -> None:
+def test_gradient_of_a_step(x64: None, robot: RobotSpec) -> None:
     """Every number of every parameter against differences, in and out of contact."""
     system = physics.load_system(robot, "float64")
     gradient, difference = derivatives(system, 1, WORLDS, 1e-5)
@@ -196,7 +196,7 @@ def test_gradient_of_a_step(x64: None, robot: Robot) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("robot", [ANT, HOPPER], ids=lambda robot: robot.name)
-def test_gradient_of_many_steps(x64: None, robot: Robot) -> None:
+def test_gradient_of_many_steps(x64: None, robot: RobotSpec) -> None:
     system = physics.load_system(robot, "float64")
     gradient, difference = derivatives(system, 32, 8, 1e-6)
     sizes = np.linalg.norm(gradient, axis=1) * np.linalg.norm(difference, axis=1)

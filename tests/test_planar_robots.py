@@ -18,7 +18,7 @@ from newton_qd.assets import find_urdf
 from newton_qd.physics import reference
 from newton_qd.physics.model.description import read_description
 from newton_qd.physics.system import JointKind
-from newton_qd.robots import HALFCHEETAH, HOPPER, ROBOTS, WALKER2D, Robot
+from newton_qd.robots import HALFCHEETAH, HOPPER, ROBOTS, WALKER2D, RobotSpec
 
 Vector = tuple[float, float, float]
 NAMES = ("halfcheetah", "hopper", "walker2d")
@@ -277,7 +277,7 @@ SECONDS, WORLDS = 30, 8
 
 
 @pytest.mark.parametrize("robot", [HALFCHEETAH, HOPPER, WALKER2D], ids=lambda r: r.name)
-def test_without_actuation_it_comes_to_rest(robot: Robot) -> None:
+def test_without_actuation_it_comes_to_rest(robot: RobotSpec) -> None:
     """From eight poses near the default one: it falls, and lies still."""
     system = physics.load_system(robot)
     rng = np.random.default_rng(0)

@@ -119,9 +119,9 @@ def test_actions_are_clipped() -> None:
 
 def test_the_farthest_place_is_the_reward_offset() -> None:
     farthest = float(move((1, -1), (0, 0)).reward)
-    original = newton_qd.original_reward_offset["pointmaze"]
+    original = newton_qd.tables.original_reward_offset["pointmaze"]
     np.testing.assert_allclose(farthest, -original, 1e-4)
-    assert 0 <= newton_qd.reward_offset["pointmaze"] + farthest < 0.01
+    assert 0 <= newton_qd.tables.reward_offset["pointmaze"] + farthest < 0.01
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ import pytest
 from contract import EVERY_NAME, NAMES, outline, zero_action
 
 import newton_qd
-from newton_qd import registry
+from newton_qd import tasks
 from newton_qd.envs.state import State
 
 OPTIONS: dict[str, tuple[Any, ...]] = {
@@ -47,10 +47,10 @@ def allowed(options: dict[str, Any]) -> bool:
 def shared_base(monkeypatch: pytest.MonkeyPatch, request: Any) -> str:
     """The environment inside is made once a name: making it is the slow part."""
     name = request.param
-    row = registry._ROWS[name]
+    row = tasks.ENVIRONMENTS[name]
     base = row.base()
     shared = dataclasses.replace(row, base=lambda: base)
-    monkeypatch.setitem(registry._ROWS, name, shared)
+    monkeypatch.setitem(tasks.ENVIRONMENTS, name, shared)
     return name
 
 

@@ -14,13 +14,13 @@ from physics_helpers import directional_errors, random_states, report
 
 from newton_qd import physics
 from newton_qd.physics.system import PhysicsState, System
-from newton_qd.robots import ANT, HALFCHEETAH, HUMANOID, Robot
+from newton_qd.robots import ANT, HALFCHEETAH, HUMANOID, RobotSpec
 
 WIDTH = 0.05
 
 
 @functools.cache
-def system_of(robot: Robot) -> System:
+def system_of(robot: RobotSpec) -> System:
     """Ant and humanoid report their bodies; the cheetah's torso hangs on slides."""
     reports = robot is not HALFCHEETAH
     return physics.load_system(
@@ -47,7 +47,7 @@ def seen(system: System, state: PhysicsState) -> Any:
 
 
 @pytest.mark.parametrize("robot", [ANT, HALFCHEETAH, HUMANOID], ids=lambda r: r.name)
-def test_step_and_kinematics_read_the_same(x64: None, robot: Robot) -> None:
+def test_step_and_kinematics_read_the_same(x64: None, robot: RobotSpec) -> None:
     system = system_of(robot)
     inputs = random_states(system, np.random.default_rng(0), 16)
     # of two worlds at fault one is frozen where it was, the other one is lost
@@ -71,7 +71,7 @@ def test_step_and_kinematics_read_the_same(x64: None, robot: Robot) -> None:
 
 
 @pytest.mark.parametrize("robot", [ANT, HALFCHEETAH, HUMANOID], ids=lambda r: r.name)
-def test_gradients_of_readings(x64: None, robot: Robot) -> None:
+def test_gradients_of_readings(x64: None, robot: RobotSpec) -> None:
     system = system_of(robot)
     inputs = random_states(system, np.random.default_rng(3), 20)
     rng = np.random.default_rng(4)

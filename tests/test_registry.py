@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import pickle
 import tomllib
 from collections.abc import Iterator
@@ -15,7 +16,7 @@ import numpy as np
 import pytest
 
 import newton_qd
-from newton_qd import registry
+from newton_qd import tasks
 from newton_qd.envs.ant import Ant
 from newton_qd.envs.base import Env, PhysicsEnv
 from newton_qd.envs.pointmaze import PointMaze
@@ -48,7 +49,7 @@ def layers(env: Env) -> list[type]:
 @pytest.fixture
 def rows(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Registrations that the test makes are forgotten after it."""
-    monkeypatch.setattr(registry, "_ROWS", dict(registry._ROWS))
+    monkeypatch.setattr(tasks, "ENVIRONMENTS", dict(tasks.ENVIRONMENTS))
     yield
 
 
@@ -208,26 +209,38 @@ def test_float64_needs_x64() -> None:
 
 
 def test_tables_are_columns_of_the_rows() -> None:
-    extractors = newton_qd.behavior_descriptor_extractor
+    extractors = newton_qd.tables.behavior_descriptor_extractor
     read = {FEET: get_feet_contact_proportion, XY: get_final_xy_position}
     assert dict(extractors) == {n: read[task.descriptor] for n, task in TASKS.items()}
-    assert newton_qd.descriptor_extractor is extractors
+    assert newton_qd.tables.descriptor_extractor is extractors
     offsets = {name: task.offset for name, task in TASKS.items()}
-    assert dict(newton_qd.original_reward_offset) == offsets
-    assert list(newton_qd.reward_offset) == list(offsets)
-    assert len(newton_qd.reward_offset) == 12 and "ant" not in newton_qd.reward_offset
-    assert "ant_uni" in repr(newton_qd.reward_offset)
+    assert dict(newton_qd.tables.original_reward_offset) == offsets
+    assert list(newton_qd.tables.reward_offset) == list(offsets)
+    assert (
+        len(newton_qd.tables.reward_offset) == 12
+        and "ant" not in newton_qd.tables.reward_offset
+    )
+    assert "ant_uni" in repr(newton_qd.tables.reward_offset)
     with pytest.raises(
         KeyError, match="'ant' has no reward_offset; known: ant_uni, ant_"
     ):
-        newton_qd.reward_offset["ant"]
+        newton_qd.tables.reward_offset["ant"]
 
 
 def test_tables_of_links_and_metrics_are_views(rows: None) -> None:
-    assert newton_qd.FEET_NAMES["ant"] == ("foot_1", "foot_2", "foot_3", "foot_4")
-    assert newton_qd.COG_NAMES["ant"] == "torso"
-    assert newton_qd.FORWARD_REWARD_NAMES["ant"] == "reward_forward"
-    tables = newton_qd.FEET_NAMES, newton_qd.COG_NAMES, newton_qd.FORWARD_REWARD_NAMES
+    assert newton_qd.tables.FEET_NAMES["ant"] == (
+        "foot_1",
+        "foot_2",
+        "foot_3",
+        "foot_4",
+    )
+    assert newton_qd.tables.COG_NAMES["ant"] == "torso"
+    assert newton_qd.tables.FORWARD_REWARD_NAMES["ant"] == "reward_forward"
+    tables = (
+        newton_qd.tables.FEET_NAMES,
+        newton_qd.tables.COG_NAMES,
+        newton_qd.tables.FORWARD_REWARD_NAMES,
+    )
     for table in tables:
         assert "ant_uni" not in table and "pointmaze" not in table
         assert len(table) == len(set(table)) == len(dict(table))
@@ -241,9 +254,9 @@ def test_tables_of_links_and_metrics_are_views(rows: None) -> None:
 
     robot = dataclasses.replace(ANT, feet=("foot_2",), torso="aux_1")
     newton_qd.register("mine", Walker, robot=robot)
-    assert newton_qd.FEET_NAMES["mine"] == ("foot_2",)
-    assert newton_qd.COG_NAMES["mine"] == "aux_1"
-    assert newton_qd.FORWARD_REWARD_NAMES["mine"] == "x_velocity"
+    assert newton_qd.tables.FEET_NAMES["mine"] == ("foot_2",)
+    assert newton_qd.tables.COG_NAMES["mine"] == "aux_1"
+    assert newton_qd.tables.FORWARD_REWARD_NAMES["mine"] == "x_velocity"
     # an environment that is not a robot's
     newton_qd.register("footless", PointMaze)
     assert not any("footless" in table for table in tables)
@@ -253,10 +266,10 @@ def test_tables_agree_with_the_environments() -> None:
     for name in newton_qd.registered_envs():
         base = newton_qd.create(name).unwrapped
         if isinstance(base, PhysicsEnv):
-            inside = registry._ROWS[name].base_name
-            assert newton_qd.FEET_NAMES.get(inside, ()) == base.robot.feet
-            assert newton_qd.COG_NAMES[inside] == base.robot.torso
-            forward = newton_qd.FORWARD_REWARD_NAMES.get(inside)
+            inside = tasks.ENVIRONMENTS[name].base_name
+            assert newton_qd.tables.FEET_NAMES.get(inside, ()) == base.robot.feet
+            assert newton_qd.tables.COG_NAMES[inside] == base.robot.torso
+            forward = newton_qd.tables.FORWARD_REWARD_NAMES.get(inside)
             assert forward == base.forward_reward_name
 
 
@@ -265,12 +278,12 @@ def test_register(rows: None) -> None:
         "my_ant",
         Ant,
         base_name="ant",
-        wrappers=[registry.WrapperRow(FeetContactWrapper, {"smooth_width": 0.1})],
+        wrappers=[tasks.WrapperSpec(FeetContactWrapper, {"smooth_width": 0.1})],
         descriptor_extractor=get_feet_contact_proportion,
         reward_offset=0.0,
     )
     assert newton_qd.registered_envs()[-1] == "my_ant"
-    assert newton_qd.reward_offset["my_ant"] == 0.0
+    assert newton_qd.tables.reward_offset["my_ant"] == 0.0
     assert layers(newton_qd.create("my_ant"))[2] is FeetContactWrapper
     with pytest.raises(ValueError, match="env_name='my_ant': taken"):
         newton_qd.register("my_ant", Ant)
@@ -292,22 +305,22 @@ def test_register(rows: None) -> None:
         ({"descriptor_extractor": 3}, TypeError, r"descriptor_extractor=3: allowed"),
         ({"wrappers": None}, TypeError, r"wrappers=None: allowed: a tuple or list"),
         (
-            {"wrappers": registry.WrapperRow(FeetContactWrapper)},
+            {"wrappers": tasks.WrapperSpec(FeetContactWrapper)},
             TypeError,
-            r"wrappers=WrapperRow\(.*allowed: a tuple or list of WrapperRow",
+            r"wrappers=WrapperSpec\(.*allowed: a tuple or list of WrapperSpec",
         ),
         (
             {"wrappers": (FeetContactWrapper,)},
             TypeError,
-            r"wrappers\[0\]=<class .*FeetContactWrapper'>: allowed: a WrapperRow",
+            r"wrappers\[0\]=<class .*FeetContactWrapper'>: allowed: a WrapperSpec",
         ),
         (
-            {"wrappers": [registry.WrapperRow(3)]},  # pyright: ignore
+            {"wrappers": [tasks.WrapperSpec(3)]},  # pyright: ignore
             TypeError,
             r"wrappers\[0\].wrapper=3: allowed: a class or a function",
         ),
         (
-            {"wrappers": [registry.WrapperRow(FeetContactWrapper, 3)]},  # pyright: ignore
+            {"wrappers": [tasks.WrapperSpec(FeetContactWrapper, 3)]},  # pyright: ignore
             TypeError,
             r"wrappers\[0\].options=3: allowed: a mapping",
         ),
@@ -319,12 +332,12 @@ def test_register_refuses_before_it_stores(
     with pytest.raises(error, match=message):
         newton_qd.register("mine", Ant, **options)
     assert "mine" not in newton_qd.registered_envs()
-    assert "ant" in list(newton_qd.FEET_NAMES)
+    assert "ant" in list(newton_qd.tables.FEET_NAMES)
 
 
 def test_register_takes_numbers_of_numpy(rows: None) -> None:
     newton_qd.register("mine", Ant, reward_offset=np.float32(2.0))  # pyright: ignore
-    assert newton_qd.reward_offset["mine"] == 2.0
+    assert newton_qd.tables.reward_offset["mine"] == 2.0
 
 
 def test_errors_survive_pickling() -> None:
@@ -352,6 +365,35 @@ def test_facade() -> None:
     project = Path(__file__).resolve().parent.parent / "pyproject.toml"
     declared = tomllib.loads(project.read_text(encoding="utf-8"))["project"]
     assert newton_qd.__version__ == declared["version"]
+
+
+@pytest.mark.parametrize("name", newton_qd.tables.__all__)
+def test_tables_answer_to_their_old_homes(name: str) -> None:
+    table = getattr(newton_qd.tables, name)
+    for old in ("newton_qd", "newton_qd.registry"):
+        said = rf"^{old}\.{name} is now newton_qd\.tables\.{name}$"
+        with pytest.warns(DeprecationWarning, match=said):
+            assert getattr(importlib.import_module(old), name) is table
+
+
+@pytest.mark.parametrize(
+    ("module", "old", "new"),
+    [
+        ("newton_qd.registry", "WrapperRow", "newton_qd.tasks.WrapperSpec"),
+        ("newton_qd.registry", "EnvironmentRow", "newton_qd.tasks.EnvironmentSpec"),
+        ("newton_qd.tasks", "WrapperRow", "newton_qd.tasks.WrapperSpec"),
+        ("newton_qd.tasks", "EnvironmentRow", "newton_qd.tasks.EnvironmentSpec"),
+        ("newton_qd.tasks", "ROWS", "newton_qd.tasks.ENVIRONMENTS"),
+        ("newton_qd.robots", "Robot", "newton_qd.robots.RobotSpec"),
+    ],
+)
+def test_old_names_say_the_new_ones(module: str, old: str, new: str) -> None:
+    home, _, name = new.rpartition(".")
+    with pytest.warns(DeprecationWarning, match=rf"^{module}\.{old} is now {new}$"):
+        found = getattr(importlib.import_module(module), old)
+    assert found is getattr(importlib.import_module(home), name)
+    with pytest.raises(AttributeError, match=f"'{module}' has no attribute 'nothing'"):
+        importlib.import_module(module).nothing  # noqa: B018
 
 
 class Data(NamedTuple):

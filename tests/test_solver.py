@@ -20,7 +20,7 @@ from newton_qd.physics.model import newton_builder
 from newton_qd.physics.model.description import read_description
 from newton_qd.physics.reference import rotation_matrix
 from newton_qd.physics.solver import NewtonQDSolver
-from newton_qd.robots import ANT, Robot
+from newton_qd.robots import ANT, RobotSpec
 
 # One link whose centre of mass is far from its origin, and a link that swings.
 OFF_CENTRE = """<robot name="off_centre">
@@ -44,18 +44,18 @@ PLANAR = """<robot name="cart"><link name="world"/>
 
 def off_centre(
     folder: Path, arm: str = "", collider: str = "", **changes: Any
-) -> Robot:
+) -> RobotSpec:
     path = write(folder, OFF_CENTRE.format(arm=arm, collider=collider))
     return row(path, "base", **changes)
 
 
-def replicated(robot: Robot, worlds: int) -> newton.ModelBuilder:
+def replicated(robot: RobotSpec, worlds: int) -> newton.ModelBuilder:
     scene = newton.ModelBuilder()
     scene.replicate(one_world(robot), worlds)
     return scene
 
 
-def one_world(robot: Robot) -> newton.ModelBuilder:
+def one_world(robot: RobotSpec) -> newton.ModelBuilder:
     path = find_urdf(robot.urdf)
     return newton_builder(str(path), read_description(path).floating, robot.gravity)
 
@@ -82,7 +82,7 @@ def numpy(array: wp.array | None, worlds: int) -> np.ndarray:
 class Loop:
     """A Newton loop over some worlds, read and set as NumPy arrays."""
 
-    def __init__(self, robot: Robot, worlds: int, device: jax.Device) -> None:
+    def __init__(self, robot: RobotSpec, worlds: int, device: jax.Device) -> None:
         self.worlds = worlds
         self.model = finalized(replicated(robot, worlds), device)
         self.solver = NewtonQDSolver(self.model, robot)
@@ -325,15 +325,15 @@ def test_worlds_must_be_identical(
         solver.notify_model_changed(0)
 
 
-def _particle(scene: newton.ModelBuilder, robot: Robot) -> None:
+def _particle(scene: newton.ModelBuilder, robot: RobotSpec) -> None:
     scene.add_particle((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), mass=1.0)
 
 
-def _other_robot(scene: newton.ModelBuilder, robot: Robot) -> None:
+def _other_robot(scene: newton.ModelBuilder, robot: RobotSpec) -> None:
     scene.add_world(one_world(ANT))
 
 
-def _two_in_a_world(scene: newton.ModelBuilder, robot: Robot) -> None:
+def _two_in_a_world(scene: newton.ModelBuilder, robot: RobotSpec) -> None:
     scene.begin_world()
     for _ in range(2):
         scene.add_builder(one_world(robot))

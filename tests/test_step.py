@@ -151,7 +151,7 @@ def test_full_gear_overshoots_a_limit_as_stated(
 
 
 TASKS = [
-    f"{name}_uni" if f"{name}_uni" in newton_qd.descriptor_extractor else name
+    f"{name}_uni" if f"{name}_uni" in newton_qd.tables.descriptor_extractor else name
     for name in ROBOTS
 ]
 

@@ -18,10 +18,10 @@ def rows() -> dict[str, list[str]]:
 
 def test_offsets_are_measured() -> None:
     found = rows()
-    assert list(found) == list(newton_qd.reward_offset)
+    assert list(found) == list(newton_qd.tables.reward_offset)
     for name, (_, _, lowest, original, offset) in found.items():
-        assert float(offset) == newton_qd.reward_offset[name]
-        assert float(original) == newton_qd.original_reward_offset[name]
+        assert float(offset) == newton_qd.tables.reward_offset[name]
+        assert float(original) == newton_qd.tables.original_reward_offset[name]
         # rounded up to hundredths; a task that is never punished needs none
         assert 0 <= float(offset) + min(0.0, float(lowest)) < 0.011
 

@@ -203,10 +203,10 @@ def test_rewards_keep_their_type_under_x64(x64: None) -> None:
 def test_offset_then_clip_around_a_created_environment() -> None:
     # as the original uses them
     env = newton_qd.create("ant_omni", episode_length=3)
-    env = OffsetRewardWrapper(env, offset=newton_qd.reward_offset["ant_omni"])
+    env = OffsetRewardWrapper(env, offset=newton_qd.tables.reward_offset["ant_omni"])
     env = ClipRewardWrapper(env, clip_min=0.0)
     state = jax.jit(env.reset)(KEY)
-    assert float(state.reward) == np.float32(newton_qd.reward_offset["ant_omni"])
+    assert float(state.reward) == np.float32(newton_qd.tables.reward_offset["ant_omni"])
     state = jax.jit(env.step)(state, 10.0 * jnp.ones(8, np.float32))
     assert float(state.reward) == 0.0
     assert env.state_descriptor_length == 2  # pyright: ignore

@@ -79,7 +79,11 @@ def test_rows_by_both_names() -> None:
     index = ANT.sys.body.index
     assert index["$ Torso"] == index["torso"] == 0
     feet = [index[name] for name in ("$ Body 4", "$ Body 7", "$ Body 10", "$ Body 13")]
-    assert feet == [index[foot] for foot in newton_qd.FEET_NAMES["ant"]] == [2, 4, 6, 8]
+    assert (
+        feet
+        == [index[foot] for foot in newton_qd.tables.FEET_NAMES["ant"]]
+        == [2, 4, 6, 8]
+    )
     assert [index[f"Aux {leg}"] for leg in (1, 2, 3, 4)] == [1, 3, 5, 7]
     assert index["Ground"] == index["floor"] == 9
     with pytest.raises(TypeError):

@@ -26,7 +26,7 @@ from urdf_text import row, write
 from newton_qd import physics
 from newton_qd.physics import reference
 from newton_qd.physics.system import System
-from newton_qd.robots import ANT, Contact, Material, Robot
+from newton_qd.robots import ANT, Contact, Material, RobotSpec
 from newton_qd.scenes import MAZE, TRAP, Scene
 
 # Smoothness and gradients
@@ -181,7 +181,7 @@ BALL = """<robot name="ball"><link name="ball"><inertial><mass value="10"/>
 TIME = 0.6  # [s]
 
 
-def ball_row(folder: Path) -> Robot:
+def ball_spec(folder: Path) -> RobotSpec:
     """A ball of 10 kg that its own weight presses in by 3 mm."""
     return row(
         write(folder, BALL),
@@ -233,7 +233,7 @@ def beside(system: System, wall: np.ndarray, position: np.ndarray) -> tuple[Any,
 
 @pytest.mark.parametrize("scene", [TRAP, MAZE], ids=["trap", "maze"])
 def test_ball_never_passes_an_axis(tmp_path: Path, scene: Scene) -> None:
-    system = physics.load_system(ball_row(tmp_path), "float32", scene)
+    system = physics.load_system(ball_spec(tmp_path), "float32", scene)
     assert system.contact_stiffness == pytest.approx(10 * 9.81 / 0.003)
     q, v, wall, side = shots(system)
     steps = round(TIME / system.robot.dt)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
-from newton_qd.robots import Robot
+from newton_qd.robots import RobotSpec
 
 
 def write(folder: Path, text: str) -> str:
@@ -14,8 +14,8 @@ def write(folder: Path, text: str) -> str:
     return str(path)
 
 
-def row(urdf: str, torso: str, **changes: object) -> Robot:
-    empty = Robot("test", urdf, torso, (), (), (), (), dt=0.02, substeps=2)
+def row(urdf: str, torso: str, **changes: object) -> RobotSpec:
+    empty = RobotSpec("test", urdf, torso, (), (), (), (), dt=0.02, substeps=2)
     return dataclasses.replace(empty, **changes)
 
 

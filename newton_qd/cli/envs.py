@@ -25,9 +25,9 @@ def run(arguments: argparse.Namespace) -> int:
     for name in newton_qd.registered_envs():
         env: Any = newton_qd.create(name)
         descriptor = offset = "-"
-        if name in newton_qd.descriptor_extractor:
+        if name in newton_qd.tables.descriptor_extractor:
             descriptor = f"{env.state_descriptor_name} ({env.descriptor_length})"
-            offset = f"{newton_qd.reward_offset[name]:g}"
+            offset = f"{newton_qd.tables.reward_offset[name]:g}"
         sizes = str(env.observation_size), str(env.action_size)
         rows.append((name, *sizes, descriptor, offset))
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]

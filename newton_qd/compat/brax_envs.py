@@ -8,7 +8,7 @@ from typing import Any
 
 import jax
 
-from newton_qd import registry
+from newton_qd import tables
 from newton_qd.compat.scoring import (
     Extractor,
     default_task,
@@ -240,7 +240,7 @@ def create_default_brax_task_components(
     scoring_fn, random_key = create_brax_scoring_fn(
         env,
         policy_network,
-        registry.behavior_descriptor_extractor[env_name],
+        tables.behavior_descriptor_extractor[env_name],
         random_key,
         episode_length=episode_length,
         deterministic=deterministic,

@@ -13,7 +13,7 @@ Contents = Mapping[str, tuple[str, ...]]
 _EXTRACTORS = ("get_feet_contact_proportion", "get_final_xy_position")
 _AURORA = ("AuroraExtraInfo", "AuroraExtraInfoNormalization")
 _LOCOMOTION: Contents = {
-    "newton_qd.registry": ("COG_NAMES", "FEET_NAMES", "FORWARD_REWARD_NAMES"),
+    "newton_qd.tables": ("COG_NAMES", "FEET_NAMES", "FORWARD_REWARD_NAMES"),
     "newton_qd.wrappers": (
         "FeetContactWrapper",
         "NoForwardRewardWrapper",
@@ -69,7 +69,7 @@ _NEW: dict[str, Contents] = {
     "qdax.tasks.brax.v1": {
         **_ENVIRONMENTS,
         "newton_qd.compat.env_creators": ("create", "create_fn"),
-        "newton_qd.registry": ("descriptor_extractor", "reward_offset"),
+        "newton_qd.tables": ("descriptor_extractor", "reward_offset"),
     },
     "qdax.tasks.brax.v1.env_creators": {"newton_qd.compat.env_creators": _SCORING},
     "qdax.tasks.brax.v1.envs": {},
@@ -89,12 +89,8 @@ _NEW: dict[str, Contents] = {
 _OLD: dict[str, Contents] = {
     "qdax.environments": {
         **_ENVIRONMENTS,
-        "newton_qd.registry": (
-            "behavior_descriptor_extractor",
-            "create",
-            "create_fn",
-            "reward_offset",
-        ),
+        "newton_qd.registry": ("create", "create_fn"),
+        "newton_qd.tables": ("behavior_descriptor_extractor", "reward_offset"),
     },
     "qdax.environments.base_wrappers": _BASE,
     "qdax.environments.bd_extractors": {

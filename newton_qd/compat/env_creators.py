@@ -8,7 +8,7 @@ from typing import Any
 
 import jax
 
-from newton_qd import registry
+from newton_qd import registry, tables
 from newton_qd.compat.scoring import (
     Extractor,
     Scores,
@@ -158,7 +158,7 @@ def create_default_brax_task_components(
     scoring_fn = create_brax_scoring_fn(
         env,
         policy_network,
-        registry.descriptor_extractor[env_name],
+        tables.descriptor_extractor[env_name],
         key,
         episode_length=episode_length,
         deterministic=deterministic,

@@ -17,7 +17,7 @@ from newton_qd.envs.options import float_type
 from newton_qd.envs.state import State, select
 from newton_qd.envs.views import SystemView, joint_indices
 from newton_qd.physics.system import PhysicsState, System
-from newton_qd.robots import Material, Robot
+from newton_qd.robots import Material, RobotSpec
 from newton_qd.scenes import Scene
 from newton_qd.types import Action, Metrics, Observation, Params, RNGKey
 
@@ -178,7 +178,7 @@ class PhysicsEnv(Env):
 
     def __init__(
         self,
-        robot: Robot,
+        robot: RobotSpec,
         *,
         reset_noise_scale: float,
         reset_velocity_noise_scale: float | None = None,
@@ -188,7 +188,7 @@ class PhysicsEnv(Env):
         """Loads the robot.
 
         Args:
-            robot: Row of the robot.
+            robot: Spec of the robot.
             reset_noise_scale: Half width of the uniform noise on joint angles [rad]
                 and joint velocities [rad/s] at a reset.
             reset_velocity_noise_scale: That of the velocities, where it differs.

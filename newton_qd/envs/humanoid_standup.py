@@ -26,7 +26,7 @@ class HumanoidStandup(Humanoid):
     """
 
     forward_reward_name = None
-    _row = HUMANOID_STANDUP
+    _spec = HUMANOID_STANDUP
 
     @checked_options
     def __init__(

@@ -28,7 +28,7 @@ def require_actuators(system: System) -> None:
     """Raises for a robot without actuators, which no action could move.
 
     Raises:
-        ValueError: The row of the system's robot has no actuators.
+        ValueError: The spec of the system's robot has no actuators.
     """
     if not system.nu:
         raise ValueError(

@@ -9,7 +9,7 @@ from newton_qd.envs.base import PhysicsEnv
 from newton_qd.envs.options import checked_options
 from newton_qd.envs.vectors import ordered_sum
 from newton_qd.physics.system import JointKind, PhysicsState
-from newton_qd.robots import Robot
+from newton_qd.robots import RobotSpec
 from newton_qd.scenes import Scene
 from newton_qd.types import Action, Metrics
 
@@ -29,7 +29,7 @@ class Locomotion(PhysicsEnv):
     @checked_options
     def __init__(
         self,
-        robot: Robot,
+        robot: RobotSpec,
         *,
         forward_reward_weight: float = 1.0,
         ctrl_cost_weight: float = 0.5,
@@ -42,7 +42,7 @@ class Locomotion(PhysicsEnv):
         """Loads a robot.
 
         Args:
-            robot: Row of the robot; its first joint is free.
+            robot: Spec of the robot; its first joint is free.
             forward_reward_weight: Weight of the velocity along x [s/m].
             ctrl_cost_weight: Cost of the sum of squared actions [-].
             healthy_reward: Bonus of a step [-].

@@ -13,7 +13,7 @@ from newton_qd.envs.points import point
 from newton_qd.envs.vectors import length, ordered_sum
 from newton_qd.physics.inspection import Kinematics
 from newton_qd.physics.system import PhysicsState
-from newton_qd.robots import REACHER, REACHERANGLE, Robot
+from newton_qd.robots import REACHER, REACHERANGLE, RobotSpec
 from newton_qd.types import Action, Metrics, RNGKey
 
 _TIP = (0.11, 0.0, 0.0)  # centre of the tip in its link [m]
@@ -32,7 +32,7 @@ class Reacher(PhysicsEnv):
         reward_ctrl: Minus the sum of squared actions [-].
     """
 
-    _row: Robot = REACHER
+    _spec: RobotSpec = REACHER
 
     @checked_options
     def __init__(
@@ -51,7 +51,7 @@ class Reacher(PhysicsEnv):
             dtype: ``"float32"``, or ``"float64"`` with JAX x64 on.
         """
         super().__init__(
-            self._row,
+            self._spec,
             reset_noise_scale=reset_noise_scale,
             reset_velocity_noise_scale=reset_velocity_noise_scale,
             dtype=dtype,
@@ -127,7 +127,7 @@ class ReacherAngle(Reacher):
         rewardCtrl: 0, as in the original.
     """
 
-    _row = REACHERANGLE
+    _spec = REACHERANGLE
 
     def _share_of_radius(self, share: jax.Array) -> jax.Array:
         """Returns how far out () a target is: uniform over the disk."""

@@ -82,8 +82,8 @@ def make_episode(
             numbers in another shape.
         descriptor_extractor: Maps ``(data, mask)`` to descriptors (1, D), with
             ``data.state_desc`` (1, T, nd) and ``mask`` (1, T) equal to 1 after the
-            end of the episode; ``newton_qd.descriptor_extractor`` has those of tasks.
-            ``None``: the descriptor is empty.
+            end of the episode; ``newton_qd.tables.descriptor_extractor`` has those of
+            tasks. ``None``: the descriptor is empty.
         episode_length: Control steps.
         unravel: Maps a genotype to the parameters, once an episode.
         options: What becomes of the gradient on its way back; ``None``: no care is

@@ -20,7 +20,7 @@ from newton_qd.physics.model import load_system, newton_builder
 from newton_qd.physics.model.description import read_description
 from newton_qd.physics.system import JointKind, System
 from newton_qd.physics.warp_internals import tape_is_recording
-from newton_qd.robots import Robot
+from newton_qd.robots import RobotSpec
 
 # Arrays that every world must share with the robot, by what they have a row for.
 _COMPARED = {
@@ -90,7 +90,7 @@ class NewtonQDSolver(SolverBase):
         normal_impulse: (worlds, nb) likewise [N s].
     """
 
-    def __init__(self, model: newton.Model, robot: Robot) -> None:
+    def __init__(self, model: newton.Model, robot: RobotSpec) -> None:
         """Checks the model and allocates the buffers of a step.
 
         Args:
@@ -203,7 +203,7 @@ def _launcher(system: System, device: wp.Device, dt: float) -> Launcher:
     return Launcher(driven, device)
 
 
-def _one_world(robot: Robot, device: Any) -> newton.Model:
+def _one_world(robot: RobotSpec, device: Any) -> newton.Model:
     """Returns what Newton makes of the robot alone, as its users would build it."""
     path = find_urdf(robot.urdf)
     floating = read_description(path).floating
@@ -214,7 +214,7 @@ def _one_world(robot: Robot, device: Any) -> newton.Model:
         return builder.finalize(device=device)
 
 
-def _check_model(model: newton.Model, one: newton.Model, robot: Robot) -> None:
+def _check_model(model: newton.Model, one: newton.Model, robot: RobotSpec) -> None:
     """Raises ValueError unless every world of ``model`` is ``one``."""
     worlds = model.world_count
     for name in _ABSENT:

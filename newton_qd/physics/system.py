@@ -8,7 +8,7 @@ import enum
 import jax
 import numpy as np
 
-from newton_qd.robots import Robot
+from newton_qd.robots import RobotSpec
 from newton_qd.scenes import Scene
 
 CONTACT_FRACTION = 0.01
@@ -97,7 +97,7 @@ class System:
         rest_q: (nq,) coordinates of the default pose, ``v`` being 0.
     """
 
-    robot: Robot
+    robot: RobotSpec
     scene: Scene | None
     dtype: str
     body_names: tuple[str, ...]

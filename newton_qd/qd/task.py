@@ -56,7 +56,7 @@ def make_task(config: EvolveConfig) -> Task:
     name = config.env_name
     if name not in newton_qd.registered_envs():
         raise newton_qd.UnknownEnvironment(name, newton_qd.registered_envs())
-    tasks = sorted(newton_qd.descriptor_extractor)
+    tasks = sorted(newton_qd.tables.descriptor_extractor)
     if name not in tasks:
         raise ConfigError(
             f"env_name: {name!r} has no descriptor; evolve takes {', '.join(tasks)}"
@@ -67,10 +67,10 @@ def make_task(config: EvolveConfig) -> Task:
     low, high = (np.asarray(x, np.float32) for x in env.descriptor_limits)
     return Task(
         env=env,
-        descriptor_extractor=newton_qd.descriptor_extractor[name],
+        descriptor_extractor=newton_qd.tables.descriptor_extractor[name],
         limits=(low, high),
         labels=_labels(env, len(low)),
-        reward_offset=float(newton_qd.reward_offset[name]),
+        reward_offset=float(newton_qd.tables.reward_offset[name]),
     )
 
 

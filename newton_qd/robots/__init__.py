@@ -1,5 +1,10 @@
-"""Robots as data: one file and one row each."""
+"""Robots as data: one file and one spec each."""
 
+from __future__ import annotations
+
+from typing import Any
+
+from newton_qd.moved import moved_name
 from newton_qd.robots.acrobot import ACROBOT
 from newton_qd.robots.ant import ANT
 from newton_qd.robots.halfcheetah import HALFCHEETAH
@@ -11,7 +16,7 @@ from newton_qd.robots.inverted_pendulum import INVERTED_PENDULUM
 from newton_qd.robots.pusher import PUSHER
 from newton_qd.robots.reacher import REACHER
 from newton_qd.robots.reacherangle import REACHERANGLE
-from newton_qd.robots.row import Contact, Material, Robot
+from newton_qd.robots.spec import Contact, Material, RobotSpec
 from newton_qd.robots.swimmer import SWIMMER
 from newton_qd.robots.walker2d import WALKER2D
 
@@ -51,5 +56,10 @@ __all__ = [
     "WALKER2D",
     "Contact",
     "Material",
-    "Robot",
+    "RobotSpec",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Says how a name that was here is called now."""
+    return moved_name(__name__, name, {"Robot": "newton_qd.robots.RobotSpec"})

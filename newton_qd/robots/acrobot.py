@@ -1,8 +1,8 @@
 """Acrobot: two poles that hang from a mount, driven where they meet."""
 
-from newton_qd.robots.row import DEGREE, Robot
+from newton_qd.robots.spec import DEGREE, RobotSpec
 
-ACROBOT = Robot(
+ACROBOT = RobotSpec(
     name="acrobot",
     urdf="acrobot.urdf",
     torso="pole",

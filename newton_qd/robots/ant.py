@@ -1,10 +1,10 @@
 """Ant: a torso on four legs of two joints."""
 
-from newton_qd.robots.row import DEGREE, Contact, Robot
+from newton_qd.robots.spec import DEGREE, Contact, RobotSpec
 
 _ANT_LEGS = ("1", "2", "3", "4")
 
-ANT = Robot(
+ANT = RobotSpec(
     name="ant",
     urdf="ant.urdf",
     torso="torso",

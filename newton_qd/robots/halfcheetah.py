@@ -1,10 +1,10 @@
 """Halfcheetah: a trunk on a back and a front leg, in a plane."""
 
-from newton_qd.robots.row import Contact, Material, Robot
+from newton_qd.robots.spec import Contact, Material, RobotSpec
 
 _LEG_PARTS = ("bthigh", "bshin", "bfoot", "fthigh", "fshin", "ffoot")
 
-HALFCHEETAH = Robot(
+HALFCHEETAH = RobotSpec(
     name="halfcheetah",
     urdf="halfcheetah.urdf",
     torso="torso",

@@ -1,8 +1,8 @@
 """Hopper: a torso on one leg, in a plane."""
 
-from newton_qd.robots.row import Contact, Material, Robot
+from newton_qd.robots.spec import Contact, Material, RobotSpec
 
-HOPPER = Robot(
+HOPPER = RobotSpec(
     name="hopper",
     urdf="hopper.urdf",
     torso="torso",

@@ -1,11 +1,11 @@
 """Humanoid: a trunk of three bodies, two legs and two arms, 17 driven axes."""
 
-from newton_qd.robots.row import DEGREE, Contact, Material, Robot
+from newton_qd.robots.spec import DEGREE, Contact, Material, RobotSpec
 
 _FEET = ("left_shin", "right_shin")
 _STRONG, _WEAK = 350.0, 100.0  # gears of trunk and legs, and of the arms [N m]
 
-HUMANOID = Robot(
+HUMANOID = RobotSpec(
     name="humanoid",
     urdf="humanoid.urdf",
     torso="torso",

@@ -3,7 +3,7 @@
 import dataclasses
 
 from newton_qd.robots.humanoid import HUMANOID
-from newton_qd.robots.row import DEGREE, Contact
+from newton_qd.robots.spec import DEGREE, Contact
 
 HUMANOID_STANDUP = dataclasses.replace(
     HUMANOID,

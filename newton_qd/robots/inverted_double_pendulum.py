@@ -1,8 +1,8 @@
 """Inverted double pendulum: two poles, one on the other, on a cart."""
 
-from newton_qd.robots.row import Robot
+from newton_qd.robots.spec import RobotSpec
 
-INVERTED_DOUBLE_PENDULUM = Robot(
+INVERTED_DOUBLE_PENDULUM = RobotSpec(
     name="inverted_double_pendulum",
     urdf="inverted_double_pendulum.urdf",
     torso="cart",

@@ -1,8 +1,8 @@
 """Inverted pendulum: a pole on a cart."""
 
-from newton_qd.robots.row import Robot
+from newton_qd.robots.spec import RobotSpec
 
-INVERTED_PENDULUM = Robot(
+INVERTED_PENDULUM = RobotSpec(
     name="inverted_pendulum",
     urdf="inverted_pendulum.urdf",
     torso="cart",

@@ -1,6 +1,6 @@
 """Pusher: an arm of seven hinges over a table, and an object that it pushes."""
 
-from newton_qd.robots.row import DEGREE, Contact, Material, Robot
+from newton_qd.robots.spec import DEGREE, Contact, Material, RobotSpec
 
 # What of the arm touches the table and the object.
 _CAPSULES = tuple(
@@ -18,7 +18,7 @@ _SPHERES = tuple(
 )
 _OBJECT = Contact("object")
 
-PUSHER = Robot(
+PUSHER = RobotSpec(
     name="pusher",
     urdf="pusher.urdf",
     torso="object",

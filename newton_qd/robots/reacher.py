@@ -1,8 +1,8 @@
 """Reacher: an arm of two links over the ground, and a target."""
 
-from newton_qd.robots.row import Robot
+from newton_qd.robots.spec import RobotSpec
 
-REACHER = Robot(
+REACHER = RobotSpec(
     name="reacher",
     urdf="reacher.urdf",
     torso="body0",

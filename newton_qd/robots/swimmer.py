@@ -1,8 +1,8 @@
 """Swimmer: three links in a row that float in a plane."""
 
-from newton_qd.robots.row import Robot
+from newton_qd.robots.spec import RobotSpec
 
-SWIMMER = Robot(
+SWIMMER = RobotSpec(
     name="swimmer",
     urdf="swimmer.urdf",
     torso="torso",

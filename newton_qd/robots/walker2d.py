@@ -1,10 +1,10 @@
 """Walker2d: a torso on two legs, in a plane."""
 
-from newton_qd.robots.row import Contact, Material, Robot
+from newton_qd.robots.spec import Contact, Material, RobotSpec
 
 _LEGS = ("", "_left")
 
-WALKER2D = Robot(
+WALKER2D = RobotSpec(
     name="walker2d",
     urdf="walker2d.urdf",
     torso="torso",

@@ -17,7 +17,7 @@ class OffsetRewardWrapper(Wrapper):
 
         Args:
             env: The environment; an action that it repeats gets the offset once.
-            offset: What is added, as ``newton_qd.reward_offset[name]``.
+            offset: What is added, as ``newton_qd.tables.reward_offset[name]``.
         """
         check_number("offset", offset)
         super().__init__(env)

@@ -21,8 +21,8 @@ class XYPositionWrapper(Wrapper, QDEnv):
 
     The state descriptor is kept within the limits; ``info["xy_position"]`` is the
     position itself. With repeated actions the last repetition counts. The torso is the
-    robot's first link where its row names no other: of an arm it sits on its pivot, and
-    its position tells nothing.
+    robot's first link where its spec names no other: of an arm it sits on its pivot,
+    and its position tells nothing.
     """
 
     def __init__(

@@ -30,7 +30,7 @@ from newton_qd.physics.model.scene import obstacle_tables, read_scene
 from newton_qd.physics.model.verify import BuiltModel, ModelMismatchError, verify
 from newton_qd.physics.model.xml_reader import IDENTITY, RobotDescriptionError
 from newton_qd.physics.system import JointKind, System
-from newton_qd.robots import Robot
+from newton_qd.robots import RobotSpec
 from newton_qd.scenes import Scene
 
 if TYPE_CHECKING:
@@ -156,7 +156,7 @@ def _read_newton(model: newton.Model, description: Description) -> BuiltModel:
     )
 
 
-def _control(robot: Robot, built: BuiltModel) -> dict[str, np.ndarray]:
+def _control(robot: RobotSpec, built: BuiltModel) -> dict[str, np.ndarray]:
     joints = [
         index_of(robot, "actuators", joint, built.joint_names)
         for joint, _ in robot.actuators
@@ -181,7 +181,7 @@ def _body_arrays(bodies: list[Body]) -> dict[str, np.ndarray]:
 
 
 def _dof_arrays(
-    robot: Robot, built: BuiltModel, bodies: list[Body], control: dict
+    robot: RobotSpec, built: BuiltModel, bodies: list[Body], control: dict
 ) -> dict[str, np.ndarray]:
     """Returns the joint springs, dampers and limits, each (nv,)."""
     nv = int(sum(6 if kind == JointKind.FREE else 1 for kind in built.joint_kind))
@@ -211,7 +211,7 @@ def _dof_arrays(
     }
 
 
-def build_system(robot: Robot, dtype: str, scene: Scene | None = None) -> System:
+def build_system(robot: RobotSpec, dtype: str, scene: Scene | None = None) -> System:
     """Builds the immutable description of a robot in a scene.
 
     Args:
@@ -282,7 +282,7 @@ def _check_dtype(dtype: str) -> None:
 
 
 @functools.cache
-def _cached_system(robot: Robot, dtype: str, scene: Scene | None) -> System:
+def _cached_system(robot: RobotSpec, dtype: str, scene: Scene | None) -> System:
     return build_system(robot, dtype, scene)
 
 
@@ -297,7 +297,7 @@ def _cached_variant(
 
 
 def load_system(
-    robot: Robot,
+    robot: RobotSpec,
     dtype: str = "float32",
     scene: Scene | None = None,
     *,

@@ -17,11 +17,11 @@ from newton_qd.physics.model.scene import (
 )
 from newton_qd.physics.model.xml_reader import RobotDescriptionError
 from newton_qd.physics.system import System
-from newton_qd.robots import Contact, Robot
+from newton_qd.robots import Contact, RobotSpec
 from newton_qd.scenes import Scene
 
 
-def body_of(robot: Robot, field: str, link: str, bodies: list[Body]) -> int:
+def body_of(robot: RobotSpec, field: str, link: str, bodies: list[Body]) -> int:
     """Returns the body that holds a link which the row's field names."""
     links = {name: i for i, body in enumerate(bodies) for name in body.links}
     index_of(robot, field, link, tuple(links))
@@ -46,7 +46,7 @@ def _colliders(contact: Contact, body: Body, kinds: tuple[str, ...]) -> list[Sha
     ]
 
 
-def _collider(robot: Robot, contact: Contact, body: Body) -> Shape:
+def _collider(robot: RobotSpec, contact: Contact, body: Body) -> Shape:
     """Returns the one collider of a body that a row's contact means."""
     kind = "capsule" if contact.end else "sphere"
     found = _colliders(contact, body, (kind,))
@@ -61,7 +61,7 @@ def _collider(robot: Robot, contact: Contact, body: Body) -> Shape:
     return found[0]
 
 
-def _ground_contacts(robot: Robot, bodies: list[Body]) -> Iterator[ContactRow]:
+def _ground_contacts(robot: RobotSpec, bodies: list[Body]) -> Iterator[ContactRow]:
     """Pairs the spheres of the robot's row with the ground."""
     # a collider may be named or be the only one of its kind: both ways mean the same
     seen: set[tuple[int, int]] = set()
@@ -79,7 +79,7 @@ def _ground_contacts(robot: Robot, bodies: list[Body]) -> Iterator[ContactRow]:
 
 
 def _pair_sides(
-    robot: Robot, bodies: list[Body]
+    robot: RobotSpec, bodies: list[Body]
 ) -> Iterator[tuple[ContactRow, ContactRow]]:
     """Returns both sides of the pairs of the robot's row, the shorter one first."""
     for pair in robot.pairs:
@@ -108,7 +108,7 @@ def _pair_sides(
 
 
 def contact_tables(
-    robot: Robot, scene: Scene | None, bodies: list[Body], obstacles: int
+    robot: RobotSpec, scene: Scene | None, bodies: list[Body], obstacles: int
 ) -> dict[str, np.ndarray]:
     """Returns the contact tables of a system.
 

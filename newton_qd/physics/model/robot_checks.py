@@ -9,7 +9,7 @@ import os
 from collections.abc import Callable
 
 from newton_qd.physics.model.xml_reader import RobotDescriptionError
-from newton_qd.robots import Contact, Material, Robot
+from newton_qd.robots import Contact, Material, RobotSpec
 
 _MAY_BE_ZERO = ("gravity", "friction", "dissipation")
 
@@ -55,7 +55,7 @@ _TUPLES: dict[str, tuple[Callable[[object], bool], str]] = {
 }
 
 
-def index_of(robot: Robot, field: str, name: str, allowed: tuple[str, ...]) -> int:
+def index_of(robot: RobotSpec, field: str, name: str, allowed: tuple[str, ...]) -> int:
     """Returns the position of a link's or joint's name in ``allowed``.
 
     Raises:
@@ -70,7 +70,7 @@ def index_of(robot: Robot, field: str, name: str, allowed: tuple[str, ...]) -> i
     return allowed.index(name)
 
 
-def _check_number(robot: Robot, field: str, value: float, *, signed: bool) -> None:
+def _check_number(robot: RobotSpec, field: str, value: float, *, signed: bool) -> None:
     zero = field.split(".")[-1] in _MAY_BE_ZERO
     valid = (
         isinstance(value, numbers.Real)
@@ -84,7 +84,7 @@ def _check_number(robot: Robot, field: str, value: float, *, signed: bool) -> No
         )
 
 
-def _check_unique(robot: Robot, field: str, names: list[str]) -> None:
+def _check_unique(robot: RobotSpec, field: str, names: list[str]) -> None:
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise RobotDescriptionError(
@@ -99,16 +99,16 @@ def _pair_name(pair: tuple[Contact, Contact]) -> str:
     return " and ".join(sorted(ends))
 
 
-def _check_types(robot: Robot) -> None:
+def _check_types(robot: RobotSpec) -> None:
     """Checks that a row can be read: what its fields hold, not yet their values.
 
     Raises:
         TypeError: ``robot`` is not a row.
         RobotDescriptionError: A field is not of the type that it is read as.
     """
-    if not isinstance(robot, Robot):
+    if not isinstance(robot, RobotSpec):
         raise TypeError(
-            f"robot={robot!r}: allowed: a Robot, such as newton_qd.robots.ANT"
+            f"robot={robot!r}: allowed: a RobotSpec, such as newton_qd.robots.ANT"
         )
     if not isinstance(robot.name, str) or not robot.name:
         raise RobotDescriptionError(
@@ -144,7 +144,7 @@ def _check_types(robot: Robot) -> None:
         )
 
 
-def _check_contacts(robot: Robot) -> None:
+def _check_contacts(robot: RobotSpec) -> None:
     """Checks the ends of contacts and pairs."""
     for contact in robot.contacts:
         if contact.end not in (-1, 0, 1):
@@ -161,7 +161,7 @@ def _check_contacts(robot: Robot) -> None:
                 )
 
 
-def check_robot(robot: Robot) -> None:
+def check_robot(robot: RobotSpec) -> None:
     """Checks the numbers of a row, and what can be checked without its file.
 
     Raises:

@@ -24,7 +24,7 @@ from newton_qd.physics.model.xml_reader import (
     XmlReader,
 )
 from newton_qd.physics.system import ObstacleKind
-from newton_qd.robots import Robot
+from newton_qd.robots import RobotSpec
 from newton_qd.scenes import Scene
 
 # A sphere is a capsule of no length.
@@ -148,7 +148,7 @@ def whole_collider(body: int, obstacle: int, shape: Shape) -> ContactRow:
 
 
 def wall_contacts(
-    robot: Robot,
+    robot: RobotSpec,
     scene: Scene,
     obstacles: int,
     colliders: dict[str, tuple[int, tuple[Shape, ...]]],

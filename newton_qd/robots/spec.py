@@ -1,7 +1,7 @@
-"""What a robot row holds: everything about a robot that its URDF file cannot.
+"""What a robot's spec holds: everything about a robot that its URDF file cannot.
 
 Masses, inertias, joint frames, limits, damping and colliders are in ``urdf/``;
-gears, the contact material and the time steps are in rows of this type.
+gears, the contact material and the time steps are in specs of this type.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class Material:
 
 
 @dataclasses.dataclass(frozen=True)
-class Robot:
+class RobotSpec:
     """One robot of the suite.
 
     Attributes:
