@@ -24,8 +24,8 @@ from throughput import seconds
 from newton_qd.gradients.episode import make_episode
 from newton_qd.physics.launch import Launcher
 from newton_qd.qd.config import EvolveConfig
-from newton_qd.qd.sharding import device_mesh, shard_scoring
-from newton_qd.qd.task import Task, make_task
+from newton_qd.qd.scoring.sharding import device_mesh, shard_scoring
+from newton_qd.qd.scoring.task import Task, make_task
 
 HIDDEN = 64
 TOLERANCE = 1e-5

@@ -102,7 +102,7 @@ def run_ours(run: Run) -> Result:
     )
     from qdax.core.map_elites import MAPElites
 
-    from newton_qd.qd.annealed_repertoire import AnnealedRepertoire
+    from newton_qd.qd.emitters.annealed_repertoire import AnnealedRepertoire
 
     domain = DOMAINS[run.domain]
     emitter, score, initial = ours(run, domain)

@@ -24,9 +24,9 @@ import numpy as np
 
 from newton_qd.gradients.episode import make_episode
 from newton_qd.qd.config import EvolveConfig
-from newton_qd.qd.rollout import make_policy, make_scoring_function
-from newton_qd.qd.search import Search
-from newton_qd.qd.task import make_task
+from newton_qd.qd.run.search import Search
+from newton_qd.qd.scoring.rollout import make_policy, make_scoring_function
+from newton_qd.qd.scoring.task import make_task
 
 
 def durations(run: Callable[[], Any], repetitions: int) -> np.ndarray:

@@ -34,7 +34,7 @@ from optimize_methods import Evolution, GradientPlan, Method, ShortHorizon
 from optimize_problems import PROBLEMS, Problem
 
 from newton_qd.gradients import GradientOptions
-from newton_qd.qd.actor_critic import ActorCriticSettings
+from newton_qd.qd.emitters.actor_critic_learner import ActorCriticSettings
 
 METHODS: tuple[str, ...] = ("gradient", "evolution")
 SCREENING_SEED = 100  # of the first run of a screening, beyond those of the comparison

@@ -13,7 +13,7 @@ from jax.flatten_util import ravel_pytree
 from optimize_problems import STEPS, Cautious, Problem, make_network
 
 from newton_qd.gradients import GradientOptions, make_episode_gradient
-from newton_qd.qd.actor_critic import ActorCritic, ActorCriticSettings
+from newton_qd.qd.emitters.actor_critic_learner import ActorCritic, ActorCriticSettings
 
 
 class Method(Protocol):
@@ -126,7 +126,7 @@ class GradientPlan:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ShortHorizon:
-    """The short-horizon actor-critic of ``newton_qd.qd.actor_critic``.
+    """The short-horizon actor-critic of ``newton_qd.qd.emitters.actor_critic_learner``.
 
     Attributes:
         problem: A problem whose solutions are policies.

@@ -127,7 +127,7 @@ def curve(search: Any, gradients: int, seconds: float, wall: bool) -> Iterator[d
         seconds: Budget [s].
         wall: Whether the budget is wall-clock time.
     """
-    from newton_qd.qd.folder import COLUMNS
+    from newton_qd.qd.run.folder import COLUMNS
 
     state = search.empty()
     for _ in range(3):  # compiles, and runs what is compiled
@@ -159,8 +159,8 @@ def execute(run: Run, seconds: float, device: str, file: Path) -> None:
     import newton_qd.compat
     from newton_qd.qd import make_task
     from newton_qd.qd.algorithms import ALGORITHMS as TABLE
-    from newton_qd.qd.archive import Archive
-    from newton_qd.qd.search import Search
+    from newton_qd.qd.run.archive import Archive
+    from newton_qd.qd.run.search import Search
 
     if run.algorithm == "pga-me":
         newton_qd.compat.install()

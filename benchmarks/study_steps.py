@@ -29,7 +29,7 @@ from newton_qd.gradients import (
 )
 from newton_qd.qd import EvolveConfig, make_policy, make_scoring_function, make_task
 from newton_qd.qd.emitters.cells import draw_cells, empty_targets, nearest_cells
-from newton_qd.qd.search import Search
+from newton_qd.qd.run.search import Search
 
 PARENTS = 32
 GENERATIONS = 10

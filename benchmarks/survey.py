@@ -22,7 +22,7 @@ import numpy as np
 import newton_qd
 from newton_qd.extractors import Trajectories
 from newton_qd.qd import EvolveConfig, make_policy, make_task
-from newton_qd.qd.task import Task
+from newton_qd.qd.scoring.task import Task
 
 WORLDS, STEPS, CELLS, HIDDEN = 1000, 1000, 1024, (64, 64)
 HEAD = f"""# Survey of the tasks

@@ -15,10 +15,10 @@ from newton_qd.qd import (
     EvolveConfig,
     make_gradient_scoring_function,
     make_policy,
+    make_ribs_evaluation,
     make_scoring_function,
     make_task,
 )
-from newton_qd.qd.ribs import make_ribs_evaluation
 
 
 def main() -> None:

@@ -13,8 +13,14 @@ from ribs.archives import GridArchive
 from ribs.emitters import EvolutionStrategyEmitter
 from ribs.schedulers import Scheduler
 
-from newton_qd.qd import EvolveConfig, make_policy, make_scoring_function, make_task
-from newton_qd.qd.ribs import from_ribs, make_ribs_evaluation
+from newton_qd.qd import (
+    EvolveConfig,
+    from_ribs,
+    make_policy,
+    make_ribs_evaluation,
+    make_scoring_function,
+    make_task,
+)
 
 
 def main() -> None:

@@ -15,8 +15,14 @@ import time
 import jax
 import numpy as np
 
-from newton_qd.qd import EvolveConfig, make_policy, make_scoring_function, make_task
-from newton_qd.qd.sharding import device_mesh, shard_scoring
+from newton_qd.qd import (
+    EvolveConfig,
+    device_mesh,
+    make_policy,
+    make_scoring_function,
+    make_task,
+    shard_scoring,
+)
 
 
 def main() -> None:

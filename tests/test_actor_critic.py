@@ -18,8 +18,12 @@ from test_evolve import PointEnv, point_task
 
 import newton_qd
 from newton_qd.extractors import get_final_xy_position
-from newton_qd.qd.actor_critic import ActorCritic, ActorCriticSettings, measure_of
 from newton_qd.qd.emitters import ActorCriticEmitter
+from newton_qd.qd.emitters.actor_critic_learner import (
+    ActorCritic,
+    ActorCriticSettings,
+    measure_of,
+)
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
 

@@ -16,14 +16,18 @@ from test_steady import compiled
 import newton_qd.compat
 from newton_qd import cli
 from newton_qd.qd.algorithms import ALGORITHMS, CMAMEOptions
-from newton_qd.qd.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
+from newton_qd.qd.algorithms.gradient_algorithms import GRADIENT_ALGORITHMS
+from newton_qd.qd.algorithms.gradient_options import TUNED
 from newton_qd.qd.config import ConfigError, EvolveConfig, read_config
 from newton_qd.qd.emitters import GradientLineEmitter
-from newton_qd.qd.evolution import evolve
-from newton_qd.qd.gradient_algorithms import GRADIENT_ALGORITHMS
-from newton_qd.qd.gradient_options import TUNED
-from newton_qd.qd.search import Search
-from newton_qd.qd.task import make_task
+from newton_qd.qd.run.checkpoint import (
+    CheckpointError,
+    load_checkpoint,
+    save_checkpoint,
+)
+from newton_qd.qd.run.evolution import evolve
+from newton_qd.qd.run.search import Search
+from newton_qd.qd.scoring.task import make_task
 
 __all__ = ["compiled"]  # a fixture
 
@@ -228,7 +232,7 @@ def test_algorithms_of_one_precision(name: str) -> None:
 
 
 def test_a_whole_number_is_a_number() -> None:
-    parts: Any = importlib.import_module("newton_qd.qd.parts")
+    parts: Any = importlib.import_module("newton_qd.qd.algorithms.parts")
     config = SMALL.replace(algorithm="cma-me", options={"sigma_g": 1}, iso_sigma=1)
     options = parts.settings(CMAMEOptions, config)
     assert type(options.sigma_g) is float and options.sigma_g == 1.0

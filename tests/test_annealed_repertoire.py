@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from qdax.core.containers.mapelites_repertoire import compute_euclidean_centroids
 
-from newton_qd.qd.annealed_repertoire import AnnealedRepertoire
+from newton_qd.qd.emitters.annealed_repertoire import AnnealedRepertoire
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
 

@@ -23,9 +23,9 @@ from test_evolve import (
 )
 
 from newton_qd import cli, files
-from newton_qd.qd.archive import Archive, ArchiveError, archive_bytes, load_archive
-from newton_qd.qd.checkpoint import CheckpointError, load_checkpoint
 from newton_qd.qd.config import read_config
+from newton_qd.qd.run.archive import Archive, ArchiveError, archive_bytes, load_archive
+from newton_qd.qd.run.checkpoint import CheckpointError, load_checkpoint
 
 __all__ = ["compile_once", "reference"]  # fixtures
 

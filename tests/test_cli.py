@@ -15,9 +15,9 @@ from test_evolve import SMALL, point_task
 
 import newton_qd
 from newton_qd import cli
-from newton_qd.qd.archive import load_archive
 from newton_qd.qd.config import EvolveConfig
-from newton_qd.qd.task import Task
+from newton_qd.qd.run.archive import load_archive
+from newton_qd.qd.scoring.task import Task
 
 # QDax and what it imports warn about their own use of other packages.
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
@@ -229,7 +229,7 @@ def test_ant_uni_evolves_and_resumes(tmp_path: Path) -> None:
     code = (
         "import os, signal, sys\n"
         "from newton_qd import cli\n"
-        "from newton_qd.qd.folder import RunFolder\n"
+        "from newton_qd.qd.run.folder import RunFolder\n"
         "save = RunFolder.save\n"
         "def save_and_die(self, checkpoint):\n"
         "    save(self, checkpoint)\n"

@@ -22,7 +22,6 @@ from qdax.core.emitters.standard_emitters import MixingEmitter
 from qdax.core.map_elites import MAPElites
 
 from newton_qd.gradients import EpisodeGradients
-from newton_qd.qd.annealed_repertoire import AnnealedRepertoire
 from newton_qd.qd.emitters import (
     CMAMAEGAEmitter,
     CMAMEGAEmitter,
@@ -33,7 +32,8 @@ from newton_qd.qd.emitters import (
     RestartRule,
     SteeringEmitter,
 )
-from newton_qd.qd.emitters.gradients import normalize, read_scores
+from newton_qd.qd.emitters.annealed_repertoire import AnnealedRepertoire
+from newton_qd.qd.scoring.gradient_scores import normalize, read_scores
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
 

@@ -27,8 +27,8 @@ from newton_qd.gradients import (
     make_episode_gradient,
     with_smooth_descriptor,
 )
-from newton_qd.qd.gradient_scoring import make_gradient_scoring_function
-from newton_qd.qd.task import Task
+from newton_qd.qd.scoring.gradient_scoring import make_gradient_scoring_function
+from newton_qd.qd.scoring.task import Task
 
 STEPS = 12
 

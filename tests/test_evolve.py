@@ -28,17 +28,17 @@ import pytest
 from newton_qd import files
 from newton_qd.errors import MissingExtra, UnknownEnvironment
 from newton_qd.extractors import get_feet_contact_proportion
-from newton_qd.qd import plot, search
-from newton_qd.qd.archive import Archive, load_archive
-from newton_qd.qd.checkpoint import CheckpointError
 from newton_qd.qd.config import ConfigError, EvolveConfig, read_config
-from newton_qd.qd.evolution import EvolveResult, evolve
-from newton_qd.qd.folder import RunFolder
-from newton_qd.qd.interrupt import INTERRUPTED, graceful_stop
-from newton_qd.qd.progress import Progress
-from newton_qd.qd.rollout import make_policy, make_scoring_function
-from newton_qd.qd.search import Search, SearchError
-from newton_qd.qd.task import Task, make_task
+from newton_qd.qd.run import plot, search
+from newton_qd.qd.run.archive import Archive, load_archive
+from newton_qd.qd.run.checkpoint import CheckpointError
+from newton_qd.qd.run.evolution import EvolveResult, evolve
+from newton_qd.qd.run.folder import RunFolder
+from newton_qd.qd.run.interrupt import INTERRUPTED, graceful_stop
+from newton_qd.qd.run.progress import Progress
+from newton_qd.qd.run.search import Search, SearchError
+from newton_qd.qd.scoring.rollout import make_policy, make_scoring_function
+from newton_qd.qd.scoring.task import Task, make_task
 
 evolve_module = sys.modules[evolve.__module__]
 
@@ -508,7 +508,7 @@ def test_signals_of_a_process(tmp_path: Path, number: int) -> None:
 def test_a_second_signal_quits_at_once_even_from_compiled_code() -> None:
     code = (
         "import hashlib\n"
-        "from newton_qd.qd.interrupt import graceful_stop\n"
+        "from newton_qd.qd.run.interrupt import graceful_stop\n"
         "with graceful_stop() as stop:\n"
         "    print('ready', flush=True)\n"
         "    hashlib.pbkdf2_hmac('sha256', b'', b'', 2**31 - 1)\n"

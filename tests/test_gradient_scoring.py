@@ -13,8 +13,8 @@ from test_evolve import SMALL, PointEnv, PointState, point_task
 from newton_qd.extractors import get_final_xy_position
 from newton_qd.gradients import GradientOptions
 from newton_qd.qd import make_policy, make_scoring_function
-from newton_qd.qd.gradient_scoring import make_gradient_scoring_function
-from newton_qd.qd.task import Task
+from newton_qd.qd.scoring.gradient_scoring import make_gradient_scoring_function
+from newton_qd.qd.scoring.task import Task
 
 # QDax and what it imports warn about their own use of other packages.
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")

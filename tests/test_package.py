@@ -51,6 +51,9 @@ LEAVES: dict[str, set[str]] = {
     "cli": {"qd", "compat", "viewers"},
     "__main__": {"cli"},
 }
+# The rooms of `qd`: a module may import those of its own room and those before it.
+ROOMS = ("extras", "config", "scoring", "emitters", "algorithms", "run", "__init__")
+MOVED = {"actor_critic", "gradient_options", "ribs", "sharding"}  # old names
 # Where a package that is not of the standard library may be imported.
 EVERYWHERE = {"jax", "numpy", "newton_qd"}
 HOMES = {
@@ -178,6 +181,24 @@ def test_only_one_file_knows_the_inside_of_warp() -> None:
         if private in path.read_text(encoding="utf-8")
     }
     assert files == allowed
+
+
+@pytest.mark.parametrize(
+    "name", [name for name in MODULES if name.startswith("newton_qd.qd")]
+)
+def test_rooms_of_qd_have_an_order(name: str) -> None:
+    def room(module: str) -> str:
+        return [*module.split("."), "__init__"][2]
+
+    if room(name) in MOVED:
+        return
+    allowed = ROOMS[: ROOMS.index(room(name)) + 1]
+    wrong = [
+        f"{name}:{line} imports {target}"
+        for line, target in imports(name)
+        if target.startswith("newton_qd.qd") and room(target) not in allowed
+    ]
+    assert not wrong
 
 
 def test_no_import_cycles() -> None:

@@ -13,8 +13,8 @@ from test_evolve import SMALL, PointEnv, point_task, run
 
 from newton_qd.errors import MissingExtra
 from newton_qd.qd.emitters import GradientsError
-from newton_qd.qd.ribs import from_ribs, make_ribs_evaluation, to_ribs
-from newton_qd.qd.rollout import make_policy, make_scoring_function
+from newton_qd.qd.scoring.ribs import from_ribs, make_ribs_evaluation, to_ribs
+from newton_qd.qd.scoring.rollout import make_policy, make_scoring_function
 
 # QDax and what it imports warn about their own use of other packages.
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")

@@ -16,15 +16,15 @@ import pytest
 from test_algorithms import CRITIC
 
 from newton_qd.qd.config import ConfigError, EvolveConfig
-from newton_qd.qd.evolution import evolve
-from newton_qd.qd.sharding import device_mesh
+from newton_qd.qd.run.evolution import evolve
+from newton_qd.qd.scoring.sharding import device_mesh
 
 ROOT = Path(__file__).resolve().parent.parent
 COMMON = """
 import json, sys
 import jax, jax.numpy as jnp, numpy as np
 from newton_qd.qd import EvolveConfig, make_policy, make_scoring_function, make_task
-from newton_qd.qd.sharding import device_mesh, shard_scoring
+from newton_qd.qd.scoring.sharding import device_mesh, shard_scoring
 
 def problem(name, count, episode_length=10):
     config = EvolveConfig(env_name=name, episode_length=episode_length, hidden=(8,))

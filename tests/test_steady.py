@@ -10,8 +10,8 @@ import pytest
 from test_evolve import SMALL, point_task
 
 from newton_qd.qd.config import EvolveConfig
-from newton_qd.qd.search import Search
-from newton_qd.qd.task import make_task
+from newton_qd.qd.run.search import Search
+from newton_qd.qd.scoring.task import make_task
 
 # QDax and what it imports warn about their own use of other packages.
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 from newton_qd.cli import doctor, envs, evolve
 from newton_qd.cli.arguments import BAD_ARGUMENTS, FAILED, OK, complain
 from newton_qd.errors import FaultError, MissingExtra, UnknownEnvironment
-from newton_qd.qd.checkpoint import CheckpointError
 from newton_qd.qd.config import ConfigError, EvolveConfig
-from newton_qd.qd.interrupt import INTERRUPTED
+from newton_qd.qd.run.checkpoint import CheckpointError
+from newton_qd.qd.run.interrupt import INTERRUPTED
 
 if TYPE_CHECKING:
-    from newton_qd.qd.task import Task
+    from newton_qd.qd.scoring.task import Task
 
 __all__ = ["BAD_ARGUMENTS", "FAILED", "INTERRUPTED", "OK", "main"]
 

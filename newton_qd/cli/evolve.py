@@ -18,11 +18,11 @@ from newton_qd.qd.config import (
     environment_facts,
     read_config,
 )
-from newton_qd.qd.interrupt import INTERRUPTED, graceful_stop
+from newton_qd.qd.run.interrupt import INTERRUPTED, graceful_stop
 
 if TYPE_CHECKING:
-    from newton_qd.qd.evolution import EvolveResult
-    from newton_qd.qd.task import Task
+    from newton_qd.qd.run.evolution import EvolveResult
+    from newton_qd.qd.scoring.task import Task
 
 _DEFAULTS = EvolveConfig()
 
@@ -176,9 +176,9 @@ def run(
     # exception in the middle of an extension module's import could end in a crash.
     with graceful_stop(b"\nstopping\n") as stop:
         from newton_qd.physics.precision import quiet
-        from newton_qd.qd.evolution import evolve
-        from newton_qd.qd.search import SearchError
-        from newton_qd.qd.task import make_task
+        from newton_qd.qd.run.evolution import evolve
+        from newton_qd.qd.run.search import SearchError
+        from newton_qd.qd.scoring.task import make_task
     if stop.requested:
         raise KeyboardInterrupt
     quiet()
@@ -205,7 +205,7 @@ def _settle(arguments: argparse.Namespace) -> tuple[EvolveConfig, Path]:
     Raises:
         ConfigError: They do not name an environment, or a setting is wrong.
     """
-    from newton_qd.qd.folder import CONFIG, RunFolder
+    from newton_qd.qd.run.folder import CONFIG, RunFolder
 
     names = vars(_DEFAULTS)
     given = {

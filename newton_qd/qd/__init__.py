@@ -8,6 +8,8 @@
   algorithms of QDax
 - ``make_gradient_scoring_function``: scores with the gradients of fitness and
   descriptor
+- ``device_mesh``, ``shard_scoring``: evaluation split over several devices
+- ``make_ribs_evaluation``, ``to_ribs``, ``from_ribs``: pyribs on these tasks
 
 Importing this package imports none of its parts: each name is loaded when it is
 first used. QDax and matplotlib (extra ``qd``) are imported by the functions that
@@ -20,16 +22,18 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from newton_qd.qd.annealed_repertoire import AnnealedRepertoire
-    from newton_qd.qd.archive import Archive, ArchiveError, load_archive
-    from newton_qd.qd.checkpoint import CheckpointError
     from newton_qd.qd.config import ConfigError, EvolveConfig
-    from newton_qd.qd.evolution import EvolveResult, evolve
-    from newton_qd.qd.gradient_scoring import make_gradient_scoring_function
-    from newton_qd.qd.plot import plot_archive
-    from newton_qd.qd.rollout import Policy, make_policy, make_scoring_function
-    from newton_qd.qd.search import SearchError
-    from newton_qd.qd.task import Task, make_task
+    from newton_qd.qd.emitters.annealed_repertoire import AnnealedRepertoire
+    from newton_qd.qd.run.archive import Archive, ArchiveError, load_archive
+    from newton_qd.qd.run.checkpoint import CheckpointError
+    from newton_qd.qd.run.evolution import EvolveResult, evolve
+    from newton_qd.qd.run.plot import plot_archive
+    from newton_qd.qd.run.search import SearchError
+    from newton_qd.qd.scoring.gradient_scoring import make_gradient_scoring_function
+    from newton_qd.qd.scoring.ribs import from_ribs, make_ribs_evaluation, to_ribs
+    from newton_qd.qd.scoring.rollout import Policy, make_policy, make_scoring_function
+    from newton_qd.qd.scoring.sharding import device_mesh, shard_scoring
+    from newton_qd.qd.scoring.task import Task, make_task
 
 __all__ = [
     "AnnealedRepertoire",
@@ -42,33 +46,43 @@ __all__ = [
     "Policy",
     "SearchError",
     "Task",
+    "device_mesh",
     "evolve",
+    "from_ribs",
     "load_archive",
     "make_gradient_scoring_function",
     "make_policy",
+    "make_ribs_evaluation",
     "make_scoring_function",
     "make_task",
     "plot_archive",
+    "shard_scoring",
+    "to_ribs",
 ]
 
 _HOME = {
-    "AnnealedRepertoire": "annealed_repertoire",
-    "Archive": "archive",
-    "ArchiveError": "archive",
-    "CheckpointError": "checkpoint",
+    "AnnealedRepertoire": "emitters.annealed_repertoire",
+    "Archive": "run.archive",
+    "ArchiveError": "run.archive",
+    "CheckpointError": "run.checkpoint",
     "ConfigError": "config",
     "EvolveConfig": "config",
-    "EvolveResult": "evolution",
-    "Policy": "rollout",
-    "SearchError": "search",
-    "Task": "task",
-    "evolve": "evolution",
-    "load_archive": "archive",
-    "make_gradient_scoring_function": "gradient_scoring",
-    "make_policy": "rollout",
-    "make_scoring_function": "rollout",
-    "make_task": "task",
-    "plot_archive": "plot",
+    "EvolveResult": "run.evolution",
+    "Policy": "scoring.rollout",
+    "SearchError": "run.search",
+    "Task": "scoring.task",
+    "device_mesh": "scoring.sharding",
+    "evolve": "run.evolution",
+    "from_ribs": "scoring.ribs",
+    "load_archive": "run.archive",
+    "make_gradient_scoring_function": "scoring.gradient_scoring",
+    "make_policy": "scoring.rollout",
+    "make_ribs_evaluation": "scoring.ribs",
+    "make_scoring_function": "scoring.rollout",
+    "make_task": "scoring.task",
+    "plot_archive": "run.plot",
+    "shard_scoring": "scoring.sharding",
+    "to_ribs": "scoring.ribs",
 }
 
 

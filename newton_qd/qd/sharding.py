@@ -1,109 +1,19 @@
-"""Evaluation spread over the devices of a mesh."""
+"""Old place of what ``newton_qd.qd`` has."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
-import jax
-import jax.numpy as jnp
-import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from newton_qd.moved import moved_name
 
-from newton_qd.qd.rollout import ScoringFunction
-
-AXIS = "individuals"
-
-
-def device_mesh(count: int | None = None) -> Mesh:
-    """Returns a mesh of devices, along one axis.
-
-    Args:
-        count: Number of devices; ``None``: all, those of other processes of
-            ``jax.distributed`` included.
-
-    Raises:
-        ValueError: There are not as many devices.
-    """
-    devices = jax.devices()
-    if count is None:
-        count = len(devices)
-    if not 1 <= count <= len(devices):
-        raise ValueError(f"count={count!r}: allowed: 1 to {len(devices)}, the devices")
-    return Mesh(np.array(devices[:count]), (AXIS,))
+_MOVED = {
+    "device_mesh": "newton_qd.qd.device_mesh",
+    "shard_scoring": "newton_qd.qd.shard_scoring",
+    "AXIS": "newton_qd.qd.scoring.sharding.AXIS",
+    "on_mesh": "newton_qd.qd.scoring.sharding.on_mesh",
+}
 
 
-def shard_scoring(score: ScoringFunction, mesh: Mesh) -> ScoringFunction:
-    """Makes a scoring function whose batch is split over devices.
-
-    Each device evaluates an equal part of the individuals; a batch that does not
-    divide is filled up with copies of its last individual, whose results are dropped.
-    Every device then holds all results, which are bitwise the same for every number of
-    devices.
-
-    Args:
-        score: Scoring function of genotypes (N, size) or a pytree of (N, ...), and a
-            key; each leaf of its results has the leading axis N.
-        mesh: Devices, as made by ``device_mesh``.
-
-    Returns:
-        Function with the arguments and results of ``score``, for ``jax.jit``.
-    """
-    split, whole = PartitionSpec(AXIS), PartitionSpec()
-    # Varying axes are not checked: foreign calls do not state theirs.
-    sharded = jax.shard_map(
-        score, mesh=mesh, in_specs=(split, whole), out_specs=split, check_vma=False
-    )
-
-    def scored(genotypes: Any, key: jax.Array) -> Any:
-        count = jax.tree.leaves(genotypes)[0].shape[0]
-        missing = -count % mesh.size
-
-        def fill(leaf: jax.Array) -> jax.Array:
-            last = jnp.broadcast_to(leaf[-1:], (missing, *leaf.shape[1:]))
-            return jnp.concatenate([leaf, last])
-
-        results = sharded(jax.tree.map(fill, genotypes), key)
-        everywhere = NamedSharding(mesh, whole)
-        return jax.tree.map(
-            lambda leaf: jax.lax.with_sharding_constraint(leaf, everywhere)[:count],
-            results,
-        )
-
-    return scored
-
-
-def on_mesh(function: Callable[..., Any], mesh: Mesh) -> Callable[..., Any]:
-    """Compiles a function for a mesh, between functions of one device.
-
-    What follows an evaluation then is one program, whatever the number of devices,
-    and its results are the same to the last bit.
-
-    Args:
-        function: Function of pytrees that every device shall have as a whole, made
-            with ``shard_scoring``; every device has its results as a whole.
-        mesh: Devices.
-
-    Returns:
-        Function of pytrees on any device, with results on the first device of this
-        process.
-    """
-    everywhere = NamedSharding(mesh, PartitionSpec())
-    run = jax.jit(function, out_shardings=everywhere)
-
-    def called(*arguments: Any) -> Any:
-        given = jax.tree.map(lambda leaf: _copied(leaf, everywhere), arguments)
-        results = run(*given)
-        return jax.tree.map(lambda leaf: leaf.addressable_data(0), results)
-
-    return called
-
-
-def _copied(leaf: jax.Array, everywhere: NamedSharding) -> jax.Array:
-    """Gives an array to all devices; those of other processes take NumPy's only."""
-    if jax.process_count() == 1:
-        return jax.device_put(leaf, everywhere)
-    if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
-        numbers = np.asarray(jax.random.key_data(leaf))
-        return jax.random.wrap_key_data(jax.device_put(numbers, everywhere))
-    return jax.device_put(np.asarray(leaf), everywhere)
+def __getattr__(name: str) -> Any:
+    """Finds an old name in its new place."""
+    return moved_name(__name__, name, _MOVED)

@@ -1,6 +1,7 @@
 """Emitters that are fed with exact gradients, as emitters of QDax.
 
-- ``ActorCriticEmitter``: the policies of actors that learn over short horizons
+- ``ActorCriticEmitter``: the policies of actors that learn over short horizons, as
+  ``ActorCritic`` teaches them
 - ``OMGMEGAEmitter``: random steps along the gradients of elites
 - ``CMAMEGAEmitter``: CMA-ES searches for the steps along the gradients of a solution
   point
@@ -10,9 +11,9 @@
 - ``SteeringEmitter``: elites move towards empty cells
 
 ``ActorCriticEmitter`` and ``GradientLineEmitter`` evaluate their own gradients; all
-others read ``extra_scores["gradients"]`` as ``gradients.py`` describes. All of them run
-under ``jax.jit`` and ``jax.lax.scan``, and mix with QDax's emitters in its
-``MultiEmitter``.
+others read ``extra_scores["gradients"]`` as ``scoring/gradient_scores.py`` describes.
+All of them run under ``jax.jit`` and ``jax.lax.scan``, and mix with QDax's emitters in
+its ``MultiEmitter``.
 """
 
 from __future__ import annotations
@@ -24,17 +25,23 @@ from newton_qd.qd.extras import require_extra
 
 if TYPE_CHECKING:
     from newton_qd.qd.emitters.actor_critic import ActorCriticEmitter
+    from newton_qd.qd.emitters.actor_critic_learner import (
+        ActorCritic,
+        ActorCriticSettings,
+    )
     from newton_qd.qd.emitters.cma_maega import CMAMAEGAEmitter
     from newton_qd.qd.emitters.cma_mega import CMAMEGAEmitter
     from newton_qd.qd.emitters.gradient_line import GradientLineEmitter
     from newton_qd.qd.emitters.gradient_variation import GradientVariationEmitter
-    from newton_qd.qd.emitters.gradients import GradientsError
     from newton_qd.qd.emitters.omg_mega import OMGMEGAEmitter
     from newton_qd.qd.emitters.restarts import RestartRule
     from newton_qd.qd.emitters.steering import SteeringEmitter
+    from newton_qd.qd.scoring.gradient_scores import GradientsError
 
 __all__ = [
+    "ActorCritic",
     "ActorCriticEmitter",
+    "ActorCriticSettings",
     "CMAMAEGAEmitter",
     "CMAMEGAEmitter",
     "GradientLineEmitter",
@@ -46,15 +53,17 @@ __all__ = [
 ]
 
 _HOME = {
-    "ActorCriticEmitter": "actor_critic",
-    "CMAMAEGAEmitter": "cma_maega",
-    "CMAMEGAEmitter": "cma_mega",
-    "GradientLineEmitter": "gradient_line",
-    "GradientVariationEmitter": "gradient_variation",
-    "GradientsError": "gradients",
-    "OMGMEGAEmitter": "omg_mega",
-    "RestartRule": "restarts",
-    "SteeringEmitter": "steering",
+    "ActorCritic": "newton_qd.qd.emitters.actor_critic_learner",
+    "ActorCriticEmitter": "newton_qd.qd.emitters.actor_critic",
+    "ActorCriticSettings": "newton_qd.qd.emitters.actor_critic_learner",
+    "CMAMAEGAEmitter": "newton_qd.qd.emitters.cma_maega",
+    "CMAMEGAEmitter": "newton_qd.qd.emitters.cma_mega",
+    "GradientLineEmitter": "newton_qd.qd.emitters.gradient_line",
+    "GradientVariationEmitter": "newton_qd.qd.emitters.gradient_variation",
+    "GradientsError": "newton_qd.qd.scoring.gradient_scores",
+    "OMGMEGAEmitter": "newton_qd.qd.emitters.omg_mega",
+    "RestartRule": "newton_qd.qd.emitters.restarts",
+    "SteeringEmitter": "newton_qd.qd.emitters.steering",
 }
 
 
@@ -63,7 +72,7 @@ def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     require_extra("qdax", "qd")
-    value = getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
+    value = getattr(importlib.import_module(_HOME[name]), name)
     globals()[name] = value
     return value
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from qdax.core.emitters.emitter import Emitter
 
 from newton_qd.envs.state import select
-from newton_qd.qd.actor_critic import ActorCritic, Learner
+from newton_qd.qd.emitters.actor_critic_learner import ActorCritic, Learner
 from newton_qd.qd.emitters.cells import draw_cells
 
 

@@ -7,7 +7,10 @@ from typing import Any
 import jax
 from qdax.core.emitters.emitter import Emitter, EmitterState
 
-from newton_qd.qd.annealed_repertoire import AnnealedRepertoire, check_annealing
+from newton_qd.qd.emitters.annealed_repertoire import (
+    AnnealedRepertoire,
+    check_annealing,
+)
 
 
 class AnnealedState(EmitterState):

@@ -26,7 +26,8 @@ from qdax.core.containers.mapelites_repertoire import get_cells_indices
 from qdax.core.emitters.emitter import Emitter, EmitterState
 
 from newton_qd.qd.emitters.cma_es import CMAES, CMAESState
-from newton_qd.qd.emitters.gradients import (
+from newton_qd.qd.emitters.restarts import RestartRule
+from newton_qd.qd.scoring.gradient_scores import (
     GradientsError,
     ScoringFunction,
     check_genotypes,
@@ -34,7 +35,6 @@ from newton_qd.qd.emitters.gradients import (
     normalize,
     read_scores,
 )
-from newton_qd.qd.emitters.restarts import RestartRule
 
 # Ranks of offspring (pyribs' status); what failed comes last.
 NEW, IMPROVED, WORSE, FAILED = 2, 1, 0, -1
@@ -101,7 +101,8 @@ class ArborescenceEmitter(Emitter, abc.ABC):
 
         Args:
             scoring_function: Scores solution points (E, size) with gradients, as
-                ``gradients.py`` describes. The loop may use a cheaper one without.
+                ``gradient_scores.py`` describes. The loop may use a cheaper one
+                without.
             sigma_g: Initial standard deviation of the coefficients, in units of the
                 genotype.
             batch_size: Individuals that each point emits in one iteration: the point

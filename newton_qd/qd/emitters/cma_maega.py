@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from newton_qd.qd.annealed_repertoire import AnnealedRepertoire
+from newton_qd.qd.emitters.annealed_repertoire import AnnealedRepertoire
 from newton_qd.qd.emitters.arborescence import ArborescenceEmitter
 from newton_qd.qd.emitters.restarts import RestartRule
 

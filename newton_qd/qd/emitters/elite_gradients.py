@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from qdax.core.containers.mapelites_repertoire import get_cells_indices
 from qdax.core.emitters.emitter import Emitter, EmitterState
 
-from newton_qd.qd.emitters.gradients import Scores, ScoringFunction, read_scores
+from newton_qd.qd.scoring.gradient_scores import Scores, ScoringFunction, read_scores
 
 _ROUNDINGS = 16
 

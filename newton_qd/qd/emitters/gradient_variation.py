@@ -10,7 +10,7 @@ import numpy as np
 import optax
 
 from newton_qd.qd.emitters.elite_gradients import EliteGradientEmitter, check_steps
-from newton_qd.qd.emitters.gradients import ScoringFunction, normalize, read_scores
+from newton_qd.qd.scoring.gradient_scores import ScoringFunction, normalize, read_scores
 
 
 class GradientVariationEmitter(EliteGradientEmitter):
@@ -46,8 +46,8 @@ class GradientVariationEmitter(EliteGradientEmitter):
                 made anew for each offspring.
             steps: Gradient steps of each offspring. The first uses the gradients
                 that the parent was evaluated with.
-            scoring_function: Scores with gradients, as ``gradients.py`` describes;
-                needed for a second step.
+            scoring_function: Scores with gradients, as ``gradient_scores.py``
+                describes; needed for a second step.
             directions: (K, 1 + D) coefficients of the normalized gradients, fitness
                 first. None climbs the fitness: (1, 0, ..., 0).
             selector: Selector of QDax; None draws uniformly with replacement.

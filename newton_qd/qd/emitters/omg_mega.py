@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from newton_qd.qd.emitters.elite_gradients import EliteGradientEmitter
-from newton_qd.qd.emitters.gradients import normalize
+from newton_qd.qd.scoring.gradient_scores import normalize
 
 
 class OMGMEGAEmitter(EliteGradientEmitter):

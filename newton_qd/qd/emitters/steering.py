@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from newton_qd.qd.emitters.cells import empty_targets, nearest_cells
 from newton_qd.qd.emitters.elite_gradients import EliteGradientEmitter, check_steps
-from newton_qd.qd.emitters.gradients import ScoringFunction, read_scores
+from newton_qd.qd.scoring.gradient_scores import ScoringFunction, read_scores
 
 # Keeps the system regular where no descriptor has a gradient.
 _TINY = 1e-12
@@ -47,8 +47,8 @@ class SteeringEmitter(EliteGradientEmitter):
             max_step: Longest step, in units of the genotype.
             steps: Steps of each offspring. The first uses the gradients that the
                 parent was evaluated with.
-            scoring_function: Scores with gradients, as ``gradients.py`` describes;
-                needed for a second step.
+            scoring_function: Scores with gradients, as ``gradient_scores.py``
+                describes; needed for a second step.
             damping: Relative damping [-].
 
         Raises:

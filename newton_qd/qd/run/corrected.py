@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from newton_qd.qd.archive import Archive
-from newton_qd.qd.rollout import ScoringFunction
+from newton_qd.qd.run.archive import Archive
+from newton_qd.qd.scoring.rollout import ScoringFunction
 
 
 @dataclasses.dataclass(frozen=True)

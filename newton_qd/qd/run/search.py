@@ -12,17 +12,21 @@ import numpy as np
 from jax.sharding import Mesh
 
 from newton_qd.qd.algorithms import ALGORITHMS
-from newton_qd.qd.archive import Archive
-from newton_qd.qd.cells import cell_centroids
-from newton_qd.qd.checkpoint import Checkpoint, CheckpointError
+from newton_qd.qd.algorithms.parts import Algorithm, Parts, refused_options
 from newton_qd.qd.config import ConfigError, EvolveConfig, settings_text
-from newton_qd.qd.corrected import Corrected, correct
 from newton_qd.qd.extras import require_extra
-from newton_qd.qd.folder import COLUMNS
-from newton_qd.qd.parts import Algorithm, Parts, refused_options
-from newton_qd.qd.rollout import ScoringFunction, make_policy, make_scoring_function
-from newton_qd.qd.sharding import on_mesh, shard_scoring
-from newton_qd.qd.task import Task
+from newton_qd.qd.run.archive import Archive
+from newton_qd.qd.run.cells import cell_centroids
+from newton_qd.qd.run.checkpoint import Checkpoint, CheckpointError
+from newton_qd.qd.run.corrected import Corrected, correct
+from newton_qd.qd.run.folder import COLUMNS
+from newton_qd.qd.scoring.rollout import (
+    ScoringFunction,
+    make_policy,
+    make_scoring_function,
+)
+from newton_qd.qd.scoring.sharding import on_mesh, shard_scoring
+from newton_qd.qd.scoring.task import Task
 
 
 class SearchError(RuntimeError):

@@ -14,19 +14,19 @@ import numpy as np
 from jax.sharding import Mesh
 
 from newton_qd.physics import interrupts
-from newton_qd.qd.archive import Archive
-from newton_qd.qd.checkpoint import Checkpoint
 from newton_qd.qd.config import ConfigError, EvolveConfig, environment_facts
-from newton_qd.qd.corrected import Corrected
 from newton_qd.qd.extras import require_extra
-from newton_qd.qd.folder import COLUMNS, EVENTS, RunFolder
-from newton_qd.qd.interrupt import StopFlag, graceful_stop
-from newton_qd.qd.plot import archive_png
-from newton_qd.qd.progress import Progress
-from newton_qd.qd.search import Search, SearchState
-from newton_qd.qd.sharding import device_mesh
-from newton_qd.qd.task import Task, make_task
-from newton_qd.qd.tensorboard import EventLog
+from newton_qd.qd.run.archive import Archive
+from newton_qd.qd.run.checkpoint import Checkpoint
+from newton_qd.qd.run.corrected import Corrected
+from newton_qd.qd.run.folder import COLUMNS, EVENTS, RunFolder
+from newton_qd.qd.run.interrupt import StopFlag, graceful_stop
+from newton_qd.qd.run.plot import archive_png
+from newton_qd.qd.run.progress import Progress
+from newton_qd.qd.run.search import Search, SearchState
+from newton_qd.qd.run.tensorboard import EventLog
+from newton_qd.qd.scoring.sharding import device_mesh
+from newton_qd.qd.scoring.task import Task, make_task
 
 
 @dataclasses.dataclass(frozen=True)

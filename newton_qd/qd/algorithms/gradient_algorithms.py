@@ -8,18 +8,18 @@ from collections.abc import Mapping
 from typing import Any
 
 from newton_qd.gradients.exact import make_directional_gradient
-from newton_qd.qd.actor_critic_algorithm import ME_ACTOR_CRITIC
-from newton_qd.qd.config import ConfigError, EvolveConfig
-from newton_qd.qd.gradient_options import (
+from newton_qd.qd.algorithms.gradient_options import (
     FlowOptions,
     MixedOptions,
     differentiable,
     flow_options,
 )
-from newton_qd.qd.gradient_scoring import make_gradient_scoring_function
-from newton_qd.qd.parts import Algorithm, Parts, isoline_emitter
-from newton_qd.qd.rollout import Policy, ScoringFunction
-from newton_qd.qd.task import Task
+from newton_qd.qd.algorithms.me_actor_critic import ME_ACTOR_CRITIC
+from newton_qd.qd.algorithms.parts import Algorithm, Parts, isoline_emitter
+from newton_qd.qd.config import ConfigError, EvolveConfig
+from newton_qd.qd.scoring.gradient_scoring import make_gradient_scoring_function
+from newton_qd.qd.scoring.rollout import Policy, ScoringFunction
+from newton_qd.qd.scoring.task import Task
 
 _SMALLEST_POPULATION = 3  # a solution point and two offspring
 

@@ -14,10 +14,16 @@ import jax
 import jax.numpy as jnp
 
 from newton_qd import compat
+from newton_qd.qd.algorithms.gradient_algorithms import GRADIENT_ALGORITHMS
+from newton_qd.qd.algorithms.parts import (
+    Algorithm,
+    Parts,
+    isoline,
+    isoline_emitter,
+    settings,
+)
 from newton_qd.qd.config import ConfigError, EvolveConfig
-from newton_qd.qd.gradient_algorithms import GRADIENT_ALGORITHMS
-from newton_qd.qd.parts import Algorithm, Parts, isoline, isoline_emitter, settings
-from newton_qd.qd.rollout import Policy
+from newton_qd.qd.scoring.rollout import Policy
 
 
 class _OfParameters:

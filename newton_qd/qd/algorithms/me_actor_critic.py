@@ -5,10 +5,14 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from newton_qd.qd.actor_critic import ActorCritic, ActorCriticSettings, measure_of
+from newton_qd.qd.algorithms.gradient_options import differentiable
+from newton_qd.qd.algorithms.parts import Algorithm, Parts, isoline_emitter, settings
 from newton_qd.qd.config import ConfigError, EvolveConfig
-from newton_qd.qd.gradient_options import differentiable
-from newton_qd.qd.parts import Algorithm, Parts, isoline_emitter, settings
+from newton_qd.qd.emitters.actor_critic_learner import (
+    ActorCritic,
+    ActorCriticSettings,
+    measure_of,
+)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

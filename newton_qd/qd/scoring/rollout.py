@@ -13,7 +13,7 @@ from jax.flatten_util import ravel_pytree
 
 from newton_qd.gradients.episode import make_episode
 from newton_qd.qd.extras import require_extra
-from newton_qd.qd.task import Task
+from newton_qd.qd.scoring.task import Task
 
 ScoringFunction = Callable[
     [jax.Array, jax.Array], tuple[jax.Array, jax.Array, dict[str, Any]]

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from newton_qd.qd.checkpoint import npz_bytes
+from newton_qd.qd.run.checkpoint import npz_bytes
 
 ARCHIVE = "archive.npz"
 FORMAT = 1

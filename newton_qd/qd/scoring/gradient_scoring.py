@@ -14,8 +14,8 @@ from newton_qd.gradients.exact import (
     make_episode_gradient,
 )
 from newton_qd.gradients.flow import GradientOptions, tree_largest, tree_norm
-from newton_qd.qd.rollout import Policy, ScoringFunction
-from newton_qd.qd.task import Task
+from newton_qd.qd.scoring.rollout import Policy, ScoringFunction
+from newton_qd.qd.scoring.task import Task
 
 
 def make_gradient_scoring_function(

@@ -18,13 +18,6 @@ from typing import Any
 import numpy as np
 
 from newton_qd.files import temporary_name, write_atomically
-from newton_qd.qd.archive import ARCHIVE, Archive, archive_bytes
-from newton_qd.qd.checkpoint import (
-    Checkpoint,
-    CheckpointError,
-    load_checkpoint,
-    save_checkpoint,
-)
 from newton_qd.qd.config import (
     ConfigError,
     EvolveConfig,
@@ -33,6 +26,13 @@ from newton_qd.qd.config import (
     equal_settings,
     read_config,
     settings_text,
+)
+from newton_qd.qd.run.archive import ARCHIVE, Archive, archive_bytes
+from newton_qd.qd.run.checkpoint import (
+    Checkpoint,
+    CheckpointError,
+    load_checkpoint,
+    save_checkpoint,
 )
 
 CONFIG = "config.json"

@@ -18,8 +18,8 @@ from newton_qd.qd.config import (
     check_integers,
     check_number,
 )
-from newton_qd.qd.rollout import Policy, ScoringFunction
-from newton_qd.qd.task import Task
+from newton_qd.qd.scoring.rollout import Policy, ScoringFunction
+from newton_qd.qd.scoring.task import Task
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from newton_qd.qd.archive import Archive
 from newton_qd.qd.config import EvolveConfig
 from newton_qd.qd.extras import require_extra
+from newton_qd.qd.run.archive import Archive
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from newton_qd.qd.task import Task
+    from newton_qd.qd.scoring.task import Task
 
 _NESTED_DIMENSIONS = 4
 _EMPTY = "0.88"

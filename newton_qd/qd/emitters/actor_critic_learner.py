@@ -1,0 +1,350 @@
+"""Actors that learn over short horizons, by the gradient of the physics."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import itertools
+import math
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from newton_qd.envs.state import select
+from newton_qd.extractors import get_final_xy_position
+from newton_qd.gradients.flow import passed_back
+from newton_qd.qd.scoring.task import Task
+
+Layers: TypeAlias = list[tuple[jax.Array, jax.Array]]
+"""Weights and bias of each layer of a perceptron."""
+
+_SETTLING = 100  # random steps that observations are scaled by
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ActorCriticSettings:
+    """How an actor and its critic learn.
+
+    Attributes:
+        worlds: Worlds of each actor.
+        window: Control steps of an update.
+        rate: Learning rate of the actor [-].
+        critic_rate: Learning rate of the critic [-].
+        clip: Largest norm of the adjoint of the state of a world.
+        noise: Standard deviation of the noise of actions [-].
+        critic: Widths of the critic's hidden layers.
+        discount: Discount of a control step [-].
+        trace: lambda of the targets of the critic [-].
+        epochs: Times that the critic sees a window.
+        batches: Steps of its optimizer in each of them.
+    """
+
+    worlds: int = 16
+    window: int = 8
+    rate: float = 5e-3
+    critic_rate: float = 2e-3
+    clip: float = 100.0
+    noise: float = 0.1
+    critic: tuple[int, ...] = (64, 64)
+    discount: float = 0.97
+    trace: float = 0.95
+    epochs: int = 2
+    batches: int = 4
+
+    def __post_init__(self) -> None:
+        """Checks every value."""
+        object.__setattr__(self, "critic", tuple(self.critic))
+        for name in ("worlds", "window", "epochs", "batches"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {self._of(name)}")
+        if self.batches > self.worlds * self.window:
+            raise ValueError(
+                f"batches must be at most worlds * window = "
+                f"{self.worlds * self.window}, got {self.batches}"
+            )
+        for name in ("rate", "critic_rate", "clip"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ValueError(
+                    f"{name} must be finite and above 0, got {self._of(name)}"
+                )
+        if not 0 <= self.noise < math.inf:
+            raise ValueError(f"noise must be at least 0, got {self.noise!r}")
+        if not 0 <= self.discount < 1:
+            raise ValueError(f"discount must be in [0, 1), got {self.discount!r}")
+        if not 0 <= self.trace <= 1:
+            raise ValueError(f"trace must be in [0, 1], got {self.trace!r}")
+
+    def _of(self, name: str) -> str:
+        return repr(getattr(self, name))
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Learner:
+    """One actor between two updates; of K actors, every leaf has K in front.
+
+    Attributes:
+        weights: (size,) of the policy.
+        aim: (1 + D,) weights of the reward and of each component of the measure.
+        critic: The critic.
+        target: A slower copy of it, which the actor is taught by.
+        moments: States of the optimizers of actor and critic.
+        first: States that the worlds begin in, (W, ...) every leaf.
+        worlds: States of the worlds now, as ``first``.
+        age: (W,) control steps since each began.
+    """
+
+    weights: jax.Array
+    aim: jax.Array
+    critic: Layers
+    target: Layers
+    moments: tuple[Any, Any]
+    first: Any
+    worlds: Any
+    age: jax.Array
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ActorCritic:
+    r"""Short-horizon actor-critic of a return that weighs rewards and measures.
+
+    Xu et al. 2022, "Accelerated policy learning with parallel differentiable
+    simulation", equations 4 to 8: with the aim :math:`w`, the policy climbs the
+    gradient of
+
+    .. math:: \sum_{t<h} \gamma^t w \cdot (r_t, m_t) + \gamma^h V(s_h)
+
+    through the physics, over a window of h control steps that ends with the value V of
+    its last state. The worlds go on from there, and V is fitted to TD(lambda) targets.
+
+    Attributes:
+        env: Environment of one world without auto-reset.
+        policy: Maps weights (size,) and an observation to an action.
+        measure: Maps the states before and after a control step to what it adds to
+            the measures, (D,).
+        episode_length: Control steps of an episode.
+        settings: How to learn.
+    """
+
+    env: Any
+    policy: Callable[[jax.Array, jax.Array], jax.Array]
+    measure: Callable[[Any, Any], jax.Array]
+    episode_length: int
+    settings: ActorCriticSettings
+
+    @property
+    def steps(self) -> int:
+        """Control steps of an update."""
+        return self.settings.worlds * self.settings.window
+
+    @functools.cached_property
+    def _optimizers(self) -> tuple[Any, Any]:
+        rates = self.settings.rate, self.settings.critic_rate
+        actor, critic = (
+            optax.chain(optax.clip_by_global_norm(1.0), optax.adam(rate, b1=0.7))
+            for rate in rates
+        )
+        return actor, critic
+
+    def scale(self, key: jax.Array, first: Any) -> tuple[jax.Array, jax.Array]:
+        """Mean and deviation (no,) of observations under random actions.
+
+        Args:
+            key: Of the actions.
+            first: States that worlds begin in, (W, ...) every leaf.
+        """
+        shape = (_SETTLING, len(first.done), self.env.action_size)
+        actions = jax.random.uniform(key, shape, first.obs.dtype, -1, 1)
+
+        def advance(state: Any, action: jax.Array) -> tuple[Any, jax.Array]:
+            after = jax.vmap(self.env.step)(state, action)
+            state = select((after.done > 0) | ~_sound(after), first, after)
+            return state, state.obs
+
+        obs = jax.lax.scan(advance, first, actions)[1].reshape(-1, first.obs.shape[-1])
+        return obs.mean(axis=0), obs.std(axis=0) + 0.01
+
+    def begin(
+        self, key: jax.Array, weights: jax.Array, aim: jax.Array, first: Any
+    ) -> Learner:
+        """An actor with a critic that knows nothing yet.
+
+        Args:
+            key: Of the weights of the critic.
+            weights: (size,) of the actor.
+            aim: (1 + D,) what it aims at.
+            first: States that its worlds begin in, (W, ...) every leaf.
+        """
+        number = self.settings.worlds
+        critic = _network(key, (first.obs.shape[-1], *self.settings.critic, 1))
+        actor_optimizer, critic_optimizer = self._optimizers
+        return Learner(
+            weights=weights,
+            aim=aim,
+            critic=critic,
+            target=critic,
+            moments=(actor_optimizer.init(weights), critic_optimizer.init(critic)),
+            first=first,
+            worlds=first,
+            # worlds of all ages, so that they do not begin again at once
+            age=jnp.arange(number, dtype=jnp.int32) * self.episode_length // number,
+        )
+
+    def update(
+        self, learner: Learner, scale: tuple[jax.Array, jax.Array], key: jax.Array
+    ) -> tuple[Learner, jax.Array]:
+        """One window: a step of the actor, several of the critic.
+
+        Args:
+            learner: The actor.
+            scale: Mean and deviation of observations.
+            key: Of the noise and of the order in which the critic learns.
+
+        Returns:
+            The actor after it, and whether the gradient was not finite (): then the
+            actor is as it was, and its worlds begin again.
+        """
+        settings = self.settings
+        noise_key, order_key = jax.random.split(key)
+        shape = (settings.worlds, settings.window, self.env.action_size)
+        noise = jax.random.normal(noise_key, shape, learner.weights.dtype)
+
+        def loss(weights: jax.Array) -> tuple[jax.Array, Any]:
+            run = functools.partial(self._window, weights, learner, scale)
+            returns, found = jax.vmap(run)(
+                learner.first, learner.worlds, settings.noise * noise
+            )
+            return -returns.sum(), found
+
+        slope, found = jax.grad(loss, has_aux=True)(learner.weights)
+        last, obs, targets = found
+        failed = ~jnp.all(jnp.isfinite(slope)) | ~jnp.all(jnp.isfinite(targets))
+        change, moments = self._optimizers[0].update(
+            slope / self.steps, learner.moments[0]
+        )
+        critic, critic_moments = self._fit(learner, scale, order_key, obs, targets)
+        target = jax.tree.map(
+            lambda new, old: 0.8 * new + 0.2 * old, critic, learner.target
+        )
+        age = learner.age + settings.window
+        over = (age >= self.episode_length) | ~_sound(last) | failed
+        learned = Learner(
+            weights=learner.weights + change,
+            aim=learner.aim,
+            critic=critic,
+            target=target,
+            moments=(moments, critic_moments),
+            first=learner.first,
+            worlds=select(over, learner.first, last),
+            age=jnp.where(over, 0, age),
+        )
+        kept = dataclasses.replace(learner, worlds=learned.worlds, age=learned.age)
+        return select(failed, kept, learned), failed
+
+    def _value(self, critic: Layers, scale: Any, obs: jax.Array) -> jax.Array:
+        mean, deviation = scale
+        for weights, bias in critic[:-1]:
+            obs = jnp.tanh(((obs - mean) / deviation) @ weights + bias)
+            mean, deviation = 0.0, 1.0
+        weights, bias = critic[-1]
+        # the network's numbers are rewards of a step
+        return (obs @ weights + bias)[0] / (1 - self.settings.discount)
+
+    def _window(
+        self,
+        weights: jax.Array,
+        learner: Learner,
+        scale: tuple[jax.Array, jax.Array],
+        first: Any,
+        state: Any,
+        noise: jax.Array,
+    ) -> tuple[jax.Array, Any]:
+        """One world's window: its return, last state, observations and targets."""
+        settings = self.settings
+
+        def advance(state: Any, noise: jax.Array) -> tuple[Any, Any]:
+            one = jnp.ones((), noise.dtype)
+            before = passed_back(state, one, settings.clip)
+            action = self.policy(weights, before.obs) + noise
+            after = self.env.step(before, jnp.clip(action, -1, 1))
+            gain = jnp.append(after.reward, self.measure(before, after)) @ learner.aim
+            value = self._value(learner.target, scale, after.obs)
+            over = after.done > 0
+            return select(over, first, after), (state.obs, gain, over, value)
+
+        last, (obs, gains, overs, values) = jax.lax.scan(advance, state, noise)
+
+        def back(sums: Any, row: Any) -> tuple[Any, jax.Array]:
+            total, target = sums
+            gain, over, value = row
+            mixed = (1 - settings.trace) * value + settings.trace * target
+            total, target = (
+                gain + settings.discount * jnp.where(over, 0, x) for x in (total, mixed)
+            )
+            return (total, target), target
+
+        rows = (gains, overs, values)
+        ends = (values[-1], values[-1])
+        (total, _), targets = jax.lax.scan(back, ends, rows, reverse=True)
+        return total, jax.lax.stop_gradient((last, obs, targets))
+
+    def _fit(
+        self, learner: Learner, scale: Any, key: jax.Array, obs: Any, targets: Any
+    ) -> tuple[Layers, Any]:
+        """Some steps of the critic towards its targets (worlds, window)."""
+        optimizer = self._optimizers[1]
+        obs, targets = obs.reshape(self.steps, -1), targets.reshape(self.steps)
+        factor = 1 - self.settings.discount
+
+        def error(critic: Layers, rows: jax.Array) -> jax.Array:
+            value = functools.partial(self._value, critic, scale)
+            values = jax.vmap(value)(obs[rows])
+            return jnp.square(factor * (values - targets[rows])).mean()
+
+        def fit(carry: Any, rows: jax.Array) -> tuple[Any, None]:
+            critic, moments = carry
+            change, moments = optimizer.update(jax.grad(error)(critic, rows), moments)
+            return (optax.apply_updates(critic, change), moments), None
+
+        number, batches = self.steps, self.settings.batches
+        keys = jax.random.split(key, self.settings.epochs)
+        order = jax.vmap(lambda k: jax.random.permutation(k, number))(keys)
+        order = order[:, : number // batches * batches].reshape(
+            self.settings.epochs * batches, -1
+        )
+        return jax.lax.scan(fit, (learner.critic, learner.moments[1]), order)[0]
+
+
+def measure_of(task: Task) -> Callable[[Any, Any], jax.Array]:
+    """What a control step adds to the measures of a task, (D,).
+
+    Of a task that is described by the final position, the velocity [m/s]; of others,
+    whose descriptor is a mean over the episode, the state descriptor.
+    """
+    if task.descriptor_extractor is not get_final_xy_position:
+        return lambda before, after: after.info["state_descriptor"]
+
+    def velocity(before: Any, after: Any) -> jax.Array:
+        names = "state_descriptor"
+        return (after.info[names] - before.info[names]) / task.env.dt
+
+    return velocity
+
+
+def _sound(state: Any) -> jax.Array:
+    """Whether a world holds finite numbers, as far as its observation shows."""
+    return jnp.all(jnp.isfinite(state.obs), axis=-1)
+
+
+def _network(key: jax.Array, sizes: tuple[int, ...]) -> Layers:
+    """Weights of a perceptron whose outputs are small."""
+    layers = []
+    for index, (rows, columns) in enumerate(itertools.pairwise(sizes)):
+        scale = (0.01 if index == len(sizes) - 2 else 1.0) / rows**0.5
+        own = jax.random.fold_in(key, index)
+        weights = scale * jax.random.normal(own, (rows, columns), jnp.float32)
+        layers.append((weights, jnp.zeros((columns,), jnp.float32)))
+    return layers

@@ -1,0 +1,182 @@
+"""pyribs on these tasks: evaluation for its schedulers, archives both ways."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from newton_qd.qd.extras import require_extra
+from newton_qd.qd.scoring.rollout import ScoringFunction
+
+Limits = tuple[np.ndarray, np.ndarray]
+
+
+def make_ribs_evaluation(
+    score: ScoringFunction,
+    key: jax.Array,
+    *,
+    limits: Limits,
+    worst: float,
+    jacobian: bool = False,
+) -> Callable[[np.ndarray], tuple[np.ndarray, ...]]:
+    """Makes the function between ``ask`` and ``tell`` of a ``ribs`` scheduler.
+
+    ``scheduler.tell(*evaluate(scheduler.ask()))``, and with ``jacobian``
+    ``scheduler.tell_dqd(*evaluate(scheduler.ask_dqd()))``. One call evaluates the
+    whole batch in one jitted function, compiled once for each size of a batch.
+
+    Args:
+        score: As made by ``make_scoring_function``; with ``jacobian`` its third
+            result holds ``"gradients"`` (N, size, 1 + D): of the fitness, then of
+            each descriptor, not normalized; ``make_gradient_scoring_function``. An
+            individual with anything that is not finite counts as faulty.
+        key: Key for the resets.
+        limits: Lowest and highest descriptor, (D,) each, as in ``Task.limits``.
+        worst: Objective of an individual whose world was faulty; pyribs takes no
+            infinite one. ``-task.reward_offset * episode_length`` adds nothing to
+            the QD score. Its measures are the lowest ones, its gradients 0.
+        jacobian: Whether to return gradients too.
+
+    Returns:
+        Function of solutions (N, size) that returns objectives (N,), measures (N, D)
+        and, with ``jacobian``, gradients (N, 1 + D, size).
+
+    Raises:
+        ValueError: ``worst`` is not finite. The function raises ``GradientsError``
+            where gradients are missing or have another shape.
+    """
+    if not np.isfinite(worst):
+        raise ValueError(f"worst={worst!r}: allowed: a finite number")
+    low = jnp.asarray(limits[0], jnp.float32)
+
+    @jax.jit
+    def run(genotypes: jax.Array) -> tuple[jax.Array, ...]:
+        fitnesses, descriptors, extra = score(genotypes, key)
+        good = jnp.isfinite(fitnesses) & jnp.isfinite(descriptors).all(axis=1)
+        rows: tuple[jax.Array, ...] = ()
+        if jacobian:
+            from newton_qd.qd.scoring.gradient_scores import read_scores
+
+            scores = read_scores(genotypes, fitnesses, descriptors, extra)
+            good, rows = scores.finite, (scores.gradients,)
+        objectives = jnp.where(good, fitnesses, worst)
+        return objectives, jnp.where(good[:, None], descriptors, low), *rows
+
+    def evaluate(solutions: np.ndarray) -> tuple[np.ndarray, ...]:
+        results = run(jnp.asarray(solutions, jnp.float32))
+        # Copies: pyribs normalizes the gradients in place.
+        return tuple(np.array(result) for result in results)
+
+    return evaluate
+
+
+def to_ribs(
+    repertoire: Any, limits: Limits, grid: tuple[int, ...] | None = None
+) -> Any:
+    """Makes a ``ribs`` archive with the elites of a repertoire.
+
+    pyribs puts each elite where its measures belong; where two share a cell, as may
+    happen for measures on the border of cells, the fitter one stays.
+
+    Args:
+        repertoire: ``MapElitesRepertoire`` of QDax, or ``Archive`` of ``evolve``.
+        limits: Lowest and highest descriptor, (D,) each.
+        grid: Cells along each dimension, if the cells are those of a grid.
+
+    Returns:
+        ``GridArchive`` if ``grid`` is given, else ``CVTArchive`` with the centroids
+        of the repertoire.
+
+    Raises:
+        MissingExtra: pyribs is not installed.
+        ValueError: ``grid`` does not have as many cells as the repertoire.
+    """
+    require_extra("ribs", "ribs")
+    from ribs.archives import CVTArchive, GridArchive
+
+    centroids = np.asarray(repertoire.centroids)
+    if grid is not None and np.prod(grid) != len(centroids):
+        raise ValueError(
+            f"grid={grid} has {np.prod(grid)} cells; the repertoire has "
+            f"{len(centroids)}"
+        )
+    ravel = jax.vmap(lambda genotype: ravel_pytree(genotype)[0])
+    solutions = np.asarray(ravel(jax.tree.map(jnp.asarray, repertoire.genotypes)))
+    common: Any = {
+        "solution_dim": solutions.shape[1],
+        "ranges": list(zip(*limits, strict=True)),
+        "dtype": solutions.dtype,
+    }
+    if grid is None:
+        archive = CVTArchive(centroids=centroids, **common)
+    else:
+        archive = GridArchive(dims=grid, **common)
+    objectives = np.asarray(repertoire.fitnesses).reshape(len(centroids))
+    filled = np.isfinite(objectives)
+    if filled.any():
+        measures = np.asarray(repertoire.descriptors)[filled]
+        archive.add(solutions[filled], objectives[filled], measures)
+    return archive
+
+
+def from_ribs(archive: Any) -> Any:
+    """Makes QDax's repertoire from a ``ribs`` archive, cell by cell.
+
+    Args:
+        archive: ``GridArchive`` or ``CVTArchive`` of pyribs.
+
+    Returns:
+        ``MapElitesRepertoire`` with flat genotypes; its cells are in the order of the
+        archive's indices.
+
+    Raises:
+        MissingExtra: QDax or pyribs is not installed.
+        TypeError: The archive is another one, or its solutions are not vectors.
+    """
+    require_extra("qdax", "qd")
+    require_extra("ribs", "ribs")
+    from qdax.core.containers.mapelites_repertoire import MapElitesRepertoire
+
+    centroids = _centroids(archive)
+    data = archive.data(["solution", "objective", "measures", "index"])
+    index = np.asarray(data["index"], np.int64)
+    cells = len(centroids)
+    genotypes = np.zeros((cells, archive.solution_dim), np.float32)
+    fitnesses = np.full((cells, 1), -np.inf, np.float32)
+    descriptors = np.zeros(centroids.shape, np.float32)
+    genotypes[index] = data["solution"]
+    fitnesses[index, 0] = data["objective"]
+    descriptors[index] = data["measures"]
+    return MapElitesRepertoire(
+        genotypes=jnp.asarray(genotypes),
+        fitnesses=jnp.asarray(fitnesses),
+        extra_scores={},
+        keys_extra_scores=(),
+        descriptors=jnp.asarray(descriptors),
+        centroids=jnp.asarray(centroids, jnp.float32),
+    )
+
+
+def _centroids(archive: Any) -> np.ndarray:
+    """(cells, D) centres of the cells, in the order of their indices."""
+    from ribs.archives import CVTArchive, GridArchive
+
+    # Others have grid indices, too, but cells that move.
+    if not isinstance(archive, CVTArchive | GridArchive):
+        raise TypeError(
+            f"archive={type(archive).__name__}: allowed: GridArchive, CVTArchive"
+        )
+    if not isinstance(archive.solution_dim, int | np.integer):
+        raise TypeError(
+            f"archive with solution_dim={archive.solution_dim!r}: allowed: an integer"
+        )
+    if isinstance(archive, CVTArchive):
+        return np.asarray(archive.centroids)
+    index = archive.int_to_grid_index(np.arange(archive.cells))
+    fraction = (index + 0.5) / archive.dims
+    return archive.lower_bounds + fraction * archive.interval_size
