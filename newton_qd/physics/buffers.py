@@ -14,9 +14,9 @@ from newton_qd.physics.system import CONTACT_FRACTION, STANDARD_GRAVITY, System
 from newton_qd.physics.tree import Tree, build_tree, origin_axes
 from newton_qd.physics.warp_internals import field_dtype
 
-# Trials of a substep and solves of a trial. With contacts: a predictor and two
-# correctors of the contacts. Without: two more trials, each at the mean velocity of the
-# one before.
+# Iterations of a substep and solves of an iteration. With contacts: a predictor and two
+# correctors of the contacts. Without: two more iterations, each at the mean velocity of
+# the one before.
 _TOUCHING, _FREE = (1, 3), (3, 1)
 # Scratch arrays by what they hold an entry for.
 _PER_BODY = ("pose", "twist_w", "twist_v", "bias_w", "bias_v", "inertia", "moment")
@@ -36,7 +36,7 @@ def _with_world(table: np.ndarray) -> np.ndarray:
     return np.concatenate([table[:1], table])
 
 
-def _trials_and_passes(system: System) -> tuple[int, int]:
+def _iterations_and_solves(system: System) -> tuple[int, int]:
     return _TOUCHING if len(system.contact_body) else _FREE
 
 
@@ -77,7 +77,7 @@ def build_model(system: System, device: Any, parametric: bool = False) -> Any:
     model.nb, model.nq, model.nv = system.nb, system.nq, system.nv
     model.nu, model.nc = system.nu, len(system.contact_body)
     model.substeps = robot.substeps
-    model.trials, model.passes = _trials_and_passes(system)
+    model.iterations, model.solves = _iterations_and_solves(system)
     model.h = robot.dt / robot.substeps
     model.gravity = robot.gravity
     model.total_mass = system.total_mass
@@ -178,15 +178,16 @@ def _entries(system: System, adjoint: bool) -> dict[str, int]:
     """Entries of each scratch array for one pack of worlds."""
     n, nc = system.robot.substeps, max(len(system.contact_body), 1)
     nf = len(system.feet)
-    trials, passes = _trials_and_passes(system)
+    iterations, solves = _iterations_and_solves(system)
+    turns = n * iterations
     # the state after the last substep has kinematics too
-    steps = n * trials + 1 if adjoint else 1
-    solves = n * trials * passes if adjoint else 1
+    steps = turns + 1 if adjoint else 1
+    solves = turns * solves if adjoint else 1
     return {
         "fault": 1,
         "lost": 1,
         "q": (n + 2) * system.nq,
-        "v": (n * trials + 2) * system.nv,
+        "v": (turns + 2) * system.nv,
         "ctrl": max(system.nu, 1),
         "parameter": 4 + 2 * system.nb + system.nv,
         **dict.fromkeys(_PER_BODY, steps * (system.nb + 1)),

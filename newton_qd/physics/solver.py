@@ -14,7 +14,7 @@ import warp as wp
 from newton.solvers import SolverBase
 
 from newton_qd.assets import find_urdf
-from newton_qd.physics.kernels.conventions import pack, unpack
+from newton_qd.physics.kernels.conventions import read_rows, write_rows
 from newton_qd.physics.launch import Launcher, output_size
 from newton_qd.physics.model import load_system, newton_builder
 from newton_qd.physics.model.description import read_description
@@ -163,10 +163,10 @@ class NewtonQDSolver(SolverBase):
         reports = (self.impulse.reshape((worlds, -1)), self.normal_impulse, self.fault)
         with wp.ScopedDevice(self.model.device):
             sources = [*self._root, q, qd, force]
-            wp.launch(pack, dim=worlds, inputs=sources, outputs=[x])
+            wp.launch(write_rows, dim=worlds, inputs=sources, outputs=[x])
             self._launcher(float(dt)).forward(worlds, x.flatten(), y.flatten())
             results = [q_new, qd_new, *reports]
-            wp.launch(unpack, dim=worlds, inputs=[*self._root, y], outputs=results)
+            wp.launch(read_rows, dim=worlds, inputs=[*self._root, y], outputs=results)
         newton.eval_fk(self.model, q_new.flatten(), qd_new.flatten(), state_out)
 
     def notify_model_changed(self, flags: newton.ModelFlags | int) -> None:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import enum
 
 import jax
 import numpy as np
 
+from newton_qd.physics.kinds import JointKind as JointKind
+from newton_qd.physics.kinds import ObstacleKind as ObstacleKind
 from newton_qd.robots import RobotSpec
 from newton_qd.scenes import Scene
 
@@ -15,22 +16,6 @@ CONTACT_FRACTION = 0.01
 """Share of the robot's weight above which a foot touches the ground [-]."""
 STANDARD_GRAVITY = 9.81
 """Gives a robot without gravity the weight that its feet are measured by [m/s^2]."""
-
-
-class JointKind(enum.IntEnum):
-    """Joint types that the kernels know; the values are read by the kernels."""
-
-    FREE = 0
-    REVOLUTE = 1
-    PRISMATIC = 2
-
-
-class ObstacleKind(enum.IntEnum):
-    """Shapes that a robot may touch; the values are read by the kernels."""
-
-    PLANE = 0
-    CAPSULE = 1
-    BOX = 2
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -31,21 +31,21 @@ from .cpp.memory import constant, load, store
 from .cpp.numbers import uniform
 from .cpp.smooth import gate, penetration
 from .parameters import body_mass, joint_damping
-from .structs import Model, Row, Scratch
+from .structs import Model, Offsets, Scratch
 
 
 @wp.func
-def point_weight(m: Model, sc: Scratch, row: Row, c: int):
+def point_weight(m: Model, sc: Scratch, offsets: Offsets, c: int):
     """3 x 3 weight of a contact: impulse per change of the body's velocity [kg]."""
-    n = load(sc.normal, row.contact + c)
+    n = load(sc.normal, offsets.contact + c)
     split = constant(m.contact_split, c)
-    wt = split * load(sc.weight_t, row.solve_contact + c)
-    wn = split * load(sc.weight_n, row.solve_contact + c)
+    wt = split * load(sc.weight_t, offsets.solve_contact + c)
+    wn = split * load(sc.weight_n, offsets.solve_contact + c)
     return add_diagonal((wn - wt) * outer(n, n), wt)
 
 
 @stage
-def gather(m: Model, sc: Scratch, row: Row, i: int):
+def gather_children(m: Model, sc: Scratch, offsets: Offsets, i: int):
     """Inertia and wrench of body ``i``: its own, its contacts', its children's.
 
     With R = [r]x a contact's weight W adds ww = R^T W R, wv = -(W R)^T, vv = W.
@@ -56,45 +56,45 @@ def gather(m: Model, sc: Scratch, row: Row, i: int):
     n = vec3()
     f = vec3()
     for c in range(load(m.contact_start, i), load(m.contact_start, i + 1)):
-        r = load(sc.point, row.contact + c)
-        weight = point_weight(m, sc, row, c)
+        r = load(sc.point, offsets.contact + c)
+        weight = point_weight(m, sc, offsets, c)
         lever = skew(r)
         turned = weight * lever
-        p = load(sc.push, row.solve_contact + c)
+        p = load(sc.push, offsets.solve_contact + c)
         ww = ww - lever * turned
         wv = wv - transpose(turned)
         vv = vv + weight
         n = n + cross(r, p)
         f = f + p
     for j in range(load(m.child_start, i), load(m.child_start, i + 1)):
-        child = row.solve_body + load(m.child, j)
+        child = offsets.solve_body + load(m.child, j)
         ww = ww + load(sc.passed_ww, child)
         wv = wv + load(sc.passed_wv, child)
         vv = vv + load(sc.passed_vv, child)
         n = n + load(sc.passed_w, child)
         f = f + load(sc.passed_v, child)
-    at = row.solve_body + i
-    body = row.body + i
+    at = offsets.solve_body + i
+    body = offsets.body + i
     store(sc.total_ww, at, ww + load(sc.inertia, body))
     store(sc.total_wv, at, wv + skew(load(sc.moment, body)))
-    store(sc.total_vv, at, add_diagonal(vv, body_mass(m, sc, row, i)))
+    store(sc.total_vv, at, add_diagonal(vv, body_mass(m, sc, offsets, i)))
     store(sc.total_w, at, n - m.h * load(sc.wrench_w, body))
     store(sc.total_v, at, f - m.h * load(sc.wrench_v, body))
 
 
 @stage
-def eliminate_hinge(m: Model, sc: Scratch, row: Row, i: int):
+def eliminate_axis(m: Model, sc: Scratch, offsets: Offsets, i: int):
     """Take the joint's dof out of body ``i``'s equation; pass the rest on."""
-    at = row.solve_body + i
+    at = offsets.solve_body + i
     k = load(m.v_start, i)
     h = m.h
-    qk = load(sc.q, row.q + load(m.q_start, i))
-    vk = load(sc.v, row.v + k)
+    qk = load(sc.q, offsets.q + load(m.q_start, i))
+    vk = load(sc.v, offsets.v + k)
     # angle predicted at the old velocity: limits are linearised about it
     ahead = qk + h * vk
     ks = constant(m.stiffness, k)
     kl = constant(m.limit_stiffness, k)
-    kd = joint_damping(m, sc, row, k)
+    kd = joint_damping(m, sc, offsets, k)
     width = uniform(m.limit_smoothing)
     lower = ahead - constant(m.limit_lower, k)
     upper = constant(m.limit_upper, k) - ahead
@@ -106,10 +106,10 @@ def eliminate_hinge(m: Model, sc: Scratch, row: Row, i: int):
     implicit = h * kd + h * h * (ks + kl * (gate(lower, width) + gate(upper, width)))
     u = load(m.dof_control, k)
     if u >= 0:
-        force = force + constant(m.gear, k) * load(sc.ctrl, row.ctrl + u)
+        force = force + constant(m.gear, k) * load(sc.ctrl, offsets.ctrl + u)
 
-    sw = load(sc.axis_w, row.dof + k)
-    sv = load(sc.axis_v, row.dof + k)
+    sw = load(sc.axis_w, offsets.dof + k)
+    sv = load(sc.axis_v, offsets.dof + k)
     ww = load(sc.total_ww, at)
     wv = load(sc.total_wv, at)
     vv = load(sc.total_vv, at)
@@ -133,17 +133,17 @@ def eliminate_hinge(m: Model, sc: Scratch, row: Row, i: int):
 
 
 @stage
-def rest_world(sc: Scratch, row: Row):
+def rest_world(sc: Scratch, offsets: Offsets):
     """The world does not move."""
-    store(sc.change_w, row.solve_body, vec3())
-    store(sc.change_v, row.solve_body, vec3())
+    store(sc.change_w, offsets.solve_body, vec3())
+    store(sc.change_v, offsets.solve_body, vec3())
 
 
 @stage
-def change_hinge(m: Model, sc: Scratch, row: Row, i: int):
+def change_axis(m: Model, sc: Scratch, offsets: Offsets, i: int):
     """Change of the joint's velocity and of body ``i``'s twist."""
-    at = row.solve_body + i
-    up = row.solve_body + load(m.body_parent, i)
+    at = offsets.solve_body + i
+    up = offsets.solve_body + load(m.body_parent, i)
     k = load(m.v_start, i)
     w = load(sc.change_w, up)
     v = load(sc.change_v, up)
@@ -152,26 +152,26 @@ def change_hinge(m: Model, sc: Scratch, row: Row, i: int):
         - dot(load(sc.lever_w, at), w)
         - dot(load(sc.lever_v, at), v)
     )
-    store(sc.dv, row.solve_dof + k, dv)
-    store(sc.change_w, at, w + dv * load(sc.axis_w, row.dof + k))
-    store(sc.change_v, at, v + dv * load(sc.axis_v, row.dof + k))
+    store(sc.dv, offsets.solve_dof + k, dv)
+    store(sc.change_w, at, w + dv * load(sc.axis_w, offsets.dof + k))
+    store(sc.change_v, at, v + dv * load(sc.axis_v, offsets.dof + k))
 
 
 @stage
-def change_free(m: Model, sc: Scratch, row: Row, i: int):
+def change_free(m: Model, sc: Scratch, offsets: Offsets, i: int):
     """Solve a free root's own equation: 6 x 6, by blocks."""
-    at = row.solve_body + i
+    at = offsets.solve_body + i
     k = load(m.v_start, i)
-    p = translation(load(sc.pose, row.body + i))
+    p = translation(load(sc.pose, offsets.body + i))
     fj = m.h * vector(
-        free_force(m, sc, row, k),
-        free_force(m, sc, row, k + 1),
-        free_force(m, sc, row, k + 2),
+        free_force(m, sc, offsets, k),
+        free_force(m, sc, offsets, k + 1),
+        free_force(m, sc, offsets, k + 2),
     )
     nj = m.h * vector(
-        free_force(m, sc, row, k + 3),
-        free_force(m, sc, row, k + 4),
-        free_force(m, sc, row, k + 5),
+        free_force(m, sc, offsets, k + 3),
+        free_force(m, sc, offsets, k + 4),
+        free_force(m, sc, offsets, k + 5),
     )
     wv = load(sc.total_wv, at)
     n = load(sc.total_w, at) + nj + cross(p, fj)
@@ -185,15 +185,15 @@ def change_free(m: Model, sc: Scratch, row: Row, i: int):
     # the joint's coordinates are the velocity of its origin and the angular velocity
     origin = v + cross(w, p)
     for j in range(3):
-        store(sc.dv, row.solve_dof + k + j, component(origin, j))
-        store(sc.dv, row.solve_dof + k + 3 + j, component(w, j))
+        store(sc.dv, offsets.solve_dof + k + j, component(origin, j))
+        store(sc.dv, offsets.solve_dof + k + 3 + j, component(w, j))
 
 
 @wp.func
-def free_force(m: Model, sc: Scratch, row: Row, k: int):
+def free_force(m: Model, sc: Scratch, offsets: Offsets, k: int):
     """Force on dof ``k`` of a free joint [N or N m]; none unless it is driven."""
     force = real()
     u = load(m.dof_control, k)
     if u >= 0:
-        force = constant(m.gear, k) * load(sc.ctrl, row.ctrl + u)
+        force = constant(m.gear, k) * load(sc.ctrl, offsets.ctrl + u)
     return force

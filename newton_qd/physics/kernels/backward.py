@@ -4,7 +4,7 @@ import warp as wp
 
 from . import scalar
 from .simulate import simulate
-from .structs import Model, Scratch, row_after, row_at
+from .structs import Model, Scratch, offsets_after, offsets_at
 from .world import load_world, pack_at, seed_world
 
 
@@ -32,7 +32,7 @@ def step_backward(
     n = tid // lanes
     lane = tid - n * lanes
     pack = pack_at(n, first, worlds, slot_stride)
-    load_world(m, sc, g, row_at(m, pack.slot, 1, 0, 0), pack, x, x_bar, lane, lanes)
+    load_world(m, sc, g, offsets_at(m, pack.slot, 1, 0, 0), pack, x, x_bar, lane, lanes)
     simulate(m, sc, pack, x, 1, lane, lanes)
-    row = row_after(m, pack.slot, 1)
-    seed_world(m, sc, g, row, pack, y_bar, lane, lanes)
+    offsets = offsets_after(m, pack.slot, 1)
+    seed_world(m, sc, g, offsets, pack, y_bar, lane, lanes)

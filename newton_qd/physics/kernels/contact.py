@@ -27,7 +27,7 @@ from .cpp.smooth import gate, penetration
 from .nearest import touch_obstacle
 from .pair import touch_partner
 from .parameters import contact_stiffness, friction, total_mass
-from .structs import Model, Row, Scratch
+from .structs import Model, Offsets, Scratch
 
 # Hunt-Crossley factor and clipping switch over these fractions of their natural scale.
 DISSIPATION_WIDTH = wp.constant(scalar(0.25))
@@ -37,93 +37,97 @@ WEIGHT_STEPS = wp.constant(2)
 
 
 @stage
-def contact_predictor(m: Model, sc: Scratch, row: Row, c: int):
+def contact_predictor(m: Model, sc: Scratch, offsets: Offsets, c: int):
     """Geometry, and the contact law linearised about the velocity at the start."""
     i = load(m.contact_body, c)
-    x = load(sc.pose, row.body + i)
+    x = load(sc.pose, offsets.body + i)
     partner = load(m.contact_partner, c)
     # one law for both: written twice, a GPU's compiler takes twice as long
     r = vec3()
     normal = vec3()
     gap = real()
     if partner < 0:
-        r, normal, gap = touch_obstacle(m, sc, row, c)
+        r, normal, gap = touch_obstacle(m, sc, offsets, c)
     else:
-        r, normal, gap = touch_partner(m, sc, row, c)
-    vc = load(sc.twist_v, row.body + i) + cross(load(sc.twist_w, row.body + i), r)
+        r, normal, gap = touch_partner(m, sc, offsets, c)
+    vc = load(sc.twist_v, offsets.body + i) + cross(
+        load(sc.twist_w, offsets.body + i), r
+    )
     if partner >= 0:
-        other = row.body + load(m.contact_body, partner)
+        other = offsets.body + load(m.contact_body, partner)
         vc = vc - (load(sc.twist_v, other) + cross(load(sc.twist_w, other), r))
     vn = dot(normal, vc)
     vt = vc - vn * normal
     reach = gap + m.h * vn
     damper = penetration(m.dissipation * vn - scalar(1.0), uniform(DISSIPATION_WIDTH))
-    k = (m.h * contact_stiffness(m, sc, row)) * damper
+    k = (m.h * contact_stiffness(m, sc, offsets)) * damper
     width = uniform(m.contact_smoothing)
     push = k * penetration(reach, width)
     wt = (
-        friction(m, sc, row)
+        friction(m, sc, offsets)
         * push
         / sqrt(m.slip_velocity * m.slip_velocity + dot(vt, vt))
     )
-    store(sc.point, row.contact + c, r)
-    store(sc.arm, row.contact + c, r - transform_point(x, constant(m.com, i)))
-    store(sc.normal, row.contact + c, normal)
-    store(sc.velocity, row.contact + c, vc)
-    store(sc.load, row.contact + c, push)
-    store(sc.weight_n, row.solve_contact + c, m.h * k * gate(reach, width))
-    store(sc.weight_t, row.solve_contact + c, wt)
-    store(sc.push, row.solve_contact + c, push * normal - wt * vt)
+    store(sc.point, offsets.contact + c, r)
+    store(sc.arm, offsets.contact + c, r - transform_point(x, constant(m.com, i)))
+    store(sc.normal, offsets.contact + c, normal)
+    store(sc.velocity, offsets.contact + c, vc)
+    store(sc.load, offsets.contact + c, push)
+    store(sc.weight_n, offsets.solve_contact + c, m.h * k * gate(reach, width))
+    store(sc.weight_t, offsets.solve_contact + c, wt)
+    store(sc.push, offsets.solve_contact + c, push * normal - wt * vt)
 
 
 @stage
-def contact_slip(m: Model, sc: Scratch, row: Row, c: int):
-    """Change of a contact point's velocity by the row's solve; of a pair, relative."""
-    at = row.solve_body + load(m.contact_body, c)
-    r = load(sc.point, row.contact + c)
+def contact_slip(m: Model, sc: Scratch, offsets: Offsets, c: int):
+    """Change of a contact point's velocity by this solve; of a pair, relative."""
+    at = offsets.solve_body + load(m.contact_body, c)
+    r = load(sc.point, offsets.contact + c)
     dv = load(sc.change_v, at) + cross(load(sc.change_w, at), r)
     partner = load(m.contact_partner, c)
     if partner >= 0:
-        other = row.solve_body + load(m.contact_body, partner)
+        other = offsets.solve_body + load(m.contact_body, partner)
         dv = dv - (load(sc.change_v, other) + cross(load(sc.change_w, other), r))
-    store(sc.slip, row.solve_contact + c, dv)
+    store(sc.slip, offsets.solve_contact + c, dv)
 
 
 @stage
-def contact_clip(m: Model, sc: Scratch, row: Row, c: int):
-    """Normal impulse: the one of the predictor, ``row.before``, clipped at zero."""
-    push = load(sc.load, row.contact + c)
-    approach = dot(load(sc.normal, row.contact + c), load(sc.slip, row.before + c))
-    linear = push - load(sc.weight_n, row.before + c) * approach
+def contact_clip(m: Model, sc: Scratch, offsets: Offsets, c: int):
+    """Normal impulse: the one of the predictor, ``offsets.before``, clipped at zero."""
+    push = load(sc.load, offsets.contact + c)
+    approach = dot(
+        load(sc.normal, offsets.contact + c), load(sc.slip, offsets.before + c)
+    )
+    linear = push - load(sc.weight_n, offsets.before + c) * approach
     normal_impulse = penetration(neg(linear), CLIP_WIDTH * push)
-    store(sc.normal_impulse, row.report + c, normal_impulse)
+    store(sc.normal_impulse, offsets.report + c, normal_impulse)
 
 
 @stage
-def contact_corrector(m: Model, sc: Scratch, row: Row, c: int, p: int):
+def contact_corrector(m: Model, sc: Scratch, offsets: Offsets, c: int, p: int):
     """Clipped normal impulse, and friction at the slip to expect, in solve ``p``.
 
     In the last one a pair's friction is given too, from the slip so far: both sides
     get the same impulse, and momentum is conserved whatever hangs on them.
     """
-    n = load(sc.normal, row.contact + c)
-    vc = load(sc.velocity, row.contact + c)
-    v1 = vc + load(sc.slip, row.before + c)
+    n = load(sc.normal, offsets.contact + c)
+    vc = load(sc.velocity, offsets.contact + c)
+    v1 = vc + load(sc.slip, offsets.before + c)
     slip = v1 - dot(n, v1) * n
-    normal_impulse = load(sc.normal_impulse, row.report + c)
-    mass = total_mass(m, sc, row)
-    before = load(sc.weight_t, row.before + c)
+    normal_impulse = load(sc.normal_impulse, offsets.report + c)
+    mass = total_mass(m, sc, offsets)
+    before = load(sc.weight_t, offsets.before + c)
     wt = friction_weight(
         mass,
-        friction(m, sc, row) * normal_impulse,
+        friction(m, sc, offsets) * normal_impulse,
         before,
         dot(slip, slip),
         m.slip_velocity,
     )
-    at = row.solve_contact + c
+    at = offsets.solve_contact + c
     push = normal_impulse * n
     store(sc.weight_n, at, real())
-    if load(m.contact_partner, c) < 0 or p < m.passes - 1:
+    if load(m.contact_partner, c) < 0 or p < m.solves - 1:
         store(sc.weight_t, at, wt)
         store(sc.push, at, push - wt * (vc - dot(n, vc) * n))
     else:
@@ -171,12 +175,16 @@ def friction_weight(
 
 
 @stage
-def contact_impulse(sc: Scratch, row: Row, c: int):
+def contact_impulse(sc: Scratch, offsets: Offsets, c: int):
     """Impulse that the corrector applied, friction at the new velocity included."""
-    n = load(sc.normal, row.contact + c)
-    dv = load(sc.slip, row.solve_contact + c)
-    j = load(sc.push, row.solve_contact + c) - load(
-        sc.weight_t, row.solve_contact + c
+    n = load(sc.normal, offsets.contact + c)
+    dv = load(sc.slip, offsets.solve_contact + c)
+    j = load(sc.push, offsets.solve_contact + c) - load(
+        sc.weight_t, offsets.solve_contact + c
     ) * (dv - dot(n, dv) * n)
-    store(sc.impulse, row.report + c, j)
-    store(sc.angular_impulse, row.report + c, cross(load(sc.arm, row.contact + c), j))
+    store(sc.impulse, offsets.report + c, j)
+    store(
+        sc.angular_impulse,
+        offsets.report + c,
+        cross(load(sc.arm, offsets.contact + c), j),
+    )

@@ -9,7 +9,7 @@ import warp as wp
 
 
 @wp.kernel
-def pack(
+def write_rows(
     # system
     free_root: int,
     com: wp.vec3,
@@ -41,7 +41,7 @@ def pack(
 
 
 @wp.kernel
-def unpack(
+def read_rows(
     # system
     free_root: int,
     com: wp.vec3,

@@ -4,7 +4,7 @@ import warp as wp
 
 from . import scalar
 from .simulate import simulate
-from .structs import Model, Scratch, row_after, row_at
+from .structs import Model, Scratch, offsets_after, offsets_at
 from .world import load_world, pack_at, store_world
 
 wp.set_module_options({"enable_backward": False})
@@ -29,6 +29,6 @@ def step_forward(
     n = tid // lanes
     lane = tid - n * lanes
     pack = pack_at(n, first, worlds, slot_stride)
-    load_world(m, sc, sc, row_at(m, pack.slot, 0, 0, 0), pack, x, x, lane, lanes)
+    load_world(m, sc, sc, offsets_at(m, pack.slot, 0, 0, 0), pack, x, x, lane, lanes)
     simulate(m, sc, pack, x, 0, lane, lanes)
-    store_world(m, sc, row_after(m, pack.slot, 0), pack, y, lane, lanes)
+    store_world(m, sc, offsets_after(m, pack.slot, 0), pack, y, lane, lanes)

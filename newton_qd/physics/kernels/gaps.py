@@ -6,25 +6,25 @@ Inputs: q and v of each world, as in :mod:`.inspect`. Outputs: the gap of each c
 import warp as wp
 
 from . import real, scalar, vec3
-from .cpp.memory import load, scatter
+from .cpp.memory import load, write_output
 from .inspect import load_views
 from .nearest import touch_obstacle
 from .pair import touch_partner
 from .simulate import kinematics
-from .structs import Model, Row, Scratch, row_at
+from .structs import Model, Offsets, Scratch, offsets_at
 from .world import pack_at
 
 
 @wp.func
-def gap_of(m: Model, sc: Scratch, row: Row, c: int):
+def gap_of(m: Model, sc: Scratch, offsets: Offsets, c: int):
     """Gap of contact ``c``; negative where the two are pressed into each other [m]."""
     _point = vec3()
     _normal = vec3()
     gap = real()
     if load(m.contact_partner, c) < 0:
-        _point, _normal, gap = touch_obstacle(m, sc, row, c)
+        _point, _normal, gap = touch_obstacle(m, sc, offsets, c)
     else:
-        _point, _normal, gap = touch_partner(m, sc, row, c)
+        _point, _normal, gap = touch_partner(m, sc, offsets, c)
     return gap
 
 
@@ -41,8 +41,10 @@ def contact_gaps(
 ):
     """Gaps of all contacts."""
     pack = pack_at(wp.tid(), first, worlds, slot_stride)
-    row = row_at(m, pack.slot, 0, 0, 0)
-    load_views(m, sc, sc, row, x, x, pack)
-    kinematics(m, sc, row, 0, 1)
+    offsets = offsets_at(m, pack.slot, 0, 0, 0)
+    load_views(m, sc, sc, offsets, x, x, pack)
+    kinematics(m, sc, offsets, 0, 1)
     for c in range(m.nc):
-        scatter(y, pack.first * m.nc + c, m.nc, pack.count, gap_of(m, sc, row, c))
+        write_output(
+            y, pack.first * m.nc + c, m.nc, pack.count, gap_of(m, sc, offsets, c)
+        )

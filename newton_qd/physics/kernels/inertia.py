@@ -16,34 +16,34 @@ from .cpp.algebra import (
 )
 from .cpp.memory import constant, load, store
 from .parameters import body_inertia, body_mass
-from .structs import Model, Row, Scratch
+from .structs import Model, Offsets, Scratch
 
 
 @stage
-def rigid_inertia(m: Model, sc: Scratch, row: Row, i: int):
+def rigid_inertia(m: Model, sc: Scratch, offsets: Offsets, i: int):
     """Inertia about O and bias wrench of body ``i``.
 
     A rigid inertia is (rotational inertia about O, first mass moment, mass); the bias
     wrench is I a + v x* I v (Featherstone 2008, eq. 5.14 and 6.2).
     """
-    x = load(sc.pose, row.body + i)
+    x = load(sc.pose, offsets.body + i)
     c = transform_point(x, constant(m.com, i))
-    mass = body_mass(m, sc, row, i)
+    mass = body_mass(m, sc, offsets, i)
     hm = mass * c
-    spin = body_inertia(m, sc, row, i)
+    spin = body_inertia(m, sc, offsets, i)
     if load(m.isotropic, i) == 0:
         r = matrix(rotation(x))
-        spin = r * body_inertia(m, sc, row, i) * transpose(r)
+        spin = r * body_inertia(m, sc, offsets, i) * transpose(r)
     io = add_diagonal(spin - outer(hm, c), dot(hm, c))
-    w = load(sc.twist_w, row.body + i)
-    v = load(sc.twist_v, row.body + i)
-    aw = load(sc.bias_w, row.body + i)
-    av = load(sc.bias_v, row.body + i)
+    w = load(sc.twist_w, offsets.body + i)
+    v = load(sc.twist_v, offsets.body + i)
+    aw = load(sc.bias_w, offsets.body + i)
+    av = load(sc.bias_v, offsets.body + i)
     angular = io * w + cross(hm, v)
     linear = mass * v - cross(hm, w)
     n = io * aw + cross(hm, av) + cross(w, angular) + cross(v, linear)
     f = mass * av - cross(hm, aw) + cross(w, linear)
-    store(sc.inertia, row.body + i, io)
-    store(sc.moment, row.body + i, hm)
-    store(sc.wrench_w, row.body + i, n)
-    store(sc.wrench_v, row.body + i, f)
+    store(sc.inertia, offsets.body + i, io)
+    store(sc.moment, offsets.body + i, hm)
+    store(sc.wrench_w, offsets.body + i, n)
+    store(sc.wrench_v, offsets.body + i, f)

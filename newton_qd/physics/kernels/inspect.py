@@ -6,6 +6,8 @@ matrix, row by row, and the bias forces.
 
 import warp as wp
 
+from newton_qd.physics.kinds import JointKind
+
 from . import mat33, real, scalar, sync, vec3
 from .cpp.algebra import (
     add,
@@ -17,12 +19,12 @@ from .cpp.algebra import (
     translation,
     vector,
 )
-from .cpp.memory import constant, gather, load, scatter, store
+from .cpp.memory import constant, load, read_input, store, write_output
 from .cpp.numbers import uniform
 from .inertia import rigid_inertia
 from .readings import BODY_SIZE, body_reading, seed_bodies, store_bodies
 from .simulate import kinematics
-from .structs import Model, Row, Scratch, row_at
+from .structs import Model, Offsets, Scratch, offsets_at
 from .world import Pack, pack_at
 
 
@@ -31,7 +33,7 @@ def load_views(
     m: Model,
     sc: Scratch,
     g: Scratch,
-    row: Row,
+    offsets: Offsets,
     x: wp.array[scalar],
     x_bar: wp.array[scalar],
     pack: Pack,
@@ -40,9 +42,9 @@ def load_views(
     size = m.nq + m.nv
     at = pack.first * size
     for k in range(m.nq):
-        store(sc.q, row.q + k, gather(x, at + k, size, pack.count))
+        store(sc.q, offsets.q + k, read_input(x, at + k, size, pack.count))
     for k in range(m.nv):
-        store(sc.v, row.v + k, gather(x, at + m.nq + k, size, pack.count))
+        store(sc.v, offsets.v + k, read_input(x, at + m.nq + k, size, pack.count))
 
 
 @wp.func_grad(load_views)
@@ -50,7 +52,7 @@ def adj_load_views(
     m: Model,
     sc: Scratch,
     g: Scratch,
-    row: Row,
+    offsets: Offsets,
     x: wp.array[scalar],
     x_bar: wp.array[scalar],
     pack: Pack,
@@ -59,47 +61,51 @@ def adj_load_views(
     size = m.nq + m.nv
     at = pack.first * size
     for k in range(m.nq):
-        scatter(x_bar, at + k, size, pack.count, load(g.q, row.q + k))
-        store(g.q, row.q + k, real())
+        write_output(x_bar, at + k, size, pack.count, load(g.q, offsets.q + k))
+        store(g.q, offsets.q + k, real())
     for k in range(m.nv):
-        scatter(x_bar, at + m.nq + k, size, pack.count, load(g.v, row.v + k))
-        store(g.v, row.v + k, real())
+        write_output(x_bar, at + m.nq + k, size, pack.count, load(g.v, offsets.v + k))
+        store(g.v, offsets.v + k, real())
 
 
 @wp.func
-def read_bodies(m: Model, sc: Scratch, row: Row):
+def read_bodies(m: Model, sc: Scratch, offsets: Offsets):
     """Kinematics of substep 0 with one lane; replayed by the adjoint kernel."""
-    kinematics(m, sc, row, 0, 1)
+    kinematics(m, sc, offsets, 0, 1)
     for i in range(1, m.nb + 1):
-        body_reading(m, sc, row, i)
+        body_reading(m, sc, offsets, i)
 
 
 @wp.func
-def seed_views(m: Model, g: Scratch, row: Row, y_bar: wp.array[scalar], pack: Pack):
+def seed_views(
+    m: Model, g: Scratch, offsets: Offsets, y_bar: wp.array[scalar], pack: Pack
+):
     """Start the reverse pass with the caller's adjoints of the bodies."""
     size = BODY_SIZE * m.nb
     at = pack.first * size
-    seed_bodies(m, g, row, real(), y_bar, at, size, pack.count, 0, 1)
+    seed_bodies(m, g, offsets, real(), y_bar, at, size, pack.count, 0, 1)
 
 
 @wp.func_grad(seed_views)
-def adj_seed_views(m: Model, g: Scratch, row: Row, y_bar: wp.array[scalar], pack: Pack):
+def adj_seed_views(
+    m: Model, g: Scratch, offsets: Offsets, y_bar: wp.array[scalar], pack: Pack
+):
     """Nothing: seeding is not part of the kinematics."""
     sync(0)
 
 
 @wp.func
-def composite(m: Model, sc: Scratch, row: Row, i: int):
+def composite(m: Model, sc: Scratch, offsets: Offsets, i: int):
     """Rigid inertia and bias wrench of body ``i`` and its descendants."""
-    at = row.solve_body + i
-    body = row.body + i
+    at = offsets.solve_body + i
+    body = offsets.body + i
     ww = load(sc.inertia, body)
     wv = skew(load(sc.moment, body))
     vv = add_diagonal(mat33(), constant(m.mass, i))
     n = load(sc.wrench_w, body)
     f = load(sc.wrench_v, body)
     for j in range(load(m.child_start, i), load(m.child_start, i + 1)):
-        child = row.solve_body + load(m.child, j)
+        child = offsets.solve_body + load(m.child, j)
         ww = ww + load(sc.total_ww, child)
         wv = wv + load(sc.total_wv, child)
         vv = vv + load(sc.total_vv, child)
@@ -116,17 +122,17 @@ def composite(m: Model, sc: Scratch, row: Row, i: int):
 def dof_count(m: Model, i: int):
     """Degrees of freedom of joint ``i``."""
     count = int(1)
-    if load(m.joint_kind, i) == 0:
+    if load(m.joint_kind, i) == JointKind.FREE:
         count = 6
     return count
 
 
 @wp.func
-def dof_axis(m: Model, sc: Scratch, row: Row, i: int, a: int):
+def dof_axis(m: Model, sc: Scratch, offsets: Offsets, i: int, a: int):
     """Motion (angular, linear) about O of unit velocity of joint ``i``'s dof ``a``."""
     w = vec3()
     v = vec3()
-    if load(m.joint_kind, i) == 0:
+    if load(m.joint_kind, i) == JointKind.FREE:
         unit = vector(
             uniform(scalar(a % 3 == 0)),
             uniform(scalar(a % 3 == 1)),
@@ -136,57 +142,59 @@ def dof_axis(m: Model, sc: Scratch, row: Row, i: int, a: int):
             v = unit
         else:
             w = unit
-            v = cross(translation(load(sc.pose, row.body + i)), unit)
+            v = cross(translation(load(sc.pose, offsets.body + i)), unit)
     else:
-        w = load(sc.axis_w, row.dof + load(m.v_start, i))
-        v = load(sc.axis_v, row.dof + load(m.v_start, i))
+        w = load(sc.axis_w, offsets.dof + load(m.v_start, i))
+        v = load(sc.axis_v, offsets.dof + load(m.v_start, i))
     return w, v
 
 
 @wp.func
 def store_body(
-    m: Model, sc: Scratch, row: Row, y: wp.array[scalar], pack: Pack, i: int
+    m: Model, sc: Scratch, offsets: Offsets, y: wp.array[scalar], pack: Pack, i: int
 ):
     """Rows of joint ``i``: M_kj = S_j . I_c S_k (Featherstone 2008, table 6.2)."""
     size = m.nv * (m.nv + 1)
     out = pack.first * size
-    at = row.solve_body + i
+    at = offsets.solve_body + i
     ww = load(sc.total_ww, at)
     wv = load(sc.total_wv, at)
     vv = load(sc.total_vv, at)
     for a in range(dof_count(m, i)):
         k = load(m.v_start, i) + a
-        sw, sv = dof_axis(m, sc, row, i, a)
+        sw, sv = dof_axis(m, sc, offsets, i, a)
         bias = dot(sw, load(sc.total_w, at)) + dot(sv, load(sc.total_v, at))
-        scatter(y, out + m.nv * m.nv + k, size, pack.count, bias)
+        write_output(y, out + m.nv * m.nv + k, size, pack.count, bias)
         angular = ww * sw + wv * sv
         linear = sw * wv + vv * sv
         up = int(i)
         while up > 0:
             for b in range(dof_count(m, up)):
-                tw, tv = dof_axis(m, sc, row, up, b)
+                tw, tv = dof_axis(m, sc, offsets, up, b)
                 j = load(m.v_start, up) + b
                 value = dot(tw, angular) + dot(tv, linear)
                 if j == k:
                     value = value + constant(m.armature, k)
-                scatter(y, out + k * m.nv + j, size, pack.count, value)
-                scatter(y, out + j * m.nv + k, size, pack.count, value)
+                write_output(y, out + k * m.nv + j, size, pack.count, value)
+                write_output(y, out + j * m.nv + k, size, pack.count, value)
             up = load(m.body_parent, up)
 
 
 @wp.func
-def store_dynamics(m: Model, sc: Scratch, row: Row, y: wp.array[scalar], pack: Pack):
+def store_dynamics(
+    m: Model, sc: Scratch, offsets: Offsets, y: wp.array[scalar], pack: Pack
+):
     """Write the mass matrix and the bias forces of a pack."""
     for i in range(1, m.nb + 1):
-        rigid_inertia(m, sc, row, i)
+        rigid_inertia(m, sc, offsets, i)
     # children come after their parents
     for n in range(m.nb):
-        composite(m, sc, row, m.nb - n)
+        composite(m, sc, offsets, m.nb - n)
     size = m.nv * (m.nv + 1)
     for k in range(m.nv * m.nv):
-        scatter(y, pack.first * size + k, size, pack.count, real())
+        write_output(y, pack.first * size + k, size, pack.count, real())
     for i in range(1, m.nb + 1):
-        store_body(m, sc, row, y, pack, i)
+        store_body(m, sc, offsets, y, pack, i)
 
 
 @wp.kernel(enable_backward=False)
@@ -202,10 +210,10 @@ def dynamics_forward(
 ):
     """Mass matrix and bias forces."""
     pack = pack_at(wp.tid(), first, worlds, slot_stride)
-    row = row_at(m, pack.slot, 0, 0, 0)
-    load_views(m, sc, sc, row, x, x, pack)
-    kinematics(m, sc, row, 0, 1)
-    store_dynamics(m, sc, row, y, pack)
+    offsets = offsets_at(m, pack.slot, 0, 0, 0)
+    load_views(m, sc, sc, offsets, x, x, pack)
+    kinematics(m, sc, offsets, 0, 1)
+    store_dynamics(m, sc, offsets, y, pack)
 
 
 @wp.kernel(enable_backward=False)
@@ -221,11 +229,11 @@ def kinematics_forward(
 ):
     """Where the bodies are and how they move."""
     pack = pack_at(wp.tid(), first, worlds, slot_stride)
-    row = row_at(m, pack.slot, 0, 0, 0)
-    load_views(m, sc, sc, row, x, x, pack)
-    read_bodies(m, sc, row)
+    offsets = offsets_at(m, pack.slot, 0, 0, 0)
+    load_views(m, sc, sc, offsets, x, x, pack)
+    read_bodies(m, sc, offsets)
     size = BODY_SIZE * m.nb
-    store_bodies(m, sc, row, y, pack.first * size, size, pack.count, 0, 1)
+    store_bodies(m, sc, offsets, y, pack.first * size, size, pack.count, 0, 1)
 
 
 @wp.kernel
@@ -243,7 +251,7 @@ def kinematics_backward(
 ):
     """Adjoint of the kinematics; launched with ``adjoint=True``."""
     pack = pack_at(wp.tid(), first, worlds, slot_stride)
-    row = row_at(m, pack.slot, 1, 0, 0)
-    load_views(m, sc, g, row, x, x_bar, pack)
-    read_bodies(m, sc, row)
-    seed_views(m, g, row, y_bar, pack)
+    offsets = offsets_at(m, pack.slot, 1, 0, 0)
+    load_views(m, sc, g, offsets, x, x_bar, pack)
+    read_bodies(m, sc, offsets)
+    seed_views(m, g, offsets, y_bar, pack)

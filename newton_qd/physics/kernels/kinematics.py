@@ -8,6 +8,8 @@ Gravity enters as an upward acceleration of the world.
 
 import warp as wp
 
+from newton_qd.physics.kinds import JointKind
+
 from . import real, scalar, stage, vec3
 from .cpp.algebra import (
     add,
@@ -25,72 +27,74 @@ from .cpp.memory import constant, load, store
 from .cpp.numbers import uniform
 from .cpp.smooth import turn_about
 from .parameters import gravity
-from .structs import Model, Row, Scratch
+from .structs import Model, Offsets, Scratch
 
 
 @stage
-def world_frame(m: Model, sc: Scratch, row: Row):
+def world_frame(m: Model, sc: Scratch, offsets: Offsets):
     """Pose of the world frame seen from O."""
     # a robot with fewer coordinates reads its last one again, times zero
-    last = row.q + m.nq - 1
-    first = load(sc.q, row.q) * constant(m.origin_axis, 0)
-    second = load(sc.q, wp.min(row.q + 1, last)) * constant(m.origin_axis, 1)
-    third = load(sc.q, wp.min(row.q + 2, last)) * constant(m.origin_axis, 2)
+    last = offsets.q + m.nq - 1
+    first = load(sc.q, offsets.q) * constant(m.origin_axis, 0)
+    second = load(sc.q, wp.min(offsets.q + 1, last)) * constant(m.origin_axis, 1)
+    third = load(sc.q, wp.min(offsets.q + 2, last)) * constant(m.origin_axis, 2)
     p = neg(first + second + third)
     zero = vec3()
     store(
         sc.pose,
-        row.body,
+        offsets.body,
         rigid(p, quaternion(real(), real(), real(), uniform(scalar(1.0)))),
     )
-    store(sc.twist_w, row.body, zero)
-    store(sc.twist_v, row.body, zero)
-    store(sc.bias_w, row.body, zero)
-    store(sc.bias_v, row.body, vector(real(), real(), gravity(m, sc, row)))
+    store(sc.twist_w, offsets.body, zero)
+    store(sc.twist_v, offsets.body, zero)
+    store(sc.bias_w, offsets.body, zero)
+    store(sc.bias_v, offsets.body, vector(real(), real(), gravity(m, sc, offsets)))
 
 
 @stage
-def free_joint(m: Model, sc: Scratch, row: Row, i: int):
+def free_joint(m: Model, sc: Scratch, offsets: Offsets, i: int):
     """Six dofs: velocity of the body origin, then angular velocity, world axes."""
     a = load(m.q_start, i)
     k = load(m.v_start, i)
     p = vector(
-        load(sc.q, row.q + a), load(sc.q, row.q + a + 1), load(sc.q, row.q + a + 2)
+        load(sc.q, offsets.q + a),
+        load(sc.q, offsets.q + a + 1),
+        load(sc.q, offsets.q + a + 2),
     )
     r = quaternion(
-        load(sc.q, row.q + a + 3),
-        load(sc.q, row.q + a + 4),
-        load(sc.q, row.q + a + 5),
-        load(sc.q, row.q + a + 6),
+        load(sc.q, offsets.q + a + 3),
+        load(sc.q, offsets.q + a + 4),
+        load(sc.q, offsets.q + a + 5),
+        load(sc.q, offsets.q + a + 6),
     )
-    x = load(sc.pose, row.body + load(m.body_parent, i)) * rigid(p, r)
-    store(sc.pose, row.body + i, x)
+    x = load(sc.pose, offsets.body + load(m.body_parent, i)) * rigid(p, r)
+    store(sc.pose, offsets.body + i, x)
     at = translation(x)
-    at_v = row.v_body + k
+    at_v = offsets.v_body + k
     vl = vector(load(sc.v, at_v), load(sc.v, at_v + 1), load(sc.v, at_v + 2))
     om = vector(load(sc.v, at_v + 3), load(sc.v, at_v + 4), load(sc.v, at_v + 5))
-    store(sc.twist_w, row.body + i, om)
-    store(sc.twist_v, row.body + i, vl + cross(at, om))
-    store(sc.bias_w, row.body + i, vec3())
+    store(sc.twist_w, offsets.body + i, om)
+    store(sc.twist_v, offsets.body + i, vl + cross(at, om))
+    store(sc.bias_w, offsets.body + i, vec3())
     # d/dt (at x om) at constant coordinates, plus the world's acceleration
-    store(sc.bias_v, row.body + i, load(sc.bias_v, row.body) + cross(vl, om))
+    store(sc.bias_v, offsets.body + i, load(sc.bias_v, offsets.body) + cross(vl, om))
 
 
 @stage
-def hinge_joint(m: Model, sc: Scratch, row: Row, i: int):
+def axis_joint(m: Model, sc: Scratch, offsets: Offsets, i: int):
     """One revolute or prismatic dof about a fixed axis of the joint frame."""
     p = load(m.body_parent, i)
     k = load(m.v_start, i)
-    qk = load(sc.q, row.q + load(m.q_start, i))
-    vk = load(sc.v, row.v_body + k)
-    frame = load(sc.pose, row.body + p) * constant(m.parent_frame, i)
+    qk = load(sc.q, offsets.q + load(m.q_start, i))
+    vk = load(sc.v, offsets.v_body + k)
+    frame = load(sc.pose, offsets.body + p) * constant(m.parent_frame, i)
     axis = constant(m.joint_axis, i)
     a = rotate(rotation(frame), axis)
     angle = qk
     shift = real()
     sw = a
     sv = cross(translation(frame), a)
-    if load(m.joint_kind, i) == 2:
+    if load(m.joint_kind, i) == JointKind.PRISMATIC:
         angle = real()
         shift = qk
         sw = vec3()
@@ -103,16 +107,20 @@ def hinge_joint(m: Model, sc: Scratch, row: Row, i: int):
     )
     if load(m.child_moved, i) == 1:
         x = x * constant(m.child_frame_inverse, i)
-    store(sc.pose, row.body + i, x)
-    store(sc.axis_w, row.dof + k, sw)
-    store(sc.axis_v, row.dof + k, sv)
-    vw = load(sc.twist_w, row.body + p) + vk * sw
-    vv = load(sc.twist_v, row.body + p) + vk * sv
-    store(sc.twist_w, row.body + i, vw)
-    store(sc.twist_v, row.body + i, vv)
-    store(sc.bias_w, row.body + i, load(sc.bias_w, row.body + p) + vk * cross(vw, sw))
+    store(sc.pose, offsets.body + i, x)
+    store(sc.axis_w, offsets.dof + k, sw)
+    store(sc.axis_v, offsets.dof + k, sv)
+    vw = load(sc.twist_w, offsets.body + p) + vk * sw
+    vv = load(sc.twist_v, offsets.body + p) + vk * sv
+    store(sc.twist_w, offsets.body + i, vw)
+    store(sc.twist_v, offsets.body + i, vv)
+    store(
+        sc.bias_w,
+        offsets.body + i,
+        load(sc.bias_w, offsets.body + p) + vk * cross(vw, sw),
+    )
     store(
         sc.bias_v,
-        row.body + i,
-        load(sc.bias_v, row.body + p) + vk * (cross(vw, sv) + cross(vv, sw)),
+        offsets.body + i,
+        load(sc.bias_v, offsets.body + p) + vk * (cross(vw, sv) + cross(vv, sw)),
     )

@@ -10,6 +10,8 @@ few degrees, or cross near an end. The obstacle is a plane, a capsule or a box.
 
 import warp as wp
 
+from newton_qd.physics.kinds import ObstacleKind
+
 from . import boxes, real, scalar, vec3
 from .box import box_distance, box_normal, box_share
 from .cpp.algebra import (
@@ -30,7 +32,7 @@ from .cpp.algebra import (
 from .cpp.memory import constant, load
 from .cpp.numbers import uniform
 from .cpp.smooth import bounded, finite_length
-from .structs import Model, Row, Scratch
+from .structs import Model, Offsets, Scratch
 
 BOXES = wp.constant(boxes)
 # A share of a segment is rounded off over this distance from its ends, -1 and 1.
@@ -85,7 +87,7 @@ def nearest_share(m: Model, c: int, o: int, at: vec3, along: vec3):
     size = constant(m.obstacle_size, o)
     radius = constant(m.contact_radius, c)
     share = real()
-    if load(m.obstacle_kind, o) == 1:
+    if load(m.obstacle_kind, o) == ObstacleKind.CAPSULE:
         share = segment_share(
             m,
             radius + component(size, 0),
@@ -96,7 +98,7 @@ def nearest_share(m: Model, c: int, o: int, at: vec3, along: vec3):
             component(size, 1),
         )
     if BOXES:
-        if load(m.obstacle_kind, o) == 2:
+        if load(m.obstacle_kind, o) == ObstacleKind.BOX:
             free = box_share(m, size, m.contact_smoothing * radius, at, along)
             share = bounded(free, uniform(scalar(1.0)), uniform(SHARE_ROUNDING))
     return share
@@ -114,11 +116,11 @@ def from_axis(m: Model, o: int, at: vec3):
 def obstacle_normal(m: Model, o: int, at: vec3):
     """Outward normal at the obstacle point nearest to ``at``."""
     n = vector(real(), real(), uniform(scalar(1.0)))
-    if load(m.obstacle_kind, o) == 1:
+    if load(m.obstacle_kind, o) == ObstacleKind.CAPSULE:
         away = from_axis(m, o, at)
         n = (scalar(1.0) / finite_length(away)) * away
     if BOXES:
-        if load(m.obstacle_kind, o) == 2:
+        if load(m.obstacle_kind, o) == ObstacleKind.BOX:
             n = box_normal(m, constant(m.obstacle_size, o), at)
     return n
 
@@ -127,27 +129,27 @@ def obstacle_normal(m: Model, o: int, at: vec3):
 def obstacle_distance(m: Model, o: int, at: vec3):
     """Signed distance of ``at`` from the obstacle's surface [m]."""
     d = component(at, 2)
-    if load(m.obstacle_kind, o) == 1:
+    if load(m.obstacle_kind, o) == ObstacleKind.CAPSULE:
         radius = component(constant(m.obstacle_size, o), 0)
         d = finite_length(from_axis(m, o, at)) - radius
     if BOXES:
-        if load(m.obstacle_kind, o) == 2:
+        if load(m.obstacle_kind, o) == ObstacleKind.BOX:
             d = box_distance(m, constant(m.obstacle_size, o), at)
     return d
 
 
 @wp.func
-def touch_obstacle(m: Model, sc: Scratch, row: Row, c: int):
+def touch_obstacle(m: Model, sc: Scratch, offsets: Offsets, c: int):
     """Contact point and outward normal in world axes, and gap, at an obstacle."""
     o = load(m.contact_obstacle, c)
-    x = load(sc.pose, row.body + load(m.contact_body, c))
+    x = load(sc.pose, offsets.body + load(m.contact_body, c))
     center = transform_point(x, constant(m.contact_position, c))
     # the world's axes are never turned: only the origin is elsewhere
     frame = constant(m.obstacle_frame, o)
     turn = rotation(frame)
-    world = translation(load(sc.pose, row.body))
+    world = translation(load(sc.pose, offsets.body))
     at = rotate_back(turn, center - world - translation(frame))
-    if load(m.obstacle_kind, o) != 0:
+    if load(m.obstacle_kind, o) != ObstacleKind.PLANE:
         half = rotate(rotation(x), constant(m.contact_segment, c))
         along = rotate_back(turn, half)
         share = nearest_share(m, c, o, at, along)

@@ -13,16 +13,16 @@ from .cpp.memory import constant, load
 from .cpp.numbers import uniform
 from .cpp.smooth import bounded, finite_length
 from .nearest import segment_share
-from .structs import Model, Row, Scratch
+from .structs import Model, Offsets, Scratch
 
 
 @wp.func
-def touch_partner(m: Model, sc: Scratch, row: Row, c: int):
+def touch_partner(m: Model, sc: Scratch, offsets: Offsets, c: int):
     """Contact point and normal towards row ``c`` in world axes, and gap, of a pair."""
     a = load(m.contact_lead, c)
     b = load(m.contact_partner, a)
-    pose_a = load(sc.pose, row.body + load(m.contact_body, a))
-    pose_b = load(sc.pose, row.body + load(m.contact_body, b))
+    pose_a = load(sc.pose, offsets.body + load(m.contact_body, a))
+    pose_b = load(sc.pose, offsets.body + load(m.contact_body, b))
     center = transform_point(pose_a, constant(m.contact_position, a))
     along = rotate(rotation(pose_a), constant(m.contact_segment, a))
     other = rotate(rotation(pose_b), constant(m.contact_segment, b))

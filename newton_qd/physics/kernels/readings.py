@@ -21,34 +21,34 @@ from .cpp.algebra import (
     translation,
     vector,
 )
-from .cpp.memory import constant, gather, load, scatter, store
+from .cpp.memory import constant, load, read_input, store, write_output
 from .cpp.numbers import above, choose, uniform
 from .cpp.smooth import logistic
-from .structs import Model, Row, Scratch, row_at
+from .structs import Model, Offsets, Scratch, offsets_at
 
 BODY_SIZE = wp.constant(16)
 
 
 @stage
-def body_reading(m: Model, sc: Scratch, row: Row, i: int):
+def body_reading(m: Model, sc: Scratch, offsets: Offsets, i: int):
     """Position of body ``i``, and position and velocity of its centre of mass."""
-    x = load(sc.pose, row.body + i)
+    x = load(sc.pose, offsets.body + i)
     # the kernels work about O
-    world = translation(load(sc.pose, row.body))
+    world = translation(load(sc.pose, offsets.body))
     com = transform_point(x, constant(m.com, i))
-    velocity = load(sc.twist_v, row.body + i) + cross(
-        load(sc.twist_w, row.body + i), com
+    velocity = load(sc.twist_v, offsets.body + i) + cross(
+        load(sc.twist_w, offsets.body + i), com
     )
-    store(sc.position, row.reading + i, translation(x) - world)
-    store(sc.com, row.reading + i, com - world)
-    store(sc.com_velocity, row.reading + i, velocity)
+    store(sc.position, offsets.reading + i, translation(x) - world)
+    store(sc.com, offsets.reading + i, com - world)
+    store(sc.com_velocity, offsets.reading + i, velocity)
 
 
 @wp.func
 def store_bodies(
     m: Model,
     sc: Scratch,
-    row: Row,
+    offsets: Offsets,
     y: wp.array[scalar],
     at: int,
     size: int,
@@ -59,26 +59,26 @@ def store_bodies(
     """Write the bodies of a pack to entries from ``at`` on of rows of ``size``."""
     n = m.nb
     for i in range(lane, n, lanes):
-        position = load(sc.position, row.reading + i + 1)
-        pose = load(sc.pose, row.body + i + 1)
-        com = load(sc.com, row.reading + i + 1)
-        linear = load(sc.com_velocity, row.reading + i + 1)
-        angular = load(sc.twist_w, row.body + i + 1)
+        position = load(sc.position, offsets.reading + i + 1)
+        pose = load(sc.pose, offsets.body + i + 1)
+        com = load(sc.com, offsets.reading + i + 1)
+        linear = load(sc.com_velocity, offsets.reading + i + 1)
+        angular = load(sc.twist_w, offsets.body + i + 1)
         for j in range(4):
-            scatter(y, at + 3 * n + 4 * i + j, size, count, component(pose, 3 + j))
+            write_output(y, at + 3 * n + 4 * i + j, size, count, component(pose, 3 + j))
         for j in range(3):
             k = at + 3 * i + j
-            scatter(y, k, size, count, component(position, j))
-            scatter(y, k + 7 * n, size, count, component(com, j))
-            scatter(y, k + 10 * n, size, count, component(linear, j))
-            scatter(y, k + 13 * n, size, count, component(angular, j))
+            write_output(y, k, size, count, component(position, j))
+            write_output(y, k + 7 * n, size, count, component(com, j))
+            write_output(y, k + 10 * n, size, count, component(linear, j))
+            write_output(y, k + 13 * n, size, count, component(angular, j))
 
 
 @wp.func
 def seed_bodies(
     m: Model,
     g: Scratch,
-    row: Row,
+    offsets: Offsets,
     fault: real,
     y_bar: wp.array[scalar],
     at: int,
@@ -102,17 +102,17 @@ def seed_bodies(
         com = seed_vector(fault, y_bar, k + 7 * n, size, count)
         linear = seed_vector(fault, y_bar, k + 10 * n, size, count)
         angular = seed_vector(fault, y_bar, k + 13 * n, size, count)
-        store(g.position, row.reading + i + 1, position)
-        store(g.pose, row.body + i + 1, rigid(vec3(), turn))
-        store(g.com, row.reading + i + 1, com)
-        store(g.com_velocity, row.reading + i + 1, linear)
-        store(g.twist_w, row.body + i + 1, angular)
+        store(g.position, offsets.reading + i + 1, position)
+        store(g.pose, offsets.body + i + 1, rigid(vec3(), turn))
+        store(g.com, offsets.reading + i + 1, com)
+        store(g.com_velocity, offsets.reading + i + 1, linear)
+        store(g.twist_w, offsets.body + i + 1, angular)
 
 
 @wp.func
 def seed(fault: real, y_bar: wp.array[scalar], at: int, size: int, count: int) -> real:
     """Entry ``at`` of each row; 0 for a faulty world."""
-    return choose(fault, real(), gather(y_bar, at, size, count))
+    return choose(fault, real(), read_input(y_bar, at, size, count))
 
 
 @wp.func
@@ -128,38 +128,38 @@ def seed_vector(
 
 
 @stage
-def torso_position(m: Model, sc: Scratch, slot: int, row: Row):
+def torso_position(m: Model, sc: Scratch, slot: int, offsets: Offsets):
     """Where the torso is on the ground: in the coordinates, if it moves freely."""
     if m.torso_q >= 0:
-        store(sc.torso_xy, 2 * slot, load(sc.q, row.q + m.torso_q))
-        store(sc.torso_xy, 2 * slot + 1, load(sc.q, row.q + m.torso_q + 1))
+        store(sc.torso_xy, 2 * slot, load(sc.q, offsets.q + m.torso_q))
+        store(sc.torso_xy, 2 * slot + 1, load(sc.q, offsets.q + m.torso_q + 1))
     else:
-        position = load(sc.position, row.reading + m.torso)
+        position = load(sc.position, offsets.reading + m.torso)
         store(sc.torso_xy, 2 * slot, component(position, 0))
         store(sc.torso_xy, 2 * slot + 1, component(position, 1))
 
 
 @stage
-def body_impulse(m: Model, sc: Scratch, slot: int, row: Row, i: int):
+def body_impulse(m: Model, sc: Scratch, slot: int, offsets: Offsets, i: int):
     """Contact impulses on body ``i`` over the control step."""
     linear = vec3()
     angular = vec3()
     normal = real()
     for s in range(m.substeps):
-        report = row_at(m, slot, 0, s, 0).report
+        report = offsets_at(m, slot, 0, s, 0).report
         for c in range(load(m.contact_start, i), load(m.contact_start, i + 1)):
             linear = linear + load(sc.impulse, report + c)
             angular = angular + load(sc.angular_impulse, report + c)
             normal = normal + load(sc.normal_impulse, report + c)
-    store(sc.body_impulse, row.reading + i, linear)
-    store(sc.body_angular_impulse, row.reading + i, angular)
-    store(sc.body_normal_impulse, row.reading + i, normal)
+    store(sc.body_impulse, offsets.reading + i, linear)
+    store(sc.body_angular_impulse, offsets.reading + i, angular)
+    store(sc.body_normal_impulse, offsets.reading + i, normal)
 
 
 @stage
-def foot_contact(m: Model, sc: Scratch, slot: int, row: Row, f: int):
+def foot_contact(m: Model, sc: Scratch, slot: int, offsets: Offsets, f: int):
     """Whether foot ``f`` carries weight, at once and as a smooth step."""
-    impulse = load(sc.body_normal_impulse, row.reading + load(m.foot, f))
+    impulse = load(sc.body_normal_impulse, offsets.reading + load(m.foot, f))
     fault = load(sc.fault, slot)
     share = choose(fault, real(), impulse) / uniform(m.foot_weight)
     at = slot * m.nf + f

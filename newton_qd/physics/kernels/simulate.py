@@ -2,8 +2,16 @@
 
 import warp as wp
 
+from newton_qd.physics.kinds import JointKind
+
 from . import scalar, stage, sync
-from .articulation import change_free, change_hinge, eliminate_hinge, gather, rest_world
+from .articulation import (
+    change_axis,
+    change_free,
+    eliminate_axis,
+    gather_children,
+    rest_world,
+)
 from .contact import (
     contact_clip,
     contact_corrector,
@@ -14,54 +22,54 @@ from .contact import (
 from .cpp.memory import load
 from .inertia import rigid_inertia
 from .integration import mean_velocity, new_coordinates, new_velocity
-from .kinematics import free_joint, hinge_joint, world_frame
+from .kinematics import axis_joint, free_joint, world_frame
 from .readings import body_impulse, body_reading, foot_contact, torso_position
-from .structs import Model, Row, Scratch, row_after, row_at
-from .world import Pack, detect_fault, settle
+from .structs import Model, Offsets, Scratch, offsets_after, offsets_at
+from .world import Pack, detect_fault, freeze_faulty
 
 
 @stage
-def kinematics(m: Model, sc: Scratch, row: Row, lane: int, lanes: int):
+def kinematics(m: Model, sc: Scratch, offsets: Offsets, lane: int, lanes: int):
     """Poses, twists and bias accelerations, root to leaves."""
     if lane == 0:
-        world_frame(m, sc, row)
+        world_frame(m, sc, offsets)
     sync(lane)
     for level in range(m.body_levels):
         start = load(m.body_level_start, level)
         for p in range(start + lane, load(m.body_level_start, level + 1), lanes):
             i = load(m.body_level, p)
-            if load(m.joint_kind, i) == 0:
-                free_joint(m, sc, row, i)
+            if load(m.joint_kind, i) == JointKind.FREE:
+                free_joint(m, sc, offsets, i)
             else:
-                hinge_joint(m, sc, row, i)
+                axis_joint(m, sc, offsets, i)
         sync(lane)
 
 
 @stage
-def linear_solve(m: Model, sc: Scratch, row: Row, lane: int, lanes: int):
+def linear_solve(m: Model, sc: Scratch, offsets: Offsets, lane: int, lanes: int):
     """Eliminate joints, leaves to root; velocity changes, root to leaves."""
     if lane == 0:
-        rest_world(sc, row)
+        rest_world(sc, offsets)
     for n in range(m.body_levels):
         level = m.body_levels - 1 - n
         start = load(m.body_level_start, level)
         for p in range(start + lane, load(m.body_level_start, level + 1), lanes):
             i = load(m.body_level, p)
-            gather(m, sc, row, i)
-            if load(m.joint_kind, i) != 0:
-                eliminate_hinge(m, sc, row, i)
+            gather_children(m, sc, offsets, i)
+            if load(m.joint_kind, i) != JointKind.FREE:
+                eliminate_axis(m, sc, offsets, i)
         sync(lane)
     for level in range(m.body_levels):
         start = load(m.body_level_start, level)
         for p in range(start + lane, load(m.body_level_start, level + 1), lanes):
             i = load(m.body_level, p)
-            if load(m.joint_kind, i) == 0:
-                change_free(m, sc, row, i)
+            if load(m.joint_kind, i) == JointKind.FREE:
+                change_free(m, sc, offsets, i)
             else:
-                change_hinge(m, sc, row, i)
+                change_axis(m, sc, offsets, i)
         sync(lane)
     for c in range(lane, m.nc, lanes):
-        contact_slip(m, sc, row, c)
+        contact_slip(m, sc, offsets, c)
     sync(lane)
 
 
@@ -72,30 +80,33 @@ def substep(
     slot: int,
     keep: int,
     s: int,
-    trial: int,
+    iteration: int,
     lane: int,
     lanes: int,
 ):
-    """A trial of substep ``s`` from its kinematics on; ``keep`` as in ``row_at``."""
-    start = trial * m.passes
-    first = row_at(m, slot, keep, s, start)
+    """An iteration of substep ``s``, once its kinematics are there.
+
+    ``keep`` is as in ``offsets_at``.
+    """
+    start = iteration * m.solves
+    first = offsets_at(m, slot, keep, s, start)
     for i in range(1 + lane, m.nb + 1, lanes):
         rigid_inertia(m, sc, first, i)
     # predictor, then correctors
-    for p in range(start, start + m.passes):
-        row = row_at(m, slot, keep, s, p)
+    for p in range(start, start + m.solves):
+        offsets = offsets_at(m, slot, keep, s, p)
         for c in range(lane, m.nc, lanes):
             if p == 0:
-                contact_predictor(m, sc, row, c)
+                contact_predictor(m, sc, offsets, c)
             else:
                 if p == 1:
-                    contact_clip(m, sc, row, c)
-                contact_corrector(m, sc, row, c, p)
+                    contact_clip(m, sc, offsets, c)
+                contact_corrector(m, sc, offsets, c, p)
         sync(lane)
-        linear_solve(m, sc, row, lane, lanes)
-    last = row_at(m, slot, keep, s, start + m.passes - 1)
-    if trial < m.trials - 1:
-        ahead = row_at(m, slot, keep, s, start + m.passes)
+        linear_solve(m, sc, offsets, lane, lanes)
+    last = offsets_at(m, slot, keep, s, start + m.solves - 1)
+    if iteration < m.iterations - 1:
+        ahead = offsets_at(m, slot, keep, s, start + m.solves)
         for k in range(lane, m.nv, lanes):
             mean_velocity(sc, last, ahead, k)
         sync(lane)
@@ -122,35 +133,37 @@ def simulate(
 ):
     """All substeps of a pack, then the returned state and what is read from it."""
     slot = pack.slot
-    for n in range(m.substeps * m.trials + 1):
+    for n in range(m.substeps * m.iterations + 1):
         # the kinematics of the returned state are those of a last turn: written
         # twice, a GPU's compiler takes twice as long
-        s = n // m.trials
-        trial = n - s * m.trials
-        row = row_at(m, slot, keep, s + s // m.substeps, trial * m.passes)
+        s = n // m.iterations
+        iteration = n - s * m.iterations
+        offsets = offsets_at(m, slot, keep, s + s // m.substeps, iteration * m.solves)
         if s == m.substeps:
             detect_fault(m, sc, pack, x, lane)
-            settle(m, sc, pack, x, row_at(m, slot, keep, s, 0), row, lane, lanes)
+            freeze_faulty(
+                m, sc, pack, x, offsets_at(m, slot, keep, s, 0), offsets, lane, lanes
+            )
             sync(lane)
         if s < m.substeps or m.reports_bodies == 1 or m.torso_q < 0:
-            kinematics(m, sc, row, lane, lanes)
+            kinematics(m, sc, offsets, lane, lanes)
         if s < m.substeps:
-            substep(m, sc, slot, keep, s, trial, lane, lanes)
-    read_out(m, sc, slot, row_after(m, slot, keep), lane, lanes)
+            substep(m, sc, slot, keep, s, iteration, lane, lanes)
+    read_out(m, sc, slot, offsets_after(m, slot, keep), lane, lanes)
 
 
 @stage
-def read_out(m: Model, sc: Scratch, slot: int, row: Row, lane: int, lanes: int):
+def read_out(m: Model, sc: Scratch, slot: int, offsets: Offsets, lane: int, lanes: int):
     """What is read from the returned state and from the substeps."""
     for i in range(1 + lane, m.nb + 1, lanes):
-        body_impulse(m, sc, slot, row, i)
+        body_impulse(m, sc, slot, offsets, i)
     sync(lane)
     for f in range(lane, m.nf, lanes):
-        foot_contact(m, sc, slot, row, f)
+        foot_contact(m, sc, slot, offsets, f)
     if m.reports_bodies == 1 or m.torso_q < 0:
         for i in range(1 + lane, m.nb + 1, lanes):
-            body_reading(m, sc, row, i)
+            body_reading(m, sc, offsets, i)
         sync(lane)
     if lane == 0:
-        torso_position(m, sc, slot, row)
+        torso_position(m, sc, slot, offsets)
     sync(lane)

@@ -23,8 +23,8 @@ class Model:
     nc: int
     substeps: int
     total_mass: scalar  # [kg]
-    trials: int  # times that a substep finds the velocities of its bodies
-    passes: int  # solves of a trial: predictor and correctors
+    iterations: int  # times that a substep finds the velocities of its bodies
+    solves: int  # solves of an iteration: predictor and correctors
     h: scalar  # [s]
     gravity: scalar  # [m/s^2]
     rest_q: wp.array[scalar]  # (nq,)
@@ -92,8 +92,8 @@ class Model:
 class Scratch:
     """Intermediates of one control step; also the layout of their adjoints.
 
-    Contiguous, one-dimensional; a slot holds one pack of worlds, and :class:`Row` says
-    where a substep's entries begin.
+    Contiguous, one-dimensional; a slot holds one pack of worlds, and :class:`Offsets`
+    says where a substep's entries begin.
     """
 
     q: wp.array[real]
@@ -163,14 +163,14 @@ class Scratch:
 
 
 @wp.struct
-class Row:
+class Offsets:
     """Where the entries of one substep and one solve begin in the scratch arrays."""
 
     q: int
     q_next: int
     v: int
     v_next: int
-    v_body: int  # velocities that the bodies have in this trial
+    v_body: int  # velocities that the bodies have in this iteration
     ctrl: int
     parameter: int
     body: int
@@ -185,8 +185,8 @@ class Row:
 
 
 @wp.func
-def row_at(m: Model, slot: int, keep: int, s: int, p: int):
-    """Row of substep ``s`` and solve ``p``, which counts those of all its trials.
+def offsets_at(m: Model, slot: int, keep: int, s: int, p: int):
+    """Offsets of substep ``s`` and solve ``p``, counted over all its iterations.
 
     ``keep`` is 1 where every substep has entries of its own, as the adjoint needs, and
     0 where a slot's substeps share them.
@@ -194,22 +194,24 @@ def row_at(m: Model, slot: int, keep: int, s: int, p: int):
     step = slot
     solve = slot
     before = slot
-    trial = p // m.passes
-    trials = m.substeps * m.trials
+    iteration = p // m.solves
+    iterations = m.substeps * m.iterations
     if keep == 1:
-        step = slot * (trials + 1) + wp.min(s * m.trials + trial, trials)
-        solve = m.passes * (slot * trials + s * m.trials) + p
+        step = slot * (iterations + 1) + wp.min(
+            s * m.iterations + iteration, iterations
+        )
+        solve = m.solves * (slot * iterations + s * m.iterations) + p
         before = solve - 1
-    r = Row()
+    r = Offsets()
     r.q = (slot * (m.substeps + 2) + s) * m.nq
     r.q_next = r.q + m.nq
-    r.v = (slot * (trials + 2) + s) * m.nv
+    r.v = (slot * (iterations + 2) + s) * m.nv
     r.v_next = r.v + m.nv
     r.v_body = r.v
-    if trial > 0:
-        # the mean velocities of all trials are behind those of the substeps
-        mean = m.substeps + 1 + s * (m.trials - 1) + trial
-        r.v_body = (slot * (trials + 2) + mean) * m.nv
+    if iteration > 0:
+        # the mean velocities of all iterations are behind those of the substeps
+        mean = m.substeps + 1 + s * (m.iterations - 1) + iteration
+        r.v_body = (slot * (iterations + 2) + mean) * m.nv
     r.ctrl = slot * m.nu
     r.parameter = slot * (4 + 2 * m.nb + m.nv)
     r.body = step * (m.nb + 1)
@@ -225,6 +227,6 @@ def row_at(m: Model, slot: int, keep: int, s: int, p: int):
 
 
 @wp.func
-def row_after(m: Model, slot: int, keep: int):
-    """Row of the returned state, one after the end of the last substep."""
-    return row_at(m, slot, keep, m.substeps + 1, 0)
+def offsets_after(m: Model, slot: int, keep: int):
+    """Offsets of the returned state, one after the end of the last substep."""
+    return offsets_at(m, slot, keep, m.substeps + 1, 0)

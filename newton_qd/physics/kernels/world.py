@@ -10,7 +10,7 @@ import warp as wp
 
 from . import real, scalar, stage, sync, width
 from .cpp.algebra import add, component, mul
-from .cpp.memory import constant, gather, load, scatter, store
+from .cpp.memory import constant, load, read_input, store, write_output
 from .cpp.numbers import beyond, choose
 from .parameters import (
     PARAMETRIC,
@@ -19,7 +19,7 @@ from .parameters import (
     return_parameters,
 )
 from .readings import BODY_SIZE, seed, seed_bodies, seed_vector, store_bodies
-from .structs import Model, Row, Scratch, row_at
+from .structs import Model, Offsets, Scratch, offsets_at
 
 WIDTH = wp.constant(width)
 # Ten radians in a substep of 10 ms: nothing that moves so fast is simulated any more.
@@ -65,27 +65,27 @@ def load_world(
     m: Model,
     sc: Scratch,
     g: Scratch,
-    row: Row,
+    offsets: Offsets,
     pack: Pack,
     x: wp.array[scalar],
     x_bar: wp.array[scalar],
     lane: int,
     lanes: int,
 ):
-    """Copy the inputs of a pack into its slot, whose first row is ``row``."""
+    """Copy the inputs of a pack into its slot, from ``offsets`` on."""
     size = input_size(m)
     at = pack.first * size
     for k in range(lane, m.nq, lanes):
-        store(sc.q, row.q + k, gather(x, at + k, size, pack.count))
+        store(sc.q, offsets.q + k, read_input(x, at + k, size, pack.count))
     at += m.nq
     for k in range(lane, m.nv, lanes):
-        store(sc.v, row.v + k, gather(x, at + k, size, pack.count))
+        store(sc.v, offsets.v + k, read_input(x, at + k, size, pack.count))
     at += m.nv
     for k in range(lane, m.nu, lanes):
-        store(sc.ctrl, row.ctrl + k, gather(x, at + k, size, pack.count))
+        store(sc.ctrl, offsets.ctrl + k, read_input(x, at + k, size, pack.count))
     if PARAMETRIC:
         at += m.nu
-        load_parameters(m, sc, row, x, at, size, pack.count, lane, lanes)
+        load_parameters(m, sc, offsets, x, at, size, pack.count, lane, lanes)
     sync(lane)
 
 
@@ -94,7 +94,7 @@ def adj_load_world(
     m: Model,
     sc: Scratch,
     g: Scratch,
-    row: Row,
+    offsets: Offsets,
     pack: Pack,
     x: wp.array[scalar],
     x_bar: wp.array[scalar],
@@ -109,22 +109,22 @@ def adj_load_world(
     if PARAMETRIC:
         last = at + m.nq + m.nv + m.nu
         return_parameters(
-            m, g, row, x, x_bar, last, size, pack.count, fault, lane, lanes
+            m, g, offsets, x, x_bar, last, size, pack.count, fault, lane, lanes
         )
     for k in range(lane, m.nq, lanes):
-        value = choose(fault, real(), load(g.q, row.q + k))
-        scatter(x_bar, at + k, size, pack.count, value)
-        store(g.q, row.q + k, real())
+        value = choose(fault, real(), load(g.q, offsets.q + k))
+        write_output(x_bar, at + k, size, pack.count, value)
+        store(g.q, offsets.q + k, real())
     at += m.nq
     for k in range(lane, m.nv, lanes):
-        value = choose(fault, real(), load(g.v, row.v + k))
-        scatter(x_bar, at + k, size, pack.count, value)
-        store(g.v, row.v + k, real())
+        value = choose(fault, real(), load(g.v, offsets.v + k))
+        write_output(x_bar, at + k, size, pack.count, value)
+        store(g.v, offsets.v + k, real())
     at += m.nv
     for k in range(lane, m.nu, lanes):
-        value = choose(fault, real(), load(g.ctrl, row.ctrl + k))
-        scatter(x_bar, at + k, size, pack.count, value)
-        store(g.ctrl, row.ctrl + k, real())
+        value = choose(fault, real(), load(g.ctrl, offsets.ctrl + k))
+        write_output(x_bar, at + k, size, pack.count, value)
+        store(g.ctrl, offsets.ctrl + k, real())
 
 
 @wp.func
@@ -136,15 +136,17 @@ def detect_fault(m: Model, sc: Scratch, pack: Pack, x: wp.array[scalar], lane: i
         total = real()
         size = input_size(m)
         for k in range(m.nq + m.nv):
-            total = total + zero * gather(x, pack.first * size + k, size, pack.count)
+            total = total + zero * read_input(
+                x, pack.first * size + k, size, pack.count
+            )
         store(sc.lost, pack.slot, beyond(total, scalar(1.0)))
-        end = row_at(m, pack.slot, 0, m.substeps, 0)
+        end = offsets_at(m, pack.slot, 0, m.substeps, 0)
         for k in range(m.nq):
             total = total + zero * load(sc.q, end.q + k)
         for k in range(m.nv):
             total = total + zero * load(sc.v, end.v + k)
         for s in range(m.substeps):
-            report = row_at(m, pack.slot, 0, s, 0).report
+            report = offsets_at(m, pack.slot, 0, s, 0).report
             for c in range(m.nc):
                 impulse = load(sc.impulse, report + c)
                 angular = load(sc.angular_impulse, report + c)
@@ -166,13 +168,13 @@ def adj_detect_fault(m: Model, sc: Scratch, pack: Pack, x: wp.array[scalar], lan
 
 
 @stage
-def settle(
+def freeze_faulty(
     m: Model,
     sc: Scratch,
     pack: Pack,
     x: wp.array[scalar],
-    end: Row,
-    row: Row,
+    end: Offsets,
+    offsets: Offsets,
     lane: int,
     lanes: int,
 ):
@@ -182,20 +184,20 @@ def settle(
     size = input_size(m)
     at = pack.first * size
     for k in range(lane, m.nq, lanes):
-        before = gather(x, at + k, size, pack.count)
+        before = read_input(x, at + k, size, pack.count)
         stay = choose(lost, constant(m.rest_q, k), before)
-        store(sc.q, row.q + k, choose(fault, stay, load(sc.q, end.q + k)))
+        store(sc.q, offsets.q + k, choose(fault, stay, load(sc.q, end.q + k)))
     at += m.nq
     for k in range(lane, m.nv, lanes):
-        stay = choose(lost, real(), gather(x, at + k, size, pack.count))
-        store(sc.v, row.v + k, choose(fault, stay, load(sc.v, end.v + k)))
+        stay = choose(lost, real(), read_input(x, at + k, size, pack.count))
+        store(sc.v, offsets.v + k, choose(fault, stay, load(sc.v, end.v + k)))
 
 
 @wp.func
 def store_world(
     m: Model,
     sc: Scratch,
-    row: Row,
+    offsets: Offsets,
     pack: Pack,
     y: wp.array[scalar],
     lane: int,
@@ -206,35 +208,35 @@ def store_world(
     size = output_size(m)
     at = pack.first * size
     for k in range(lane, m.nq, lanes):
-        scatter(y, at + k, size, pack.count, load(sc.q, row.q + k))
+        write_output(y, at + k, size, pack.count, load(sc.q, offsets.q + k))
     at += m.nq
     for k in range(lane, m.nv, lanes):
-        scatter(y, at + k, size, pack.count, load(sc.v, row.v + k))
+        write_output(y, at + k, size, pack.count, load(sc.v, offsets.v + k))
     at += m.nv
     for i in range(lane, m.nb, lanes):
-        linear = load(sc.body_impulse, row.reading + i + 1)
-        angular = load(sc.body_angular_impulse, row.reading + i + 1)
-        normal = load(sc.body_normal_impulse, row.reading + i + 1)
+        linear = load(sc.body_impulse, offsets.reading + i + 1)
+        angular = load(sc.body_angular_impulse, offsets.reading + i + 1)
+        normal = load(sc.body_normal_impulse, offsets.reading + i + 1)
         for j in range(3):
             value = choose(fault, real(), component(linear, j))
-            scatter(y, at + 6 * i + j, size, pack.count, value)
+            write_output(y, at + 6 * i + j, size, pack.count, value)
             value = choose(fault, real(), component(angular, j))
-            scatter(y, at + 6 * i + 3 + j, size, pack.count, value)
+            write_output(y, at + 6 * i + 3 + j, size, pack.count, value)
         value = choose(fault, real(), normal)
-        scatter(y, at + 6 * m.nb + i, size, pack.count, value)
+        write_output(y, at + 6 * m.nb + i, size, pack.count, value)
     at += 7 * m.nb
     if lane == 0:
-        scatter(y, at, size, pack.count, fault)
+        write_output(y, at, size, pack.count, fault)
     for f in range(lane, m.nf, lanes):
         value = load(sc.foot_contact, pack.slot * m.nf + f)
-        scatter(y, at + 1 + f, size, pack.count, value)
+        write_output(y, at + 1 + f, size, pack.count, value)
         value = load(sc.smooth_foot_contact, pack.slot * m.nf + f)
-        scatter(y, at + 1 + m.nf + f, size, pack.count, value)
+        write_output(y, at + 1 + m.nf + f, size, pack.count, value)
     at += 1 + 2 * m.nf
     for k in range(lane, 2, lanes):
-        scatter(y, at + k, size, pack.count, load(sc.torso_xy, 2 * pack.slot + k))
+        write_output(y, at + k, size, pack.count, load(sc.torso_xy, 2 * pack.slot + k))
     if m.reports_bodies == 1:
-        store_bodies(m, sc, row, y, at + 2, size, pack.count, lane, lanes)
+        store_bodies(m, sc, offsets, y, at + 2, size, pack.count, lane, lanes)
 
 
 @wp.func
@@ -242,7 +244,7 @@ def seed_world(
     m: Model,
     sc: Scratch,
     g: Scratch,
-    row: Row,
+    offsets: Offsets,
     pack: Pack,
     y_bar: wp.array[scalar],
     lane: int,
@@ -253,18 +255,18 @@ def seed_world(
     size = output_size(m)
     at = pack.first * size
     for k in range(lane, m.nq, lanes):
-        store(g.q, row.q + k, seed(fault, y_bar, at + k, size, pack.count))
+        store(g.q, offsets.q + k, seed(fault, y_bar, at + k, size, pack.count))
     at += m.nq
     for k in range(lane, m.nv, lanes):
-        store(g.v, row.v + k, seed(fault, y_bar, at + k, size, pack.count))
+        store(g.v, offsets.v + k, seed(fault, y_bar, at + k, size, pack.count))
     at += m.nv
     for i in range(lane, m.nb, lanes):
         linear = seed_vector(fault, y_bar, at + 6 * i, size, pack.count)
         angular = seed_vector(fault, y_bar, at + 6 * i + 3, size, pack.count)
         normal = seed(fault, y_bar, at + 6 * m.nb + i, size, pack.count)
-        store(g.body_impulse, row.reading + i + 1, linear)
-        store(g.body_angular_impulse, row.reading + i + 1, angular)
-        store(g.body_normal_impulse, row.reading + i + 1, normal)
+        store(g.body_impulse, offsets.reading + i + 1, linear)
+        store(g.body_angular_impulse, offsets.reading + i + 1, angular)
+        store(g.body_normal_impulse, offsets.reading + i + 1, normal)
     at += 7 * m.nb + 1
     for f in range(lane, m.nf, lanes):
         # the contact itself is a step: its gradient is 0
@@ -275,7 +277,7 @@ def seed_world(
         value = seed(fault, y_bar, at + k, size, pack.count)
         store(g.torso_xy, 2 * pack.slot + k, value)
     if m.reports_bodies == 1:
-        seed_bodies(m, g, row, fault, y_bar, at + 2, size, pack.count, lane, lanes)
+        seed_bodies(m, g, offsets, fault, y_bar, at + 2, size, pack.count, lane, lanes)
     sync(lane)
 
 
@@ -284,7 +286,7 @@ def adj_seed_world(
     m: Model,
     sc: Scratch,
     g: Scratch,
-    row: Row,
+    offsets: Offsets,
     pack: Pack,
     y_bar: wp.array[scalar],
     lane: int,

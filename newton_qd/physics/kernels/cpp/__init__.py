@@ -11,12 +11,12 @@ their elements are computed in loops, and most of its functions (``dot``,
 address from strides in memory at every access.
 
 **What is done instead.** One thread computes a pack: 8 worlds in float32, 4 in
-float64, and one on a GPU. A number is a pack of numbers, one for each world. In C++ it
-is ``Real``, a vector type of Clang that fills one register. Warp's C++ templates accept
-``Real`` as their scalar: ``wp::vec_t<3, Real>`` is a vector in each of the worlds, and
-``wp::dot`` of two of them is 5 vector instructions. Their adjoints come with them.
-Warp's Python does not know ``Real``. There, a pack of numbers is a Warp vector (of 3-D
-vectors: a matrix 3 x width), with the same bytes in memory.
+float64, and one on a GPU. A number in a kernel is one number for each world of the
+pack. In C++ it is ``Real``, a vector of Clang's that fills one register. Warp's C++
+templates accept ``Real`` as their scalar: ``wp::vec_t<3, Real>`` is one vector for each
+world, and ``wp::dot`` of two of them is 5 vector instructions. Their adjoints come with
+them. Warp's Python does not know ``Real``. There, a number is a Warp vector of length
+``width``, and a 3-D vector is a matrix (3, width), with the same bytes in memory.
 
 **The files.**
 

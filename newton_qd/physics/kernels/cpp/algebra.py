@@ -21,7 +21,7 @@ auto minus = [](Real x, Real y) { return x - y; };
 """
 # Sums and products.
 
-for _pack in (real, vec3, mat33):
+for _type in (real, vec3, mat33):
 
     @wp.func_native(
         *native(
@@ -30,7 +30,7 @@ for _pack in (real, vec3, mat33):
             _EACH,
         )
     )
-    def add(a: _pack, b: _pack) -> _pack:
+    def add(a: _type, b: _type) -> _type:
         """Sum."""
         ...
 
@@ -41,7 +41,7 @@ for _pack in (real, vec3, mat33):
             _EACH,
         )
     )
-    def sub(a: _pack, b: _pack) -> _pack:
+    def sub(a: _type, b: _type) -> _type:
         """Difference."""
         ...
 
@@ -52,7 +52,7 @@ for _pack in (real, vec3, mat33):
             _EACH,
         )
     )
-    def neg(a: _pack) -> _pack:
+    def neg(a: _type) -> _type:
         """Negative."""
         ...
 
@@ -65,12 +65,12 @@ for _pack in (real, vec3, mat33):
             _EACH,
         )
     )
-    def mul(s: scalar, a: _pack) -> _pack:
+    def mul(s: scalar, a: _type) -> _type:
         """Product with one number for all worlds."""
         ...
 
 
-for _pack in (vec3, mat33):
+for _type in (vec3, mat33):
 
     @wp.func_native(
         *native(
@@ -80,7 +80,7 @@ for _pack in (vec3, mat33):
             _EACH,
         )
     )
-    def mul(b: real, a: _pack) -> _pack:
+    def mul(b: real, a: _type) -> _type:
         """Product with a number."""
         ...
 
@@ -135,10 +135,10 @@ def vector(a: real, b: real, c: real) -> vec3:
     ...
 
 
-for _pack in (vec3, quat, transform):
+for _type in (vec3, quat, transform):
 
     @wp.func_native(*native("((Real*)&A)[i]", "((Real*)&adj_A)[i] += adj_RET;"))
-    def component(a: _pack, i: int) -> real:
+    def component(a: _type, i: int) -> real:
         """Component ``i``; a transform's are its translation, then its rotation."""
         ...
 
@@ -169,7 +169,7 @@ def length(a: vec3) -> real:
     ...
 
 
-for _pack in (vec3, quat):
+for _type in (vec3, quat):
 
     @wp.func_native(
         *native(
@@ -181,7 +181,7 @@ for _pack in (vec3, quat):
             _EACH + ROOT + "Real d = Real(1) / root(wp::dot(A, A));",
         )
     )
-    def normalize(a: _pack) -> _pack:
+    def normalize(a: _type) -> _type:
         """``a``, which is not zero, divided by its length."""
         ...
 

@@ -11,17 +11,19 @@ import warp as wp
 from .. import mat33, real, scalar, transform, vec3, width
 from .native import CPP, PRELUDE
 
-_LOAD = PRELUDE + "return Pack::out(Pack::in(a.data[i]));"
+_LOAD = PRELUDE + "return Convert::out(Convert::in(a.data[i]));"
 _ADJ_LOAD = f"""
 #if defined(__CUDA_ARCH__)
 wp::atomic_add(a.grad + i, adj_ret);
 #else
 {PRELUDE}
-Pack::more(Pack::in(adj_ret), a.grad[i]);
+Convert::more(Convert::in(adj_ret), a.grad[i]);
 #endif
 """
-_STORE = PRELUDE + "Pack::out(Pack::in(value), a.data[i]);"
-_ADJ_STORE = PRELUDE + "Pack::more(Pack::in(a.grad[i]), adj_value); a.grad[i] = {};"
+_STORE = PRELUDE + "Convert::out(Convert::in(value), a.data[i]);"
+_ADJ_STORE = (
+    PRELUDE + "Convert::more(Convert::in(a.grad[i]), adj_value); a.grad[i] = {};"
+)
 
 
 @wp.func_native(snippet="return a.data[i];", adj_snippet="")
@@ -30,15 +32,15 @@ def load(a: wp.array[int], i: int) -> int:
     ...
 
 
-for _pack in (real, vec3, transform, mat33):
+for _type in (real, vec3, transform, mat33):
 
     @wp.func_native(snippet=_LOAD, adj_snippet=_ADJ_LOAD)
-    def load(a: wp.array[_pack], i: int) -> _pack:
+    def load(a: wp.array[_type], i: int) -> _type:
         """Element ``i`` of ``a``."""
         ...
 
     @wp.func_native(snippet=_STORE, adj_snippet=_ADJ_STORE, replay_snippet="")
-    def store(a: wp.array[_pack], i: int, value: _pack):
+    def store(a: wp.array[_type], i: int, value: _type):
         """Write element ``i`` of ``a``."""
         ...
 
@@ -51,17 +53,17 @@ TABLES = {
     transform: wp.types.transformation(dtype=scalar),
 }
 
-for _pack, _entry in TABLES.items():
+for _type, _entry in TABLES.items():
     _CONSTANT = f"""
 {PRELUDE}
-{CPP[_pack][0]} value;
+{CPP[_type][0]} value;
 for (int j = 0; j < sizeof(value) / sizeof(Real); ++j)
     ((Real*)&value)[j] = Real(((const Number*)&a.data[i])[j]);
-return Pack::out(value);
+return Convert::out(value);
 """
 
     @wp.func_native(snippet=_CONSTANT, adj_snippet="")
-    def constant(a: wp.array[_entry], i: int) -> _pack:
+    def constant(a: wp.array[_entry], i: int) -> _type:
         """Element ``i`` of a table without adjoint, the same for all worlds."""
         ...
 
@@ -76,10 +78,10 @@ value = a.data[i];
 for (int j = 0; j < {width}; ++j)
     value[j] = a.data[i + (j < count ? j : count - 1) * stride];
 #endif
-return Pack::out(value);""",
+return Convert::out(value);""",
     adj_snippet="",
 )
-def gather(a: wp.array[scalar], i: int, stride: int, count: int) -> real:
+def read_input(a: wp.array[scalar], i: int, stride: int, count: int) -> real:
     """Element ``i`` of a row and of the next ``count - 1`` rows, one world each.
 
     Worlds of the pack beyond ``count`` repeat the last one. Without adjoint.
@@ -90,7 +92,7 @@ def gather(a: wp.array[scalar], i: int, stride: int, count: int) -> real:
 @wp.func_native(
     snippet=f"""
 {PRELUDE}
-Real it = Pack::in(value);
+Real it = Convert::in(value);
 #if defined(__CUDA_ARCH__)
 a.data[i] = it;
 #else
@@ -101,6 +103,6 @@ for (int j = 0; j < {width}; ++j)
     adj_snippet="",
     replay_snippet="",
 )
-def scatter(a: wp.array[scalar], i: int, stride: int, count: int, value: real):
+def write_output(a: wp.array[scalar], i: int, stride: int, count: int, value: real):
     """Write element ``i`` of a row and of the next ``count - 1`` rows."""
     ...

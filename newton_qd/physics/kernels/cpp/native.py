@@ -70,8 +70,8 @@ static CUDA_CALLABLE {name} zero({name} x) {{
 
 # Between packs in memory and the types above.
 PRELUDE = (
-    f"{TYPES}\nstruct Pack {{"
-    + "".join(_conversion(*row) for row in CPP.values())
+    f"{TYPES}\nstruct Convert {{"
+    + "".join(_conversion(*entry) for entry in CPP.values())
     + "\n};\n"
 )
 
@@ -85,16 +85,16 @@ def native(forward: str, adjoint: str = "", before: str = "") -> tuple[str, str]
         before: Statements before both.
     """
     names = sorted({*_ARGUMENT.findall(f"{before}\n{forward}\n{adjoint}")} - {"RET"})
-    values = "".join(f"auto {name} = Pack::in({name.lower()});\n" for name in names)
+    values = "".join(f"auto {name} = Convert::in({name.lower()});\n" for name in names)
     start = f"{PRELUDE}{values}{before}\n"
-    snippet = f"{start}return Pack::out({forward});"
+    snippet = f"{start}return Convert::out({forward});"
     if not adjoint:
         return snippet, ""
     # added to memory at the end, one by one: two arguments may be one variable
-    adjoints = "".join(f"decltype({n}) adj_{n} = Pack::zero({n});\n" for n in names)
-    results = "".join(f"Pack::more(adj_{n}, adj_{n.lower()});\n" for n in names)
+    adjoints = "".join(f"decltype({n}) adj_{n} = Convert::zero({n});\n" for n in names)
+    results = "".join(f"Convert::more(adj_{n}, adj_{n.lower()});\n" for n in names)
     result = f"auto RET = {forward};\n" if re.search(r"\bRET\b", adjoint) else ""
     return snippet, (
-        f"{start}{result}{adjoints}auto adj_RET = Pack::in(adj_ret);\n"
+        f"{start}{result}{adjoints}auto adj_RET = Convert::in(adj_ret);\n"
         f"{adjoint}\n{results}"
     )
