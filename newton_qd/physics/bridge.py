@@ -8,19 +8,18 @@ through DLPack. No other module knows both libraries.
 import contextlib
 import functools
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import warp as wp
 from jax.core import Tracer
 
-from newton_qd.physics import interrupts
-from newton_qd.physics.launch import BODY_SIZE, Launcher, output_size, thread_count
-from newton_qd.physics.parameters import parameter_count
+from newton_qd.physics import interrupts, layout
+from newton_qd.physics.launch import Launcher, thread_count
+from newton_qd.physics.layout import Layout
 from newton_qd.physics.precision import SCALARS, kernels
-from newton_qd.physics.system import Kinematics, System
+from newton_qd.physics.system import Kinematics, PhysicsState, System
 from newton_qd.physics.warp_internals import ffi_callback
 
 
@@ -135,28 +134,52 @@ def _kernel_call(system: System, name: str, size: int, parametric: bool = False)
     return _row_call(name, system.dtype, default.prepare(name), launch)
 
 
-def _row(system: System, **parts: tuple[jax.Array, int]) -> jax.Array:
+def _row(
+    system: System, shapes: dict[str, tuple[int, ...]], **arrays: jax.Array
+) -> jax.Array:
     """Concatenates the inputs of one world; a wrong size would shift all others.
 
     Args:
         system: The system.
-        **parts: Array and length of each input.
+        shapes: Shape of each input.
+        **arrays: The inputs, in the order of the row.
 
     Raises:
         TypeError: An array has another type than the system.
         ValueError: An array has another shape.
     """
-    for name, (array, size) in parts.items():
-        expected = f"allowed: shape {(size,)}, {system.dtype}"
-        if array.shape != (size,):
+    for name, array in arrays.items():
+        expected = f"allowed: shape {shapes[name]}, {system.dtype}"
+        if array.shape != shapes[name]:
             raise ValueError(f"{name}: shape {array.shape} given; {expected}")
         if array.dtype != system.dtype:
             raise TypeError(f"{name}: dtype {array.dtype} given; {expected}")
-    return jnp.concatenate([array for array, _ in parts.values()])
+    return jnp.concatenate(list(arrays.values()))
+
+
+def _split(row: jax.Array, fields: Layout) -> dict[str, jax.Array]:
+    """The fields of one world's row (size,), each in its shape."""
+    parts = jnp.split(row, [field.offset for field in fields][1:])
+    pairs = zip(fields, parts, strict=True)
+    return {field.name: part.reshape(field.shape) for field, part in pairs}
+
+
+class Step(Protocol):
+    """The control step of one world, as :func:`control_step` returns it."""
+
+    def __call__(
+        self,
+        q: jax.Array,
+        v: jax.Array,
+        control: jax.Array,
+        params: jax.Array | None = None,
+    ) -> tuple[PhysicsState, jax.Array]:
+        """Next state, and the fault ()."""
+        ...
 
 
 @functools.cache
-def control_step(system: System) -> Any:
+def control_step(system: System) -> Step:
     """The differentiable control step of one world.
 
     Args:
@@ -165,75 +188,69 @@ def control_step(system: System) -> Any:
     Returns:
         A function of ``q`` (nq,), ``v`` (nv,), ``control`` (nu,) and, where the
         world has its own, ``params``
-        (:func:`~newton_qd.physics.parameters.parameter_count`,) that returns
-        ``q`` (nq,), ``v`` (nv,), ``impulse`` (nb, 6), ``normal_impulse`` (nb,),
-        ``fault`` (), ``feet_contact`` (nf,), ``smooth_feet_contact`` (nf,),
-        ``torso_xy`` (2,) and ``bodies`` as in
-        :class:`~newton_qd.physics.system.PhysicsState`; reverse mode once, no forward
-        mode. Under ``vmap`` the worlds share one launch.
+        (:func:`~newton_qd.physics.parameters.parameter_count`,) that returns the next
+        state and the fault (); reverse mode once, no forward mode. Under ``vmap`` the
+        worlds share one launch.
     """
     interrupts.install()
-    nq, nv, nb, nf = system.nq, system.nv, system.nb, len(system.feet)
-    size, out = nq + nv + system.nu, output_size(system)
-    count = parameter_count(system)
-    call = functools.partial(_kernel_call, system, size=size)
-    step = _differentiable(call, "step", size, out)
-    size += count
+    read, written = layout.inputs(system), layout.outputs(system)
+    count = layout.parameters(system).size
+    shapes = read.shapes | {"params": (count,)}
+    seen = tuple(field.name for field in layout.bodies(system))
+    call = functools.partial(_kernel_call, system, size=read.size)
+    step = _differentiable(call, "step", read.size, written.size)
+    size = layout.inputs(system, parametric=True).size
     call = functools.partial(_kernel_call, system, size=size, parametric=True)
-    own_step = _differentiable(call, "step", size, out)
-    ends = np.cumsum([nq, nv, 6 * nb, nb, 1, nf, nf, 2])
+    own_step = _differentiable(call, "step", size, written.size)
 
     def run(
         q: jax.Array, v: jax.Array, control: jax.Array, params: jax.Array | None = None
-    ) -> tuple[Any, ...]:
+    ) -> tuple[PhysicsState, jax.Array]:
         thread_count()  # a bad setting is an error here, not inside a compiled call
-        parts = {"q": (q, nq), "v": (v, nv), "control": (control, system.nu)}
         if params is None:
-            y = step(_row(system, **parts))
+            y = step(_row(system, shapes, q=q, v=v, control=control))
         else:
-            y = own_step(_row(system, **parts, params=(params, count)))
-        q, v, impulse, normal, fault, *read, last = jnp.split(y, ends)
-        bodies = _bodies(last) if system.reports_bodies else None
-        return q, v, impulse.reshape(nb, 6), normal, fault[0], *read, bodies
+            row = _row(system, shapes, q=q, v=v, control=control, params=params)
+            y = own_step(row)
+        found = _split(y, written)
+        fault = found.pop("fault")
+        bodies = None
+        if system.reports_bodies:
+            bodies = Kinematics(**{name: found.pop(name) for name in seen})
+        return PhysicsState(**found, bodies=bodies), fault
 
     return run
 
 
-def _bodies(row: jax.Array) -> Kinematics:
-    """The bodies of one world, which a kernel wrote field by field."""
-    sizes = (3, 4, 3, 3, 3)
-    nb = row.shape[0] // sum(sizes)
-    fields = jnp.split(row, nb * np.cumsum(sizes[:-1]))
-    parts = zip(fields, sizes, strict=True)
-    return Kinematics(*(field.reshape(nb, size) for field, size in parts))
-
-
 @functools.cache
-def kinematics(system: System) -> Any:
+def kinematics(system: System) -> Callable[[jax.Array, jax.Array], Kinematics]:
     """Differentiable bodies of one world, as a function of ``q`` and ``v``."""
-    size = system.nq + system.nv
-    call = functools.partial(_kernel_call, system, size=size)
-    views = _differentiable(call, "kinematics", size, BODY_SIZE * system.nb)
+    read, written = layout.coordinates(system), layout.bodies(system)
+    call = functools.partial(_kernel_call, system, size=read.size)
+    views = _differentiable(call, "kinematics", read.size, written.size)
 
     def run(q: jax.Array, v: jax.Array) -> Kinematics:
-        return _bodies(views(_row(system, q=(q, system.nq), v=(v, system.nv))))
+        row = _row(system, read.shapes, q=q, v=v)
+        return Kinematics(**_split(views(row), written))
 
     return run
 
 
 def dynamics(system: System, q: jax.Array, v: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Mass matrix (nv, nv) and bias forces (nv,) of one world."""
-    nv = system.nv
-    call = _kernel_call(system, "dynamics_forward", system.nq + nv)
-    y = call(jnp.concatenate([q, v]), output_dims=nv * (nv + 1))[0]
-    return y[: nv * nv].reshape(nv, nv), y[nv * nv :]
+    read, written = layout.coordinates(system), layout.dynamics(system)
+    call = _kernel_call(system, "dynamics_forward", read.size)
+    row = _row(system, read.shapes, q=q, v=v)
+    found = _split(call(row, output_dims=written.size)[0], written)
+    return found["mass_matrix"], found["bias"]
 
 
 def contact_gaps(system: System, q: jax.Array) -> jax.Array:
     """Gaps (nc,) of one world."""
-    call = _kernel_call(system, "contact_gaps", system.nq + system.nv)
-    row = jnp.concatenate([q, jnp.zeros((system.nv,), q.dtype)])
-    return call(row, output_dims=len(system.contact_body))[0]
+    read, written = layout.coordinates(system), layout.gaps(system)
+    call = _kernel_call(system, "contact_gaps", read.size)
+    row = _row(system, read.shapes, q=q, v=jnp.zeros((system.nv,), q.dtype))
+    return call(row, output_dims=written.size)[0]
 
 
 @functools.cache

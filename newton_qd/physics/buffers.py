@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from newton_qd.physics import reference
+from newton_qd.physics import layout, reference
 from newton_qd.physics.precision import kernels, pack_width
 from newton_qd.physics.system import CONTACT_FRACTION, STANDARD_GRAVITY, System
 from newton_qd.physics.tree import Tree, build_tree, origin_axes
@@ -189,7 +189,7 @@ def _entries(system: System, adjoint: bool) -> dict[str, int]:
         "q": (n + 2) * system.nq,
         "v": (turns + 2) * system.nv,
         "ctrl": max(system.nu, 1),
-        "parameter": 4 + 2 * system.nb + system.nv,
+        "parameter": layout.scratch_parameters(system).size,
         **dict.fromkeys(_PER_BODY, steps * (system.nb + 1)),
         **dict.fromkeys(("axis_w", "axis_v"), steps * system.nv),
         **dict.fromkeys(_PER_CONTACT, steps * nc),

@@ -9,13 +9,12 @@ from typing import Any
 
 import warp as wp
 
-from newton_qd.physics import buffers
+from newton_qd.physics import buffers, layout
 from newton_qd.physics.precision import pack_width
 from newton_qd.physics.system import System
 from newton_qd.physics.workers import Worker
 
 LANES = (1, 2, 4, 8, 16, 32)
-BODY_SIZE = 16  # entries of a body: the fields of Kinematics
 # Kernel modules other than ``inspect``; each is compiled as a whole.
 _MODULES = {
     "step_forward": "forward",
@@ -70,8 +69,7 @@ def lane_count(kernel: str) -> int:
 
 def output_size(system: System) -> int:
     """Length of a row that a step writes."""
-    size = system.nq + system.nv + 7 * system.nb + 1 + 2 * len(system.feet) + 2
-    return size + (BODY_SIZE * system.nb if system.reports_bodies else 0)
+    return layout.outputs(system).size
 
 
 @dataclasses.dataclass(frozen=True)

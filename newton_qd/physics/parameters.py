@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from typing import Any
 
 import jax
@@ -11,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from newton_qd.physics import layout
 from newton_qd.physics.system import System
 
 
@@ -60,14 +60,12 @@ _POSITIVE = ("mass_scale", "inertia_scale")
 
 def parameter_shapes(system: System) -> dict[str, tuple[int, ...]]:
     """Returns the shape of each parameter of one world, in the order of the fields."""
-    bodies = (system.nb,)
-    sizes = ((), (), (), bodies, bodies, (system.nv,), (system.nu,))
-    return dict(zip(FIELDS, sizes, strict=True))
+    return layout.parameters(system).shapes
 
 
 def parameter_count(system: System) -> int:
     """Returns how many numbers the parameters of one world are."""
-    return sum(math.prod(shape) for shape in parameter_shapes(system).values())
+    return layout.parameters(system).size
 
 
 def default_params(system: System) -> PhysicsParams:

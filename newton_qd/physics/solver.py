@@ -14,8 +14,9 @@ import warp as wp
 from newton.solvers import SolverBase
 
 from newton_qd.assets import find_urdf
+from newton_qd.physics import layout
 from newton_qd.physics.kernels.conventions import read_rows, write_rows
-from newton_qd.physics.launch import Launcher, output_size
+from newton_qd.physics.launch import Launcher
 from newton_qd.physics.model import load_system, newton_builder
 from newton_qd.physics.model.description import read_description
 from newton_qd.physics.system import JointKind, System
@@ -106,17 +107,17 @@ class NewtonQDSolver(SolverBase):
         _check_model(model, self._reference, robot)
         self._system = load_system(robot, "float32")
         self._worlds = model.world_count
-        nq, nv, nb = self._system.nq, self._system.nv, self._system.nb
+        nb, driven = self._system.nb, _driven_by_forces(self._system)
         with wp.ScopedDevice(model.device):
-            self._inputs = self._zeros(nq + 2 * nv)
-            self._outputs = self._zeros(output_size(self._system))
+            self._inputs = self._zeros(layout.inputs(driven).size)
+            self._outputs = self._zeros(layout.outputs(driven).size)
             self.impulse = self._zeros(nb, 6)
             self.normal_impulse = self._zeros(nb)
             self.fault = self._zeros()
         free = self._system.joint_kind[0] == JointKind.FREE
         self._root = (int(free), wp.vec3(*self._system.com[0]))
         self._launcher = functools.lru_cache(_HELD_STEPS)(
-            functools.partial(_launcher, self._system, model.device)
+            functools.partial(_launcher, driven, model.device)
         )
 
     def step(
@@ -192,15 +193,19 @@ class NewtonQDSolver(SolverBase):
         return wp.zeros((self._worlds, *shape), dtype=wp.float32)
 
 
-def _launcher(system: System, device: wp.Device, dt: float) -> Launcher:
-    """Returns the launcher of one substep of ``dt`` [s], driven by joint forces."""
-    driven = dataclasses.replace(
+def _driven_by_forces(system: System) -> System:
+    """Returns the system with a force on every degree of freedom as its actions."""
+    return dataclasses.replace(
         system,
-        robot=dataclasses.replace(system.robot, dt=dt, substeps=1),
         control_dof=np.arange(system.nv, dtype=np.int32),
         gear=np.ones(system.nv),
     )
-    return Launcher(driven, device)
+
+
+def _launcher(system: System, device: wp.Device, dt: float) -> Launcher:
+    """Returns the launcher of one substep of ``dt`` [s]."""
+    robot = dataclasses.replace(system.robot, dt=dt, substeps=1)
+    return Launcher(dataclasses.replace(system, robot=robot), device)
 
 
 def _one_world(robot: RobotSpec, device: Any) -> newton.Model:

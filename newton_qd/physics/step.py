@@ -75,7 +75,6 @@ def step(
             is wrong.
     """
     own = None if params is None else parameter_row(system, params)
-    found = bridge.control_step(system)(state.q, state.v, control, own)
-    q, v, impulse, normal_impulse, fault, *readings = found
-    after = PhysicsState(q, v, impulse, normal_impulse, *readings)
+    run = bridge.control_step(system)
+    after, fault = run(state.q, state.v, control, own)
     return after, fault.astype(jnp.int32)
