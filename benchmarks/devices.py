@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from throughput import seconds
 
-from newton_qd.gradients.episode import make_episode
+from newton_qd.gradients.factories import make_episode
 from newton_qd.physics.launch import Launcher
 from newton_qd.qd.config import EvolveConfig
 from newton_qd.qd.scoring.sharding import device_mesh, shard_scoring

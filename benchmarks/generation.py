@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from newton_qd.gradients.episode import make_episode
+from newton_qd.gradients.factories import make_episode
 from newton_qd.qd.config import EvolveConfig
 from newton_qd.qd.run.search import Search
 from newton_qd.qd.scoring.rollout import make_policy, make_scoring_function

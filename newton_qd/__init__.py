@@ -6,8 +6,9 @@ The facade:
 - ``registered_envs()``, ``register(name, base, ...)``: the names; a new one
 - ``Env``, ``State``: what ``create`` returns; what ``reset`` and ``step`` return
 - ``check(state)``: raises ``FaultError`` where a world was frozen
-- ``diagnose_gradients(env)``: over how many steps gradients can be used, and why;
-  ``newton_qd.gradients`` has the gradients of whole episodes
+- ``Episode(env, policy, ...)``: an episode and its gradients; ``newton_qd.gradients``
+  has the rest of what belongs to these
+- ``diagnose_gradients(env)``: over how many steps gradients can be used, and why
 - ``PhysicsParams``, ``randomize_params``: physical parameters of each world, which
   ``step`` takes and ``env.default_params`` has; drawn at random
 - ``NewtonQDSolver``: the same physics as a solver of Newton
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from newton_qd.envs.state import State, check
     from newton_qd.errors import FaultError, MissingExtra, UnknownEnvironment
     from newton_qd.gradients.doctor import diagnose_gradients
+    from newton_qd.gradients.episode import Episode
     from newton_qd.physics.parameters import PhysicsParams
     from newton_qd.physics.solver import NewtonQDSolver
     from newton_qd.registry import create, create_fn, register, registered_envs
@@ -38,6 +40,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Env",
+    "Episode",
     "FaultError",
     "MissingExtra",
     "NewtonQDSolver",
@@ -55,6 +58,7 @@ __all__ = [
 
 _HOME = {
     "Env": "newton_qd.envs.base",
+    "Episode": "newton_qd.gradients.episode",
     "FaultError": "newton_qd.errors",
     "MissingExtra": "newton_qd.errors",
     "NewtonQDSolver": "newton_qd.physics.solver",

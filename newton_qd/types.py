@@ -1,10 +1,10 @@
-"""Shared aliases, and the table of the keys of ``State.info``."""
+"""Shared aliases and protocols, and the table of the keys of ``State.info``."""
 
 from __future__ import annotations
 
 import types
-from collections.abc import Mapping
-from typing import Any, TypeAlias
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol, TypeAlias
 
 import jax
 
@@ -16,6 +16,95 @@ Mask: TypeAlias = jax.Array
 Metrics: TypeAlias = dict[str, jax.Array]
 Info: TypeAlias = dict[str, Any]
 Params: TypeAlias = Any  # of simulated robots: physics.PhysicsParams
+
+PyTree: TypeAlias = Any
+"""Arrays in any nesting of dicts, tuples, lists and registered dataclasses."""
+
+Genotype: TypeAlias = PyTree
+"""What a search changes: weights of a policy, or actions; N of them have N in front."""
+
+ExtraScores: TypeAlias = dict[str, Any]
+"""What a scoring function returns besides fitness and descriptor, by name."""
+
+ScoringFunction: TypeAlias = Callable[
+    [Genotype, RNGKey], tuple[jax.Array, Descriptor, ExtraScores]
+]
+"""QDax's contract: maps N genotypes and a key to fitnesses (N,), descriptors (N, D)."""
+
+
+class Policy(Protocol):
+    """Chooses an action."""
+
+    def __call__(self, parameters: PyTree, obs: Observation, /) -> Action:
+        """Maps parameters and an observation (no,) to an action (nu,)."""
+        ...
+
+
+class StateDescriptors(Protocol):
+    """The part of the transitions that a descriptor extractor reads."""
+
+    @property
+    def state_desc(self) -> jax.Array:
+        """(n, t, nd) state descriptors before each step."""
+        ...
+
+
+class DescriptorExtractor(Protocol):
+    """Reads the descriptors of n episodes."""
+
+    def __call__(self, data: StateDescriptors, mask: Mask, /) -> Descriptor:
+        """Maps transitions and a mask (n, t), 1 after the end, to (n, D)."""
+        ...
+
+
+class StateLike(Protocol):
+    """What an episode reads of a state: :class:`newton_qd.State`, or one's own."""
+
+    @property
+    def obs(self) -> Observation:
+        """(no,) observation."""
+        ...
+
+    @property
+    def reward(self) -> jax.Array:
+        """() reward of the step that led here."""
+        ...
+
+    @property
+    def done(self) -> jax.Array:
+        """() 1 where the episode has ended, else 0."""
+        ...
+
+    @property
+    def info(self) -> Mapping[str, Any]:
+        """Readings by name; :data:`INFO_KEYS` lists the keys."""
+        ...
+
+
+class Environment(Protocol):
+    """What an episode needs of an environment; :class:`newton_qd.Env` has it.
+
+    ``step`` takes the physical parameters of the world, too, where there are any.
+    """
+
+    @property
+    def observation_size(self) -> int:
+        """Length of an observation."""
+        ...
+
+    @property
+    def action_size(self) -> int:
+        """Length of an action."""
+        ...
+
+    def reset(self, rng: RNGKey, /) -> StateLike:
+        """Begins an episode."""
+        ...
+
+    def step(self, state: Any, action: Action, /) -> StateLike:
+        """Advances by one control step."""
+        ...
+
 
 INFO_KEYS: Mapping[str, str] = types.MappingProxyType(
     {

@@ -329,7 +329,7 @@ def test_what_no_episode_can_be_made_of() -> None:
     """Each error names the argument and what is allowed."""
     line: Any = Line(1.0)
     with pytest.raises(TypeError, match="env='hopper': allowed"):
-        make_episode("hopper", None, None, episode_length=4)
+        make_episode("hopper", None, None, episode_length=4)  # pyright: ignore[reportArgumentType]
     options: Any = {"clip": 1.0}
     with pytest.raises(TypeError, match=r"options=.*GradientOptions"):
         make_episode(line, None, None, episode_length=4, options=options)

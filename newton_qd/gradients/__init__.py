@@ -1,12 +1,14 @@
 """Gradients of fitness and descriptor over whole episodes, and what they are worth.
 
-- ``make_episode_gradient``: of a policy or of open-loop actions
-- ``make_directional_gradient``: of weighted sums of fitness and descriptor alone
-- ``make_mixed_gradient``: the same under noise, of first and zeroth order at once
+- ``Episode``: an environment under a policy or open-loop actions; its methods are
+  ``gradient``, ``directional`` (of weighted sums alone), ``mixed`` (of first and zeroth
+  order, under noise) and ``scoring`` (QDax's contract)
 - ``GradientOptions``: windows, clipping, discounting, memory
 - ``diagnose_gradients``: over how many steps the gradient can be used
 - ``soft_to_stiff``, ``softened``: softer contacts, and the way back
 - ``with_smooth_descriptor``: an environment whose descriptor has a gradient
+- ``make_episode``, ``make_episode_gradient``, ``make_directional_gradient``,
+  ``make_mixed_gradient``: deprecated; methods of ``Episode``
 
 Importing this package imports none of its parts: each name is loaded when it is
 first used.
@@ -19,19 +21,23 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from newton_qd.gradients.doctor import diagnose_gradients
-    from newton_qd.gradients.episode import Outcome, make_episode
-    from newton_qd.gradients.exact import (
-        EpisodeGradients,
+    from newton_qd.gradients.episode import Episode
+    from newton_qd.gradients.exact import EpisodeGradients
+    from newton_qd.gradients.factories import (
         make_directional_gradient,
+        make_episode,
         make_episode_gradient,
+        make_mixed_gradient,
     )
     from newton_qd.gradients.flow import GradientOptions
-    from newton_qd.gradients.mixed import MixedGradients, make_mixed_gradient
+    from newton_qd.gradients.mixed import MixedGradients
+    from newton_qd.gradients.outcome import Outcome
     from newton_qd.gradients.report import GradientReport
     from newton_qd.gradients.smooth import with_smooth_descriptor
     from newton_qd.gradients.softness import soft_to_stiff, softened
 
 __all__ = [
+    "Episode",
     "EpisodeGradients",
     "GradientOptions",
     "GradientReport",
@@ -48,16 +54,17 @@ __all__ = [
 ]
 
 _HOME = {
+    "Episode": "episode",
     "EpisodeGradients": "exact",
     "GradientOptions": "flow",
     "GradientReport": "report",
     "MixedGradients": "mixed",
-    "Outcome": "episode",
+    "Outcome": "outcome",
     "diagnose_gradients": "doctor",
-    "make_directional_gradient": "exact",
-    "make_episode": "episode",
-    "make_episode_gradient": "exact",
-    "make_mixed_gradient": "mixed",
+    "make_directional_gradient": "factories",
+    "make_episode": "factories",
+    "make_episode_gradient": "factories",
+    "make_mixed_gradient": "factories",
     "soft_to_stiff": "softness",
     "softened": "softness",
     "with_smooth_descriptor": "smooth",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,8 +12,8 @@ import numpy as np
 from newton_qd.envs.base import Env
 from newton_qd.envs.options import check_count
 from newton_qd.errors import FaultError
-from newton_qd.gradients.episode import Policy
 from newton_qd.registry import create
+from newton_qd.types import Genotype, Policy
 
 
 def refuse_faults(faulty: np.ndarray) -> None:
@@ -33,7 +32,7 @@ def refuse_faults(faulty: np.ndarray) -> None:
         )
 
 
-def checked_horizons(horizons: Any) -> tuple[int, ...]:
+def checked_horizons(horizons: Sequence[int] | np.ndarray) -> tuple[int, ...]:
     """Numbers of control steps.
 
     Raises:
@@ -52,8 +51,8 @@ def checked_horizons(horizons: Any) -> tuple[int, ...]:
 
 
 def checked_genotypes(
-    genotypes: Any, env: Env, policy: Policy | None, length: int
-) -> Any:
+    genotypes: Genotype | None, env: Env, policy: Policy | None, length: int
+) -> Genotype:
     """Genotypes in the precision of the environment; plans as long as is needed.
 
     Raises:
@@ -89,8 +88,13 @@ def checked_genotypes(
     return jax.tree.map(lambda x: jnp.asarray(x[:, : plan[0]], dtype), genotypes)
 
 
-def made_env(env: Env | str) -> Any:
-    """The environment to diagnose."""
+def made_env(env: Env | str) -> Env:
+    """The environment to diagnose.
+
+    Raises:
+        TypeError: It is neither a name nor an environment.
+        ValueError: It is in float32.
+    """
     if isinstance(env, str):
         return create(env, episode_length=None, auto_reset=False, dtype="float64")
     if not hasattr(env, "step"):

@@ -1,4 +1,4 @@
-"""One episode of one world: its fitness and its descriptor."""
+"""Episodes of an environment: what they come to, and the gradients of that."""
 
 from __future__ import annotations
 
@@ -6,140 +6,162 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable
-from types import NoneType
-from typing import Any, Protocol
+from typing import Any, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from newton_qd.envs.options import check_count
-from newton_qd.envs.state import State, select
+from newton_qd.envs.options import check_count, check_flag
+from newton_qd.envs.state import select
 from newton_qd.extractors import Trajectories
-from newton_qd.gradients.flow import GradientOptions, passed_back
-from newton_qd.types import Params
+from newton_qd.gradients.exact import EpisodeGradient, EpisodeGradients, differentiate
+from newton_qd.gradients.flow import EXACT, GradientOptions, passed_back, scan_keeping
+from newton_qd.gradients.mixed import (
+    MixedGradients,
+    check_mixture,
+    mixed_gradients,
+)
+from newton_qd.gradients.outcome import Outcome, at_fault, transition
+from newton_qd.gradients.scores import gradient_scores, scores
+from newton_qd.moved import moved_name
+from newton_qd.types import (
+    DescriptorExtractor,
+    Environment,
+    ExtraScores,
+    Genotype,
+    Params,
+    Policy,
+    PyTree,
+    RNGKey,
+    ScoringFunction,
+    StateLike,
+)
 
-Policy = Callable[[Any, jax.Array], jax.Array]
-"""Maps the parameters of a policy and an observation (no,) to an action (nu,)."""
+_MOVED = {
+    "make_episode": "newton_qd.gradients.make_episode",
+}
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class Outcome:
-    """What an episode came to.
+def __getattr__(name: str) -> Any:
+    """Finds what has left this module."""
+    return moved_name(__name__, name, _MOVED)
+
+
+Start: TypeAlias = RNGKey | StateLike
+"""Where an episode begins: a key of the reset, or a state of one world."""
+
+_Same = TypeVar("_Same")
+
+
+def itself(genotype: _Same) -> _Same:
+    """Returns the genotype: its parameters are the genotype itself."""
+    return genotype
+
+
+@jax.tree_util.register_static
+@dataclasses.dataclass(frozen=True, eq=False)
+class Episode:
+    """One episode of an environment under a policy, and its gradients.
+
+    Every method is a pure function that ``jax.jit`` and ``jax.vmap`` take; an episode
+    is immutable, compares and hashes by identity, and is static where a transformed
+    function takes it as an argument. Called, it runs one world; it is differentiable in
+    the genotype, in the state that it begins from and in the physical parameters of the
+    world. The other methods take N genotypes, a pytree whose leaves have N in front,
+    and share one start among them.
+
+        episode = Episode(env, policy, extractor, episode_length=100)
+        outcome = episode(genotype, key)
+        found = jax.jit(episode.gradient)(genotypes, key)
+        score = jax.jit(episode.scoring(episode.gradient))
 
     Attributes:
-        fitness: () sum of the rewards up to the first ``done``.
-        descriptor: (D,) descriptor of the episode.
-        faulty: () whether the world was at fault before the episode ended, or
-            fitness or descriptor are not finite: they mean nothing then.
-        transitions: Empty, or the fields of QDax's ``QDTransition`` by name,
-            (T, ...) each.
-    """
-
-    fitness: jax.Array
-    descriptor: jax.Array
-    faulty: jax.Array
-    transitions: dict[str, jax.Array] = dataclasses.field(default_factory=dict)
-
-
-class Episode(Protocol):
-    """Runs one episode of one world; see :func:`make_episode`."""
-
-    def __call__(
-        self, genotype: Any, start: jax.Array | State, params: Params = None, /
-    ) -> Outcome:
-        """Returns what the episode came to.
-
-        Args:
-            genotype: Whose policy acts, or the actions.
-            start: Key of the reset, or the state that the episode begins from.
-            params: Physical parameters of the world; ``None``: as in its files.
-        """
-        ...
-
-
-def make_episode(
-    env: Any,
-    policy: Policy | None,
-    descriptor_extractor: Callable[[Any, jax.Array], jax.Array] | None,
-    *,
-    episode_length: int,
-    unravel: Callable[[Any], Any] = lambda genotype: genotype,
-    options: GradientOptions | None = None,
-    transitions: bool = False,
-) -> Episode:
-    """Builds the function that runs one episode.
-
-    It is differentiable in the genotype, in the state that the episode begins from and
-    in the physical parameters of the world.
-
-    Args:
         env: Environment of one world without auto-reset; with
-            ``info["state_descriptor"]`` where a descriptor is extracted.
+            ``info["state_descriptor"]`` where a descriptor is extracted. The descriptor
+            has a gradient where the environment's does: see
+            :func:`~newton_qd.gradients.with_smooth_descriptor`.
         policy: Maps parameters and an observation to an action; ``None``: the
             parameters are the actions themselves, (episode_length, nu) or as many
             numbers in another shape.
         descriptor_extractor: Maps ``(data, mask)`` to descriptors (1, D), with
             ``data.state_desc`` (1, T, nd) and ``mask`` (1, T) equal to 1 after the
             end of the episode; ``newton_qd.tables.descriptor_extractor`` has those of
-            tasks. ``None``: the descriptor is empty.
-        episode_length: Control steps.
+            tasks. ``None``: the descriptor is empty, and the fitness alone has a
+            gradient.
+        episode_length: Control steps; a reward counts up to the first ``done``.
+        options: What becomes of a gradient on its way back through the episode:
+            windows, clipping, discounting and memory. By default it is exact, and one
+            state is kept per control step. The value never changes.
         unravel: Maps a genotype to the parameters, once an episode.
-        options: What becomes of the gradient on its way back; ``None``: no care is
-            taken of its memory, and it is exact.
         transitions: Whether to return the steps, for algorithms that learn from
             them. An episode that ends early is followed by another one then, which
             counts for nothing else.
 
-    Returns:
-        Function of the genotype, of the key of the reset or a first state, and of
-        physical parameters, if any. Under ``jax.vmap`` the worlds share the launches,
-        and so do the rows of a Jacobian.
-
     Raises:
-        TypeError: ``env`` is no environment, or ``options`` something else.
+        TypeError: ``env`` is no environment, ``policy``, ``descriptor_extractor`` or
+            ``unravel`` no function, ``options`` something else than ``GradientOptions``
+            or ``transitions`` neither true nor false.
         ValueError: ``episode_length`` is not an integer from 1.
     """
-    check_count("episode_length", episode_length)
-    if not hasattr(env, "step"):
-        raise TypeError(f"env={env!r}: allowed: an environment, as create() makes it")
-    if not isinstance(options, (GradientOptions, NoneType)):
-        raise TypeError(f"options={options!r}: allowed: None, or GradientOptions")
-    kept = options or GradientOptions(checkpoint_every=None)
-    return _Run(
-        env, policy, descriptor_extractor, episode_length, unravel, kept, transitions
-    )
 
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Run:
-    """The function that ``make_episode`` returns, whose arguments its fields are."""
-
-    env: Any
-    policy: Policy | None
-    descriptor_extractor: Callable[[Any, jax.Array], jax.Array] | None
+    env: Environment
+    policy: Policy | None = None
+    descriptor_extractor: DescriptorExtractor | None = None
+    _: dataclasses.KW_ONLY
     episode_length: int
-    unravel: Callable[[Any], Any]
-    options: GradientOptions
-    transitions: bool
+    options: GradientOptions = EXACT
+    unravel: Callable[[Genotype], PyTree] = itself
+    transitions: bool = False
+
+    def __post_init__(self) -> None:
+        """Checks every value."""
+        check_count("episode_length", self.episode_length)
+        if not hasattr(self.env, "step"):
+            raise TypeError(
+                f"env={self.env!r}: allowed: an environment, as create() makes it"
+            )
+        for name, needed in (
+            ("policy", "None, or a function of parameters and an observation"),
+            ("descriptor_extractor", "None, or a function of transitions and a mask"),
+            ("unravel", "a function of a genotype"),
+        ):
+            value = getattr(self, name)
+            optional = name != "unravel" and value is None
+            if not (optional or callable(value)):
+                raise TypeError(f"{name}: got {value!r}; allowed: {needed}")
+        if not isinstance(self.options, GradientOptions):
+            raise TypeError(f"options={self.options!r}: allowed: GradientOptions")
+        check_flag("transitions", self.transitions)
 
     def __call__(
-        self, genotype: Any, start: jax.Array | State, params: Params = None, /
+        self, genotype: Genotype, start: Start, params: Params = None, /
     ) -> Outcome:
-        """Runs the episode."""
+        """Runs the episode in one world.
+
+        Args:
+            genotype: Whose policy acts, or the actions.
+            start: Key of the reset, or the state that the episode begins from.
+            params: Physical parameters of the world; ``None``: as in its files.
+
+        Raises:
+            TypeError: ``start`` is neither a key nor a state.
+            ValueError: ``start`` is a state of several worlds or without the state
+                descriptor that is read, or the genotype is no plan of actions where
+                there is no policy.
+        """
         parameters = self.unravel(genotype)
         is_key = isinstance(start, (jax.Array, np.ndarray))
-        first = self.env.reset(start) if is_key else start
+        first: Any = self.env.reset(start) if is_key else start
         self._check_first(first)
         dtype, steps = first.reward.dtype, self.episode_length
-        rows: dict[str, Any] = {}
+        rows: dict[str, jax.Array | np.ndarray] = {}
         if not self.options.exact:
             rows["factor"] = self.options.factors(steps).astype(dtype)
         if self.policy is None:
             rows["action"] = self._plan(parameters)
         no = jnp.zeros((), bool)
-        (_, fitness, _, bad), (readings, over, taken) = _scan(
+        (_, fitness, _, bad), (readings, over, taken) = scan_keeping(
             functools.partial(self._advance, parameters, first, params),
             (first, jnp.zeros((), dtype), no, no),
             rows,
@@ -152,6 +174,141 @@ class _Run:
             descriptor = self.descriptor_extractor(data, mask)[0]
         bad = bad | ~jnp.isfinite(fitness) | ~jnp.all(jnp.isfinite(descriptor))
         return Outcome(fitness, descriptor, bad, taken)
+
+    def gradient(
+        self, genotypes: Genotype, start: Start, params: Params = None
+    ) -> EpisodeGradients:
+        """Runs N episodes, with the gradients of fitness and descriptor.
+
+        All rows of the Jacobian go back through the episode at once: a launch of the
+        physics' adjoint has N (1 + D) worlds. The values are bitwise those of the
+        episode without gradients.
+
+        Args:
+            genotypes: Leaves (N, ...).
+            start: One key of the reset, or one state, for all.
+            params: Physical parameters of all worlds; ``None``: as in their files.
+
+        Raises:
+            TypeError: As when the episode is called.
+            ValueError: Likewise.
+        """
+        axes = (0, None, None, None)
+        return jax.vmap(self._differentiated, axes)(genotypes, None, start, params)
+
+    def directional(
+        self,
+        genotypes: Genotype,
+        weights: jax.Array,
+        start: Start,
+        params: Params = None,
+    ) -> EpisodeGradients:
+        """Runs N episodes, with the gradients of weighted sums of their results.
+
+        What :meth:`gradient` gives, multiplied by weights, for the price of as many
+        rows as there are sums: a launch of the physics' adjoint has N R worlds.
+
+        Args:
+            genotypes: Leaves (N, ...).
+            weights: (N, R, 1 + D), of the fitness first, then of each component of the
+                descriptor.
+            start: One key of the reset, or one state, for all.
+            params: Physical parameters of all worlds; ``None``: as in their files.
+
+        Returns:
+            Gradients with the rows of the sums, leaves (N, R, ...), and ``overflowed``
+            (N, R).
+
+        Raises:
+            TypeError: As when the episode is called.
+            ValueError: Likewise.
+        """
+        axes = (0, 0, None, None)
+        return jax.vmap(self._differentiated, axes)(genotypes, weights, start, params)
+
+    def mixed(
+        self,
+        genotypes: Genotype,
+        key: RNGKey,
+        params: Params = None,
+        *,
+        samples: int = 16,
+        sigma: float = 0.02,
+        tolerance: float = math.inf,
+    ) -> MixedGradients:
+        """Runs N episodes, with gradients of first and zeroth order under noise.
+
+        It estimates the gradient of the mean of f(x + w), w normal with standard
+        deviation ``sigma``, by alpha times the mean gradient of the samples plus
+        (1 - alpha) times the mean of (f(x + w) - f(x - w)) w / (2 sigma^2), in pairs of
+        w and -w. Alpha weights them by their inverse variances, and less where the two
+        differ by more than the tolerance: the alpha-order gradient of Suh et al. 2022,
+        "Do differentiable simulators give better policy gradients?", whose error bound
+        of the zeroth order is its standard error here.
+
+        Args:
+            genotypes: Leaves (N, ...).
+            key: Of the reset that all share; it gives the noise, too.
+            params: Physical parameters of all worlds; ``None``: as in their files.
+            samples: Pairs of samples of a genotype, from 2; N individuals are
+                2 N ``samples`` worlds, in one launch.
+            sigma: Standard deviation of the noise, in the units of the genotype.
+            tolerance: Error that the estimate may have where first and zeroth order
+                disagree, in units of the gradient; infinite: inverse variances alone,
+                which trusts a first order that is wrong without being noisy.
+
+        Raises:
+            TypeError: A setting is no number, or as when the episode is called.
+            ValueError: A setting is out of its range, or likewise.
+        """
+        check_mixture(samples, sigma, tolerance)
+        return mixed_gradients(
+            jax.vmap(self, (0, None, None))(genotypes, key, params),
+            lambda around: self.gradient(around, key, params),
+            genotypes,
+            jax.random.fold_in(key, 1),
+            samples=samples,
+            sigma=sigma,
+            tolerance=tolerance,
+        )
+
+    def scoring(self, gradient: EpisodeGradient | None = None) -> ScoringFunction:
+        """Returns the episode as QDax's scoring function, for any algorithm of QDax.
+
+        Args:
+            gradient: Maps genotypes and a key to gradients: :meth:`gradient`, or
+                ``functools.partial(episode.mixed, sigma=0.05)``; ``None``: the scores
+                have none.
+
+        Returns:
+            Function of genotypes, leaves (N, ...), and one key of the reset; returns
+            fitnesses (N,), ``-inf`` where a world was at fault, descriptors (N, D) and
+            a dictionary. With gradients it holds ``gradients``, every leaf of the
+            genotypes with an axis of 1 + D behind, the fitness first;
+            ``normalized_grads``, the same with Euclidean norm 1 over a genotype, or 0
+            where the gradient is; ``faulty`` (N,) and ``overflowed`` (N, 1 + D), whose
+            gradients were set to 0. Without, it holds ``transitions``, if the episode
+            returns them: the fields of QDax's ``QDTransition`` by name, (N, T, ...).
+        """
+        if gradient is None:
+            return self._score
+        return lambda genotypes, key: gradient_scores(gradient(genotypes, key))
+
+    def _score(
+        self, genotypes: Genotype, key: RNGKey
+    ) -> tuple[jax.Array, jax.Array, ExtraScores]:
+        """Fitnesses (N,), descriptors (N, D), and transitions, if any."""
+        return scores(jax.vmap(self, (0, None))(genotypes, key))
+
+    def _differentiated(
+        self,
+        genotype: Genotype,
+        weights: jax.Array | None,
+        start: Start,
+        params: Params,
+    ) -> EpisodeGradients:
+        """One episode with its gradient along weights (R, 1 + D); ``None``: each."""
+        return differentiate(lambda x: self(x, start, params), genotype, weights)
 
     def _check_first(self, first: Any) -> None:
         """Raises for what no episode can begin from."""
@@ -172,7 +329,7 @@ class _Run:
                 "ant_uni, or descriptor_extractor=None without transitions"
             )
 
-    def _plan(self, parameters: Any) -> jax.Array:
+    def _plan(self, parameters: PyTree) -> jax.Array:
         """Open-loop actions (episode_length, nu)."""
         shape = (self.episode_length, self.env.action_size)
         if np.size(parameters) != math.prod(shape):
@@ -183,7 +340,12 @@ class _Run:
         return jnp.asarray(parameters).reshape(shape)
 
     def _advance(
-        self, parameters: Any, first: State, params: Params, carry: tuple, row: Any
+        self,
+        parameters: PyTree,
+        first: StateLike,
+        params: Params,
+        carry: tuple[Any, jax.Array, jax.Array, jax.Array],
+        row: dict[str, jax.Array],
     ) -> tuple[tuple, tuple]:
         """One control step; hands on state, fitness, whether it is over, and faults."""
         begin, fitness, over, bad = carry
@@ -195,9 +357,9 @@ class _Run:
         else:
             action = self.policy(parameters, state.obs)
         # an environment of one's own may have a step without parameters
-        own = () if params is None else (params,)
-        state = self.env.step(state, action, *own)
-        steps = _transition(begin, action, state) if self.transitions else {}
+        step: Callable[..., StateLike] = self.env.step
+        state = step(state, action) if params is None else step(state, action, params)
+        steps = transition(begin, action, state) if self.transitions else {}
         # The sum runs in time order here, not in a reduction over time, so that a
         # row's return does not depend on the size of the batch.
         fitness = jnp.where(over, fitness, fitness + state.reward)
@@ -209,56 +371,3 @@ class _Run:
         if self.transitions:
             state = select(ended, first, state)
         return (state, fitness, over | ended, bad), (reading, over, steps)
-
-
-def _scan(
-    body: Callable[[Any, Any], tuple[Any, Any]],
-    carry: Any,
-    rows: Any,
-    steps: int,
-    every: int | None,
-) -> tuple[Any, Any]:
-    """``jax.lax.scan`` that keeps a carry every so many steps for its gradient."""
-    if every is None:
-        return jax.lax.scan(body, carry, rows, length=steps)
-    if every == 1:
-        body = jax.checkpoint(body, prevent_cse=False)
-        return jax.lax.scan(body, carry, rows, length=steps)
-    every = min(every, steps)
-    segments = steps // every
-    cut = segments * every
-
-    def segment(carry: Any, rows: Any, length: int = every) -> tuple[Any, Any]:
-        return jax.lax.scan(body, carry, rows, length=length)
-
-    heads = jax.tree.map(lambda x: x[:cut].reshape(segments, every, *x.shape[1:]), rows)
-    kept = jax.checkpoint(segment, prevent_cse=False)
-    carry, readings = jax.lax.scan(kept, carry, heads, length=segments)
-    readings = jax.tree.map(lambda x: x.reshape(cut, *x.shape[2:]), readings)
-    if cut == steps:
-        return carry, readings
-    tail = jax.tree.map(lambda x: x[cut:], rows)
-    kept = jax.checkpoint(functools.partial(segment, length=steps - cut))
-    carry, last = kept(carry, tail)
-    return carry, jax.tree.map(lambda *x: jnp.concatenate(x), readings, last)
-
-
-def _transition(begin: Any, action: jax.Array, end: Any) -> dict[str, jax.Array]:
-    """The fields of QDax's ``QDTransition`` for one step."""
-    return {
-        "obs": begin.obs,
-        "next_obs": end.obs,
-        "rewards": end.reward,
-        "dones": end.done,
-        "truncations": end.info["truncation"],
-        "actions": action,
-        "state_desc": begin.info["state_descriptor"],
-        "next_state_desc": end.info["state_descriptor"],
-    }
-
-
-def at_fault(state: Any) -> jax.Array:
-    """Whether the physics contained a value that is not finite."""
-    if "fault" in state.info:
-        return state.info["fault"] != 0
-    return jnp.zeros((), bool)

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Any, TypeVar
+from collections.abc import Callable
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from newton_qd.envs.options import check_positive, is_number
+from newton_qd.types import PyTree
 
 Tree = TypeVar("Tree")
+Carry = TypeVar("Carry")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -37,6 +40,10 @@ class GradientOptions:
             step is kept; with the square root of the episode's length, the memory is
             least. ``None``: every intermediate of the environment and of the policy
             is kept and only the physics computed again, the fastest.
+
+    Raises:
+        TypeError: ``clip`` or ``discount`` is no number.
+        ValueError: A value is out of its range, or a number of steps no integer.
     """
 
     window: int | None = None
@@ -71,11 +78,15 @@ class GradientOptions:
         return factors
 
 
+EXACT = GradientOptions()
+"""The exact gradient; one state is kept per control step."""
+
+
 def passed_back(tree: Tree, factor: jax.Array, clip: float | None) -> Tree:
     """Returns a pytree as it is, and changes the gradient that flows back into it.
 
     Args:
-        tree: Any pytree; leaves that are not floating-point have no gradient.
+        tree: PyTree pytree; leaves that are not floating-point have no gradient.
         factor: () by which the gradient is multiplied; at 0 it is exactly 0, whatever
             flowed in.
         clip: Largest norm of the gradient before that; ``None``: no limit.
@@ -122,7 +133,53 @@ def _backward(
 _identity.defvjp(_forward, _backward)
 
 
-def tree_norm(tree: Any) -> jax.Array:
+def scan_keeping(
+    body: Callable[[Carry, PyTree], tuple[Carry, PyTree]],
+    carry: Carry,
+    rows: PyTree,
+    steps: int,
+    every: int | None,
+) -> tuple[Carry, PyTree]:
+    """``jax.lax.scan`` that keeps a carry every so many steps for its gradient.
+
+    Args:
+        body: Maps a carry and a row to the next carry and to a reading.
+        carry: The first one.
+        rows: Leaves (steps, ...).
+        steps: Number of steps.
+        every: Steps between the carries that are kept; what lies between is computed
+            again. ``None``: every intermediate is kept.
+
+    Returns:
+        The last carry, and the readings, leaves (steps, ...).
+    """
+    if every is None:
+        return jax.lax.scan(body, carry, rows, length=steps)
+    if every == 1:
+        body = jax.checkpoint(body, prevent_cse=False)
+        return jax.lax.scan(body, carry, rows, length=steps)
+    every = min(every, steps)
+    segments = steps // every
+    cut = segments * every
+
+    def segment(
+        carry: Carry, rows: PyTree, length: int = every
+    ) -> tuple[Carry, PyTree]:
+        return jax.lax.scan(body, carry, rows, length=length)
+
+    heads = jax.tree.map(lambda x: x[:cut].reshape(segments, every, *x.shape[1:]), rows)
+    kept = jax.checkpoint(segment, prevent_cse=False)
+    carry, readings = jax.lax.scan(kept, carry, heads, length=segments)
+    readings = jax.tree.map(lambda x: x.reshape(cut, *x.shape[2:]), readings)
+    if cut == steps:
+        return carry, readings
+    tail = jax.tree.map(lambda x: x[cut:], rows)
+    kept = jax.checkpoint(functools.partial(segment, length=steps - cut))
+    carry, last = kept(carry, tail)
+    return carry, jax.tree.map(lambda *x: jnp.concatenate(x), readings, last)
+
+
+def tree_norm(tree: PyTree) -> jax.Array:
     """Euclidean norm () over all leaves; for use without gradient.
 
     Args:
@@ -135,7 +192,7 @@ def tree_norm(tree: Any) -> jax.Array:
     return unit * jnp.sqrt(functools.reduce(jnp.add, squares))
 
 
-def tree_largest(tree: Any) -> jax.Array:
+def tree_largest(tree: PyTree) -> jax.Array:
     """Largest magnitude () over all leaves; for use without gradient.
 
     Args:

@@ -13,14 +13,19 @@ import jax.numpy as jnp
 
 from newton_qd.envs.options import check_count, check_positive
 from newton_qd.envs.state import select
-from newton_qd.gradients.episode import Policy, make_episode
-from newton_qd.gradients.exact import (
-    EpisodeGradient,
-    EpisodeGradients,
-    finite_rows,
-    make_episode_gradient,
-)
-from newton_qd.gradients.flow import GradientOptions
+from newton_qd.gradients.exact import EpisodeGradients, finite_rows
+from newton_qd.gradients.outcome import Outcome
+from newton_qd.moved import moved_name
+from newton_qd.types import Genotype, PyTree, RNGKey
+
+_MOVED = {
+    "make_mixed_gradient": "newton_qd.gradients.make_mixed_gradient",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Finds what has left this module."""
+    return moved_name(__name__, name, _MOVED)
 
 
 @jax.tree_util.register_dataclass
@@ -48,45 +53,8 @@ class MixedGradients(EpisodeGradients):
     bias: jax.Array
 
 
-def make_mixed_gradient(
-    env: Any,
-    policy: Policy | None,
-    descriptor_extractor: Callable[[Any, jax.Array], jax.Array] | None,
-    *,
-    episode_length: int,
-    unravel: Callable[[Any], Any] = lambda genotype: genotype,
-    options: GradientOptions | None = None,
-    samples: int = 16,
-    sigma: float = 0.02,
-    tolerance: float = math.inf,
-) -> Callable[[Any, jax.Array], MixedGradients]:
-    """Builds the alpha-order gradient of an episode under noise on its genotype.
-
-    It estimates the gradient of the mean of f(x + w), w normal with standard deviation
-    ``sigma``, by alpha times the mean gradient of the samples plus (1 - alpha) times
-    the mean of (f(x + w) - f(x - w)) w / (2 sigma^2), in pairs of w and -w. Alpha
-    weights them by their inverse variances, and less where the two differ by more
-    than the tolerance: the alpha-order gradient of Suh et al. 2022, "Do differentiable
-    simulators give better policy gradients?", whose error bound of the zeroth order is
-    its standard error here.
-
-    Args:
-        env: As in :func:`~newton_qd.gradients.make_episode_gradient`; so are the
-            policy, the extractor, the episode length, ``unravel`` and ``options``.
-        policy: Maps parameters and an observation to an action, or ``None``.
-        descriptor_extractor: Reads the descriptor of an episode.
-        episode_length: Control steps.
-        unravel: Maps a genotype to the parameters of the policy.
-        options: Windows, clipping, discounting and memory of the first order.
-        samples: Pairs of samples of a genotype, from 2; N individuals are
-            2 N ``samples`` worlds, in one launch.
-        sigma: Standard deviation of the noise, in the units of the genotype.
-        tolerance: Error that the estimate may have where first and zeroth order
-            disagree, in units of the gradient; infinite: inverse variances alone,
-            which trusts a first order that is wrong without being noisy.
-
-    Returns:
-        Function of genotypes and a key: the reset's, which gives the noise too.
+def check_mixture(samples: int, sigma: float, tolerance: float) -> None:
+    """Checks the settings of a mixed gradient.
 
     Raises:
         TypeError: A setting is no number.
@@ -95,23 +63,37 @@ def make_mixed_gradient(
     check_count("samples", samples, 2)
     check_positive("sigma", sigma)
     check_positive("tolerance", tolerance, endless=True)
-    subject = (env, policy, descriptor_extractor)
-    common: dict[str, Any] = {"episode_length": episode_length, "unravel": unravel}
-    episode = make_episode(*subject, **common)
-    gradient = make_episode_gradient(*subject, **common, options=options)
+
+
+def mixed_gradients(
+    centre: Outcome,
+    gradient: Callable[[Genotype], EpisodeGradients],
+    genotypes: Genotype,
+    noise_key: RNGKey,
+    *,
+    samples: int,
+    sigma: float,
+    tolerance: float,
+) -> MixedGradients:
+    """Alpha-order gradients of N individuals; :meth:`Episode.mixed` says what they are.
+
+    Args:
+        centre: Their episodes without noise, leaves (N, ...).
+        gradient: Maps any number of genotypes to values and first-order gradients.
+        genotypes: Leaves (N, ...).
+        noise_key: Of the noise.
+        samples: Pairs of samples of a genotype.
+        sigma: Standard deviation of the noise, in the units of the genotype.
+        tolerance: Error allowed where the two orders disagree.
+    """
+    noise = _noise(noise_key, genotypes, samples, sigma)
+    found = _pairs(gradient, genotypes, noise)
     combine = functools.partial(_combined, sigma=sigma, tolerance=tolerance)
-
-    def mixed(genotypes: Any, key: jax.Array) -> MixedGradients:
-        noise = _noise(jax.random.fold_in(key, 1), genotypes, samples, sigma)
-        found = _pairs(gradient, genotypes, noise, key)
-        centre = jax.vmap(episode, in_axes=(0, None))(genotypes, key)
-        return jax.vmap(combine)(centre, found, noise)
-
-    return mixed
+    return jax.vmap(combine)(centre, found, noise)
 
 
 def _pairs(
-    gradient: EpisodeGradient, genotypes: Any, noise: Any, key: jax.Array
+    gradient: Callable[[Genotype], EpisodeGradients], genotypes: Genotype, noise: PyTree
 ) -> EpisodeGradients:
     """Values and gradients at x + w and x - w, leaves (N, samples, 2, ...)."""
     signs = jnp.array([1, -1], jnp.int32)
@@ -121,11 +103,11 @@ def _pairs(
         noise,
     )
     shape = jax.tree.leaves(around)[0].shape[:3]
-    found = gradient(jax.tree.map(lambda x: x.reshape(-1, *x.shape[3:]), around), key)
+    found = gradient(jax.tree.map(lambda x: x.reshape(-1, *x.shape[3:]), around))
     return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), found)
 
 
-def _noise(key: jax.Array, genotypes: Any, samples: int, sigma: float) -> Any:
+def _noise(key: RNGKey, genotypes: Genotype, samples: int, sigma: float) -> PyTree:
     """Normal noise of every genotype, leaves (N, samples, ...)."""
     leaves, structure = jax.tree.flatten(genotypes)
     keys = jax.random.split(key, len(leaves))
@@ -143,7 +125,12 @@ def _like(factors: jax.Array, array: jax.Array) -> jax.Array:
 
 
 def _combined(
-    centre: Any, found: EpisodeGradients, noise: Any, *, sigma: float, tolerance: float
+    centre: Outcome,
+    found: EpisodeGradients,
+    noise: PyTree,
+    *,
+    sigma: float,
+    tolerance: float,
 ) -> MixedGradients:
     """The estimate of one individual from its pairs (samples, 2, ...)."""
     sound = ~found.faulty.any(axis=1)
@@ -156,7 +143,7 @@ def _combined(
     few = (sound.sum() < 2) | (lost & jnp.isinf(mixed.zeroth_variance))
     zeros = jax.tree.map(jnp.zeros_like, mixed.gradients)
     return MixedGradients(
-        fitnesses=jnp.where(centre.faulty, -jnp.inf, centre.fitness),
+        fitnesses=centre.admitted_fitness,
         descriptors=centre.descriptor,
         gradients=select(~few & ~centre.faulty, mixed.gradients, zeros),
         faulty=centre.faulty,
@@ -173,9 +160,9 @@ def _combined(
 class Mixture:
     """Alpha-order, first- and zeroth-order gradients (rows, ...), and their worth."""
 
-    gradients: Any
-    first: Any
-    zeroth: Any
+    gradients: PyTree
+    first: PyTree
+    zeroth: PyTree
     order: jax.Array
     first_variance: jax.Array
     zeroth_variance: jax.Array
@@ -184,8 +171,8 @@ class Mixture:
 
 def mixture(
     values: jax.Array,
-    gradients: Any,
-    noise: Any,
+    gradients: PyTree,
+    noise: PyTree,
     sound: jax.Array,
     lost: jax.Array,
     *,
@@ -245,12 +232,12 @@ def mixture(
 
 def _samples(
     values: jax.Array,
-    gradients: Any,
-    noise: Any,
+    gradients: PyTree,
+    noise: PyTree,
     sound: jax.Array,
     lost: jax.Array,
     sigma: float,
-) -> tuple[Any, Any, jax.Array]:
+) -> tuple[PyTree, PyTree, jax.Array]:
     """Samples of first and zeroth order (n, rows, ...), and which of these are none.
 
     Those that are not finite, ``lost`` ones and those of the zeroth order that the last
@@ -264,7 +251,7 @@ def _samples(
     first = jax.tree.map(lambda g: 0.5 * g[:, 0] + 0.5 * g[:, 1], gradients)
     missing = ~jax.vmap(finite_rows)(zeroth).all(axis=0)
 
-    def without(samples: Any, gone: jax.Array) -> Any:
+    def without(samples: PyTree, gone: jax.Array) -> PyTree:
         return jax.tree.map(lambda x: jnp.where(_rows(gone, x), 0, x), samples)
 
     return without(first, lost), without(zeroth, missing), missing
@@ -275,12 +262,12 @@ def _rows(factors: jax.Array, samples: jax.Array) -> jax.Array:
     return factors.reshape(-1, *[1] * (samples.ndim - 2))
 
 
-def _scaled(samples: Any, unit: jax.Array) -> Any:
+def _scaled(samples: PyTree, unit: jax.Array) -> PyTree:
     """Samples (n, rows, ...) in units (rows,)."""
     return jax.tree.map(lambda x: x / _rows(unit, x), samples)
 
 
-def _unit(samples: Any) -> jax.Array:
+def _unit(samples: PyTree) -> jax.Array:
     """Power of two (rows,) near the largest number of samples (n, rows, ...), or 1."""
     sizes = [
         jnp.abs(jnp.moveaxis(x, 1, 0)).reshape(x.shape[1], -1).max(axis=1, initial=0)
@@ -292,7 +279,7 @@ def _unit(samples: Any) -> jax.Array:
     return jnp.where(largest > 0, jnp.ldexp(one, exponent), one)
 
 
-def _mean_and_variance(samples: Any, sound: jax.Array) -> tuple[Any, jax.Array]:
+def _mean_and_variance(samples: PyTree, sound: jax.Array) -> tuple[PyTree, jax.Array]:
     """Mean over sound samples, leaves (rows, ...), and total variance (rows,)."""
     count = sound.sum()
 
@@ -307,7 +294,7 @@ def _mean_and_variance(samples: Any, sound: jax.Array) -> tuple[Any, jax.Array]:
     return means, total * count / jnp.maximum(count - 1, 1)
 
 
-def _squared(rows: Any) -> jax.Array:
+def _squared(rows: PyTree) -> jax.Array:
     """Squared norm (rows,) of leaves (rows, ...)."""
     squares = [jnp.square(x).reshape(x.shape[0], -1) for x in jax.tree.leaves(rows)]
     return functools.reduce(jnp.add, [x.sum(axis=1) for x in squares])

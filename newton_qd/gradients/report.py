@@ -7,9 +7,9 @@ import dataclasses
 import importlib.util
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from newton_qd.errors import MissingExtra
 from newton_qd.files import write_atomically
@@ -115,7 +115,7 @@ class GradientReport:
         """Control steps up to which first orders vary less than zeroth ones, or 0."""
         return self._last(lambda row: row.order > 0.5)
 
-    def _last(self, good: Any) -> int:
+    def _last(self, good: Callable[[HorizonRow], bool]) -> int:
         last = 0
         for row in self.horizons:
             if not good(row):
@@ -308,7 +308,7 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     ]
 
 
-def _csv_text(kind: type, rows: Sequence[Any]) -> str:
+def _csv_text(kind: type, rows: Sequence[HorizonRow | ContactRow]) -> str:
     names = [field.name for field in dataclasses.fields(kind)]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
-from newton_qd.envs.base import PhysicsEnv
+from newton_qd.envs.base import Env, PhysicsEnv
 from newton_qd.envs.options import check_positive
 from newton_qd.robots import Material
 
@@ -36,7 +36,7 @@ def softened(material: Material, factor: float) -> Material:
     return dataclasses.replace(material, **changes)
 
 
-def soft_to_stiff(env: Any, factors: Sequence[float] = (4, 2, 1)) -> tuple[Any, ...]:
+def soft_to_stiff(env: Env, factors: Sequence[float] = (4, 2, 1)) -> tuple[Any, ...]:
     """Returns the environment with its softness multiplied, for a continuation.
 
     Optimize in the first one, go on from there in the next, and end with the one that

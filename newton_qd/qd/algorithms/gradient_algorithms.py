@@ -7,7 +7,7 @@ import functools
 from collections.abc import Mapping
 from typing import Any
 
-from newton_qd.gradients.exact import make_directional_gradient
+from newton_qd.gradients.factories import make_directional_gradient
 from newton_qd.qd.algorithms.gradient_options import (
     FlowOptions,
     MixedOptions,

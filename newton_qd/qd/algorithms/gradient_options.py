@@ -7,9 +7,8 @@ import functools
 from collections.abc import Mapping
 from typing import Any
 
-from newton_qd.gradients.exact import make_episode_gradient
+from newton_qd.gradients.factories import make_episode_gradient, make_mixed_gradient
 from newton_qd.gradients.flow import GradientOptions
-from newton_qd.gradients.mixed import make_mixed_gradient
 from newton_qd.gradients.smooth import with_smooth_descriptor
 from newton_qd.qd.algorithms.parts import refused_options, settings
 from newton_qd.qd.config import EvolveConfig

@@ -8,11 +8,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from newton_qd.gradients.exact import (
-    EpisodeGradient,
-    EpisodeGradients,
-    make_episode_gradient,
-)
+from newton_qd.gradients.exact import EpisodeGradient, EpisodeGradients
+from newton_qd.gradients.factories import make_episode_gradient
 from newton_qd.gradients.flow import GradientOptions, tree_largest, tree_norm
 from newton_qd.qd.scoring.rollout import Policy, ScoringFunction
 from newton_qd.qd.scoring.task import Task

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from newton_qd.gradients.episode import make_episode
+from newton_qd.gradients.factories import make_episode
 from newton_qd.qd.extras import require_extra
 from newton_qd.qd.scoring.task import Task
 

@@ -1,0 +1,64 @@
+"""What a step and an episode of one world came to."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+
+from newton_qd.types import Action, StateLike
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What an episode came to.
+
+    Attributes:
+        fitness: () sum of the rewards up to the first ``done``.
+        descriptor: (D,) descriptor of the episode.
+        faulty: () whether the world was at fault before the episode ended, or
+            fitness or descriptor are not finite: they mean nothing then.
+        transitions: Empty, or the fields of QDax's ``QDTransition`` by name,
+            (T, ...) each.
+    """
+
+    fitness: jax.Array
+    descriptor: jax.Array
+    faulty: jax.Array
+    transitions: dict[str, jax.Array] = dataclasses.field(default_factory=dict)
+
+    @property
+    def admitted_fitness(self) -> jax.Array:
+        """() fitness, or ``-inf`` where ``faulty``: no archive takes it then."""
+        return jnp.where(self.faulty, -jnp.inf, self.fitness)
+
+
+def transition(
+    begin: StateLike, action: Action, end: StateLike
+) -> dict[str, jax.Array]:
+    """The fields of QDax's ``QDTransition`` for one step.
+
+    Args:
+        begin: State before the step.
+        action: (nu,) what was done.
+        end: State after it.
+    """
+    return {
+        "obs": begin.obs,
+        "next_obs": end.obs,
+        "rewards": end.reward,
+        "dones": end.done,
+        "truncations": end.info["truncation"],
+        "actions": action,
+        "state_desc": begin.info["state_descriptor"],
+        "next_state_desc": end.info["state_descriptor"],
+    }
+
+
+def at_fault(state: StateLike) -> jax.Array:
+    """Whether the physics of a state contained a value that is not finite, ()."""
+    if "fault" in state.info:
+        return state.info["fault"] != 0
+    return jnp.zeros((), bool)

@@ -1,0 +1,53 @@
+"""Episodes as QDax scores them: fitnesses, descriptors and a dictionary."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from newton_qd.gradients.exact import EpisodeGradients
+from newton_qd.gradients.flow import tree_largest, tree_norm
+from newton_qd.gradients.outcome import Outcome
+from newton_qd.types import ExtraScores, Genotype
+
+
+def scores(outcome: Outcome) -> tuple[jax.Array, jax.Array, ExtraScores]:
+    """Scores of N episodes; the dictionary holds their transitions, if any."""
+    steps = outcome.transitions
+    extra = {"transitions": steps} if steps else {}
+    return outcome.admitted_fitness, outcome.descriptor, extra
+
+
+def gradient_scores(
+    found: EpisodeGradients,
+) -> tuple[jax.Array, jax.Array, ExtraScores]:
+    """Scores of N episodes with their gradients in QDax's layout.
+
+    Returns:
+        Fitnesses (N,), descriptors (N, D) and a dictionary: ``gradients``, every leaf
+        of the genotypes with an axis of 1 + D behind, the fitness first;
+        ``normalized_grads``, the same with Euclidean norm 1 over a genotype, or 0 where
+        the gradient is; ``faulty`` (N,) and ``overflowed`` (N, 1 + D).
+    """
+    unit = jax.vmap(jax.vmap(_unit))(found.gradients)
+    extra: ExtraScores = {
+        "gradients": _rows_last(found.gradients),
+        "normalized_grads": _rows_last(unit),
+        "faulty": found.faulty,
+        "overflowed": found.overflowed,
+    }
+    return found.fitnesses, found.descriptors, extra
+
+
+def _unit(gradient: Genotype) -> Genotype:
+    """Returns a gradient of norm 1, or 0 where it is 0."""
+    # twice: the norm of large numbers may be beyond the numbers
+    for norm in (tree_largest, tree_norm):
+        size = norm(gradient)
+        divisor = jnp.where(size == 0, jnp.ones_like(size), size)
+        gradient = jax.tree.map(lambda x, d=divisor: x / d, gradient)
+    return gradient
+
+
+def _rows_last(gradients: Genotype) -> Genotype:
+    return jax.tree.map(lambda x: jnp.moveaxis(x, 1, -1), gradients)
