@@ -4,9 +4,9 @@
 
 Writes the table of docs/gradients.md. *Weight of the first order*: what inverse
 variances give it over the horizon, and *bias*: the share of the first-order slope that
-the zeroth order does not confirm (`newton_qd.diagnose_gradients`). *Off the stiffest*:
-distance of the torso, after 1 s under the same random actions from the same start, from
-where it is with the stiffest material; median over the worlds.
+the zeroth order does not confirm (`newton_qd.diagnose_gradients`). *Distance from
+the stiffest*: distance of the torso from its position with the stiffest material, after
+1 s of the same random actions from the same start; median over the worlds.
 """
 
 from __future__ import annotations
@@ -48,8 +48,9 @@ def main() -> None:
     parser.add_argument("--robots", nargs="+", default=["ant", "halfcheetah", "hopper"])
     names = parser.parse_args().robots
     print(
-        "| robot | softness | penetration at rest [mm] | off the stiffest [m] | "
-        f"gradient norm, {HORIZON} steps | largest | weight of the first order | "
+        "| robot | softness | penetration at rest [mm] "
+        "| distance from the stiffest [m] "
+        f"| gradient norm, {HORIZON} steps | largest | weight of the first order | "
         "bias |\n"
         "|---|---|---|---|---|---|---|---|"
     )
