@@ -1,4 +1,8 @@
-"""What every test shares: the device it runs on, and JAX's 64-bit mode.
+"""What every test shares: how XLA compiles, the device, and JAX's 64-bit mode.
+
+Most of a test's time is XLA compiling, so it compiles fast and loosely optimized
+code here, and each program once for all worker processes. ``--optimized`` compiles
+as users do; tests marked ``optimized`` are the ones for which that matters.
 
 On a machine with an NVIDIA GPU every test runs twice, on the CPU and on the GPU;
 ``-m gpu`` and ``-m "not gpu"`` choose. Without a GPU, tests run on the CPU and those
@@ -9,14 +13,65 @@ from __future__ import annotations
 
 import functools
 import os
+import shutil
+import signal
+import tempfile
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 # Tests run in several processes, which share the memory of a GPU. JAX reads this once.
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
 import jax
+import prebuild
 import pytest
+
+FAST_COMPILING = (
+    "--xla_cpu_use_fusion_emitters=false",
+    "--xla_backend_optimization_level=0",
+    "--xla_llvm_disable_expensive_passes=true",
+)
+
+# JAX's cache of what XLA compiled keeps every program, however small.
+PROGRAM_CACHE: dict[str, Any] = {
+    "jax_persistent_cache_min_compile_time_secs": 0.0,
+    "jax_persistent_cache_min_entry_size_bytes": -1,
+}
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Adds ``--optimized``."""
+    parser.addoption(
+        "--optimized",
+        action="store_true",
+        help="let XLA optimize as it does for users; tests take three times as long",
+    )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Sets how XLA compiles, here and in all processes of this session."""
+    has_gpu = Path("/proc/driver/nvidia").exists()
+    if not config.getoption("optimized") and not has_gpu:
+        given = os.environ.get("XLA_FLAGS", "").split()
+        flags = [*given, *(flag for flag in FAST_COMPILING if flag not in given)]
+        os.environ["XLA_FLAGS"] = " ".join(flags)
+
+    cache = dict(PROGRAM_CACHE)
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        folder = tempfile.mkdtemp(prefix="newton_qd-programs-")
+        config.add_cleanup(functools.partial(shutil.rmtree, folder, True))
+        cache["jax_compilation_cache_dir"] = folder
+    for name, value in cache.items():
+        jax.config.update(name, value)
+        os.environ[name.upper()] = str(value)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_setupnodes(config: pytest.Config, specs: list[Any]) -> None:
+    """Builds the kernels once, before every worker process would do so."""
+    del config
+    prebuild.main(len(specs))
 
 
 @functools.cache
@@ -61,3 +116,14 @@ def x64() -> Iterator[None]:
     """JAX's 64-bit mode, for this test alone."""
     with jax.enable_x64(True):
         yield
+
+
+@pytest.fixture(scope="session")
+def sigint() -> None:
+    """SIGINT is not ignored, neither here nor in the processes that the test starts.
+
+    A process that was started in the background may have inherited that it is, and
+    hands that on.
+    """
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)

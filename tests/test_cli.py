@@ -87,6 +87,7 @@ def test_resume_starts_a_run_that_was_killed_too_early(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("sigint")
 def test_a_signal_before_the_first_generation(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

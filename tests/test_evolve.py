@@ -23,6 +23,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import processes
 import pytest
 
 from newton_qd import files
@@ -351,6 +352,7 @@ def interrupt_after(
 
 
 @pytest.mark.parametrize("generation", [0, 1, 7, 12])
+@pytest.mark.usefixtures("sigint")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_interrupt_saves_and_resumes_bit_by_bit(
     reference: Path,
@@ -443,13 +445,7 @@ LONG += ["9", "--hidden", "4", "--grid", "4x4", "--checkpoint-seconds", "0"]
 
 
 def start(*arguments: str) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, "-c", PROGRAM, "evolve", *arguments],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    return processes.start([sys.executable, "-c", PROGRAM, "evolve", *arguments])
 
 
 def wait_for_generation(out: Path, generation: int, process: Any) -> None:
@@ -488,6 +484,7 @@ def test_sigkill_at_random_moments(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("sigint")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_signals_of_a_process(tmp_path: Path, number: int) -> None:
     out = tmp_path / "with space"
@@ -505,6 +502,7 @@ def test_signals_of_a_process(tmp_path: Path, number: int) -> None:
     assert [int(row.split(",")[0]) for row in rows] == list(range(151))
 
 
+@pytest.mark.usefixtures("sigint")
 def test_a_second_signal_quits_at_once_even_from_compiled_code() -> None:
     code = (
         "import hashlib\n"
@@ -513,13 +511,7 @@ def test_a_second_signal_quits_at_once_even_from_compiled_code() -> None:
         "    print('ready', flush=True)\n"
         "    hashlib.pbkdf2_hmac('sha256', b'', b'', 2**31 - 1)\n"
     )
-    process = subprocess.Popen(
-        [sys.executable, "-c", code],
-        cwd=ROOT,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    process = processes.start([sys.executable, "-c", code], cwd=ROOT)
     assert process.stdout is not None and process.stderr is not None
     assert process.stdout.readline() == "ready\n"
     process.send_signal(signal.SIGINT)

@@ -12,7 +12,6 @@ import random
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -21,6 +20,7 @@ from types import FrameType
 import jax
 import jax.numpy as jnp
 import numpy as np
+import processes
 import pytest
 
 import newton_qd
@@ -155,11 +155,10 @@ def start(child: Callable[[], None], errors: Path, device: jax.Device):
         "PYTHONFAULTHANDLER": "1",
     }
     with errors.open("w", encoding="utf-8") as stderr:
-        return subprocess.Popen(
+        return processes.start(
             [sys.executable, "-W", "error", __file__, child.__name__],
-            stdout=subprocess.PIPE,
+            seconds=TIMEOUT_S,
             stderr=stderr,
-            text=True,
             env=environment,
         )
 
@@ -177,12 +176,11 @@ def check_end(process: subprocess.Popen, errors: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("sigint")
 def test_random_moments(tmp_path: Path, device: jax.Device) -> None:
     rng = random.Random(5)
     errors = tmp_path / "stderr"
     with start(child_random_moments, errors, device) as process:
-        watchdog = threading.Timer(TIMEOUT_S, process.kill)
-        watchdog.start()
         try:
             assert process.stdout is not None
             for line in process.stdout:
@@ -195,20 +193,17 @@ def test_random_moments(tmp_path: Path, device: jax.Device) -> None:
                 assert line == "interrupted\n", (line, errors.read_text())
             check_end(process, errors)
         finally:
-            watchdog.cancel()
             process.kill()
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("sigint")
 def test_moments_of_a_callback(tmp_path: Path, device: jax.Device) -> None:
     errors = tmp_path / "stderr"
     with start(child_moments_of_a_callback, errors, device) as process:
-        watchdog = threading.Timer(TIMEOUT_S, process.kill)
-        watchdog.start()
         try:
             check_end(process, errors)
         finally:
-            watchdog.cancel()
             process.kill()
 
 

@@ -280,8 +280,8 @@ def distributions(tmp_path_factory: pytest.TempPathFactory) -> Path:
         cwd=ROOT,
         check=True,
         stdin=subprocess.DEVNULL,
-        capture_output=True,
         timeout=300,
+        capture_output=True,
     )
     return folder
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import jax
 import numpy as np
+import processes
 import pytest
 from test_algorithms import CRITIC
 
@@ -37,14 +38,11 @@ def problem(name, count, episode_length=10):
 
 
 def start(code: str, **variables: str) -> subprocess.Popen[str]:
-    return subprocess.Popen(
+    return processes.start(
         [sys.executable, "-W", "ignore", "-c", COMMON + code],
+        seconds=540.0,
         cwd=ROOT,
         env={**os.environ, "JAX_PLATFORMS": "cpu", **variables},
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
     )
 
 

@@ -228,6 +228,7 @@ with jax.default_device(jax.devices({device.platform!r})[0]):
         capture_output=True,
         text=True,
         check=True,
+        timeout=300,
     )
     assert result.stdout.split()[-1] == digest()
 
