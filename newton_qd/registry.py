@@ -9,6 +9,7 @@ import numbers
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from newton_qd import brax_views as brax
 from newton_qd import tasks
 from newton_qd.envs.base import Env
 from newton_qd.envs.options import check_flag
@@ -154,6 +155,7 @@ def create(
     fixed_init_state: bool = False,
     qdax_wrappers_kwargs: Sequence[Mapping[str, Any]] | None = None,
     material: Material | None = None,
+    brax_views: bool = False,
     **kwargs: Any,
 ) -> Env:
     """Builds an environment by its name.
@@ -170,6 +172,7 @@ def create(
         qdax_wrappers_kwargs: Keyword arguments for each of the environment's own
             wrappers, replacing those of the registry.
         material: Softness of contacts and limits; ``None``: that of the robot's spec.
+        brax_views: Whether code for brax v1 finds ``state.qp`` and ``env.sys``.
         **kwargs: To the environment inside, as ``dtype`` or ``ctrl_cost_weight``.
 
     Returns:
@@ -184,6 +187,7 @@ def create(
     check_flag("auto_reset", auto_reset)
     check_flag("eval_metrics", eval_metrics)
     check_flag("fixed_init_state", fixed_init_state)
+    check_flag("brax_views", brax_views)
     options = _wrapper_options(env_name, spec, qdax_wrappers_kwargs)
     if episode_length is None and (action_repeat != 1 or eval_metrics):
         raise ValueError(
@@ -192,7 +196,10 @@ def create(
         )
     env = _base(env_name, spec, material, kwargs)
     if fixed_init_state:
-        env = FixedInitialStateWrapper(env, spec.base_name)
+        fixed = (
+            brax.FixedInitialStateWrapper if brax_views else FixedInitialStateWrapper
+        )
+        env = fixed(env, spec.base_name)
     for wrapper_spec, chosen in zip(spec.wrappers, options, strict=True):
         env = wrapper_spec.wrapper(env, spec.base_name, **chosen)
     if episode_length is not None:
@@ -203,6 +210,8 @@ def create(
         env = AutoResetWrapper(env)
     if eval_metrics:
         env = CompletedEvalWrapper(EvalWrapper(env))
+    if brax_views:
+        env = brax.BraxViewsWrapper(env)
     return env
 
 

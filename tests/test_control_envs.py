@@ -25,6 +25,7 @@ from physics_helpers import directional_errors, report
 from test_pusher import presses
 
 import newton_qd
+from newton_qd.brax_views import BraxViewsWrapper
 from newton_qd.envs import Humanoid
 from newton_qd.envs.state import State
 from newton_qd.physics import reference
@@ -125,9 +126,11 @@ def test_target_is_drawn_and_stays(name: str) -> None:
     assert np.abs(np.mean(q[:, 2:], axis=0)).max() < 0.01
     assert 0.09 < np.abs(q[:, :2]).max() <= 0.1 * (1 + 1e-6)
     assert 0.0045 < np.abs(v[:, :2]).max() <= 0.005 * (1 + 1e-6)
-    row = env.sys.body.index["target"]
-    np.testing.assert_allclose(state.qp.pos[:, row, :2], q[:, 2:], atol=1e-7)
-    np.testing.assert_allclose(state.qp.pos[:, row, 2], 0.01, atol=1e-7)
+    viewed: Any = BraxViewsWrapper(env)
+    row = viewed.sys.body.index["target"]
+    qp = jax.jit(jax.vmap(viewed.reset))(keys).qp
+    np.testing.assert_allclose(qp.pos[:, row, :2], q[:, 2:], atol=1e-7)
+    np.testing.assert_allclose(qp.pos[:, row, 2], 0.01, atol=1e-7)
     quiet = make(name, reset_noise_scale=0.0, reset_velocity_noise_scale=0.0)
     start = quiet.reset(jax.random.key(1)).pipeline_state
     assert not np.any(start.q[:2]) and not np.any(start.v)

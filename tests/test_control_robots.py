@@ -6,7 +6,7 @@ capsule's length includes its caps. Every inertia is 1 kg m^2 about every axis.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -14,6 +14,7 @@ from physics_helpers import variant
 
 from newton_qd import physics
 from newton_qd.assets import find_urdf
+from newton_qd.brax_views import BraxViewsWrapper
 from newton_qd.envs import Acrobot
 from newton_qd.physics import reference
 from newton_qd.physics.model.description import Shape, read_description
@@ -146,7 +147,7 @@ def test_joints(name: str) -> None:
 
 
 def test_acrobot_hangs_from_a_mount() -> None:
-    env = Acrobot()
+    env: Any = BraxViewsWrapper(Acrobot())
     qp, at = env.fixed_state().qp, env.sys.body.index["cart"]
     assert env.sys.num_joint_dof == 2
     np.testing.assert_allclose(qp.pos[at], (0, 0, 1.85), atol=1e-7)

@@ -16,6 +16,7 @@ import pytest
 
 import newton_qd
 from newton_qd import tasks
+from newton_qd.brax_views import BraxViewsWrapper
 from newton_qd.envs.locomotion import Locomotion
 from newton_qd.physics.system import PhysicsState
 
@@ -100,7 +101,7 @@ def test_robot_that_touches_nothing_resets(example: ModuleType) -> None:
     env = Locomotion(free)
     state = jax.eval_shape(env.reset, jax.random.key(0))
     assert state.obs.shape == (env.observation_size,)
-    jax.eval_shape(env.sys.default_qp, jnp.zeros(6))
+    jax.eval_shape(BraxViewsWrapper(env).sys.default_qp, jnp.zeros(6))
 
 
 def test_walls_of_the_yard_stop_the_tripod(example: ModuleType) -> None:

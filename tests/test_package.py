@@ -36,6 +36,7 @@ LAYERS = (
     "physics",
     "envs",
     "wrappers",
+    "brax_views",
     "extractors",
     "tasks",
     "tables",

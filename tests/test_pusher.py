@@ -6,7 +6,7 @@ Every link weighs 1 kg, has 1 kg m^2 about every axis, and has its frame at its 
 from __future__ import annotations
 
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -16,6 +16,7 @@ from physics_helpers import batched_step, report
 
 from newton_qd import physics
 from newton_qd.assets import find_urdf
+from newton_qd.brax_views import BraxViewsWrapper
 from newton_qd.envs import Pusher
 from newton_qd.physics import reference
 from newton_qd.physics.model.description import read_description
@@ -155,7 +156,7 @@ DEFAULT = {
 
 def test_default_pose() -> None:
     """The object is where the mean of its resets is; the rest is the original's."""
-    env = Pusher()
+    env: Any = BraxViewsWrapper(Pusher())
     qp, index = env.fixed_state().qp, env.sys.body.index
     for name, (place, rotation) in DEFAULT.items():
         np.testing.assert_allclose(qp.pos[index[name]], place, atol=2e-6)

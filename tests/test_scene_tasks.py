@@ -251,7 +251,7 @@ def test_other_environments_are_refused(task: str) -> None:
 
 def test_views_show_the_scene() -> None:
     """Rows of ground, maze and target come after those of the robot."""
-    env: Any = newton_qd.create("antmaze")
+    env: Any = newton_qd.create("antmaze", brax_views=True)
     qp = env.reset(KEY).qp
     assert qp.pos.shape == (12, 3)
     np.testing.assert_allclose(qp.pos[9:], [[0, 0, 0], [0, 0, 0], [35, 0, 0.5]])

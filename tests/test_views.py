@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 from typing import Any
 
 import jax
@@ -11,19 +12,29 @@ import numpy as np
 import pytest
 
 import newton_qd
+from newton_qd import wrappers
+from newton_qd.brax_views import (
+    QP,
+    BraxState,
+    BraxViewsWrapper,
+    FixedInitialStateWrapper,
+    Info,
+)
+from newton_qd.compat import brax_envs, env_creators
 from newton_qd.envs.ant import Ant
 from newton_qd.envs.pointmaze import PointMaze
 from newton_qd.envs.state import State
-from newton_qd.envs.views import QP, Info
 from newton_qd.physics import reference
-from newton_qd.wrappers import FixedInitialStateWrapper
+from newton_qd.robots import ANT as ANT_SPEC
+from newton_qd.robots import Material
+from newton_qd.wrappers import TrapWrapper
 
-ANT = Ant()
+ANT: Any = BraxViewsWrapper(Ant())
 KEY = jax.random.key(0)
 
 
 @pytest.fixture(scope="module")
-def batch() -> State:
+def batch() -> BraxState:
     """Three ants after some steps."""
     state = jax.jit(jax.vmap(ANT.reset))(jax.random.split(KEY, 3))
     step = jax.jit(jax.vmap(ANT.step))
@@ -38,7 +49,7 @@ def row(tree: Any, index: int) -> Any:
     return jax.tree.map(lambda x: x[index], tree)
 
 
-def test_bodies_are_where_the_kinematics_puts_them(batch: State) -> None:
+def test_bodies_are_where_the_kinematics_puts_them(batch: BraxState) -> None:
     system, qp = ANT.system, batch.qp
     assert qp.pos.shape == qp.vel.shape == qp.ang.shape == (3, 10, 3)
     assert qp.rot.shape == (3, 10, 4)
@@ -59,14 +70,14 @@ def test_bodies_are_where_the_kinematics_puts_them(batch: State) -> None:
         np.testing.assert_allclose(same, 1.0, atol=1e-5)
 
 
-def test_the_ground_is_the_last_row(batch: State) -> None:
+def test_the_ground_is_the_last_row(batch: BraxState) -> None:
     qp = batch.qp
     for part in (qp.pos, qp.vel, qp.ang):
         assert np.all(part[:, 9] == 0)
     assert np.all(qp.rot[:, 9] == np.array([1, 0, 0, 0]))
 
 
-def test_a_batch_is_its_worlds(batch: State) -> None:
+def test_a_batch_is_its_worlds(batch: BraxState) -> None:
     alone = jax.jit(lambda state: state.qp)(row(batch, 1))
     nested = jax.tree.map(lambda x: x.reshape(1, 3, *x.shape[1:]), batch).qp
     for part in ("pos", "rot", "vel", "ang"):
@@ -90,7 +101,7 @@ def test_rows_by_both_names() -> None:
         index["mine"] = 3  # pyright: ignore[reportIndexIssue]
 
 
-def test_joints_are_those_of_the_observation(batch: State) -> None:
+def test_joints_are_those_of_the_observation(batch: BraxState) -> None:
     (joints,) = ANT.sys.joints
     (angles,), (rates,) = joints.angle_vel(batch.qp)
     assert np.array_equal(angles, batch.obs[:, 5:13])
@@ -100,7 +111,7 @@ def test_joints_are_those_of_the_observation(batch: State) -> None:
 
 def test_joints_of_the_fixed_initial_state() -> None:
     # the test of QDax: exactly the default angles, exactly at rest
-    env: Any = newton_qd.create("ant_uni", fixed_init_state=True)
+    env: Any = newton_qd.create("ant_uni", fixed_init_state=True, brax_views=True)
     state = env.reset(jax.random.PRNGKey(10))
     angle_vel = [joint.angle_vel(state.qp) for joint in env.sys.joints]
     angles = jnp.concatenate([a for angle, _ in angle_vel for a in angle])
@@ -127,7 +138,7 @@ def test_default_pose() -> None:
         sys.default_qp(jnp.zeros(3))
 
 
-def test_contact_is_that_of_the_observation(batch: State) -> None:
+def test_contact_is_that_of_the_observation(batch: BraxState) -> None:
     contact = ANT.sys.info(batch.qp).contact
     assert np.any(contact.vel != 0)
     for values, first in ((contact.vel, 27), (contact.ang, 57)):
@@ -139,7 +150,7 @@ def test_contact_is_that_of_the_observation(batch: State) -> None:
 
 @pytest.mark.parametrize("repeat", [1, 3])
 def test_config(repeat: int) -> None:
-    env: Any = newton_qd.create("ant_uni", action_repeat=repeat)
+    env: Any = newton_qd.create("ant_uni", action_repeat=repeat, brax_views=True)
     assert env.sys.config.dt == env.dt == 0.05 * repeat
     assert env.sys.config.substeps == 5 * repeat
 
@@ -148,12 +159,16 @@ def test_a_state_without_bodies() -> None:
     state = PointMaze().reset(KEY)
     assert not hasattr(state, "qp")
     with pytest.raises(AttributeError, match="without bodies"):
-        state.qp  # noqa: B018
+        getattr(state, "qp")  # noqa: B009
     assert not hasattr(newton_qd.create("pointmaze"), "sys")
+    viewed: Any = newton_qd.create("pointmaze", brax_views=True)
+    assert not hasattr(viewed.reset(KEY), "qp") and not hasattr(viewed, "sys")
 
 
-def test_states_of_one_robot_have_one_structure(batch: State) -> None:
-    other = newton_qd.create("ant", episode_length=None, auto_reset=False)
+def test_states_of_one_robot_have_one_structure(batch: BraxState) -> None:
+    other = newton_qd.create(
+        "ant", episode_length=None, auto_reset=False, brax_views=True
+    )
     same = jax.tree.structure(other.reset(KEY)) == jax.tree.structure(batch)
     assert same
     assert copy.copy(batch).system is ANT.system
@@ -176,7 +191,7 @@ def test_observation_function_of_the_fixed_initial_state() -> None:
     after = jax.jit(env.step)(state, jnp.zeros(8, np.float32))
     assert after.obs.shape == (87,) and np.ptp(after.obs) > 0
 
-    short = FixedInitialStateWrapper(ANT, "ant", lambda qp, info, action: qp.pos[0])
+    short = FixedInitialStateWrapper(Ant(), "ant", lambda qp, info, action: qp.pos[0])
     text: Any = "obs"
     with pytest.raises(TypeError, match=r"get_obs_fn='obs': allowed: None, or a func"):
         FixedInitialStateWrapper(Ant(), get_obs_fn=text)
@@ -184,3 +199,58 @@ def test_observation_function_of_the_fixed_initial_state() -> None:
         short.reset(KEY)
     with pytest.raises(NotImplementedError, match=r"^This wrapper does not support"):
         FixedInitialStateWrapper(PointMaze(), "pointmaze", observe)
+
+
+def test_states_of_two_materials_can_be_mapped_over() -> None:
+    soft = Ant().with_material(Material(static_penetration=0.01))
+    states = Ant().reset(KEY), soft.reset(KEY)
+    found = jax.tree.map(jnp.subtract, *states)
+    assert type(found) is State and float(found.reward) == 0
+    # with views each state knows its robot: they cannot, and the error is short
+    viewed = ANT.reset(KEY), BraxViewsWrapper(soft).reset(KEY)
+    with pytest.raises(ValueError, match=r"<ant at 0x\w+>") as caught:
+        jax.tree.map(jnp.subtract, *viewed)
+    assert len(str(caught.value)) < 2000
+
+
+def test_a_step_shows_the_robot_that_made_it() -> None:
+    trap: Any = BraxViewsWrapper(TrapWrapper(Ant(), "ant"))
+    for start in (ANT.reset(KEY), Ant().reset(KEY)):
+        after = trap.step(start, jnp.zeros(8, np.float32))
+        assert after.system is trap.system
+        assert after.qp.pos.shape == (11, 3)
+    assert trap.sys.body.index["Trap"] == 10
+
+
+def test_plain_environments_say_where_the_views_are() -> None:
+    env = newton_qd.create("ant")
+    state: Any = env.reset(KEY)
+    assert isinstance(state, State) and not isinstance(state, BraxState)
+    for thing, name in ((env, "sys"), (env.unwrapped, "sys"), (state, "qp")):
+        said = rf"^{name}: .*allowed: .*newton_qd\.create\(\.\.\., brax_views=True\)"
+        with pytest.raises(AttributeError, match=said):
+            getattr(thing, name)
+    with pytest.raises(AttributeError, match="'State' object has no attribute 'pose'"):
+        getattr(state, "pose")  # noqa: B009
+    with pytest.raises(TypeError, match=r"get_obs_fn=.*newton_qd\.brax_views\.Fixed"):
+        wrappers.FixedInitialStateWrapper(Ant(), "ant", len)  # pyright: ignore
+    with pytest.raises(TypeError, match=r"brax_views=3: allowed: True, False"):
+        newton_qd.create("ant", brax_views=3)  # pyright: ignore[reportArgumentType]
+
+
+def test_names_of_bodies_of_an_own_robot() -> None:
+    env = BraxViewsWrapper(Ant(), body_names={"foot_2": "Claw"})
+    index = env.sys.body.index
+    assert index["Claw"] == index["foot_2"] == 4 and "$ Torso" not in index
+    with pytest.raises(TypeError, match=r"original_names=.*BraxViewsWrapper\(env, bo"):
+        dataclasses.replace(ANT_SPEC, original_names=(("foot_2", "Claw"),))
+
+
+def test_compat_shows_the_views() -> None:
+    for creators in (brax_envs, env_creators):
+        env: Any = creators.create("ant_uni", episode_length=5)
+        assert env.reset(KEY).qp.pos.shape == (10, 3)
+        assert env.sys.config.substeps == 5
+        env = creators.create_fn("ant", batch_size=2)()
+        assert env.reset(KEY).qp.pos.shape == (2, 10, 3)
+        assert not hasattr(creators.create("ant", brax_views=False), "sys")

@@ -8,7 +8,7 @@ from typing import Any
 
 import jax
 
-from newton_qd import tables
+from newton_qd import registry, tables
 from newton_qd.compat.scoring import (
     Extractor,
     default_task,
@@ -22,8 +22,10 @@ from newton_qd.envs.base import Env
 from newton_qd.envs.state import State
 
 __all__ = [
+    "create",
     "create_brax_scoring_fn",
     "create_default_brax_task_components",
+    "create_fn",
     "get_aurora_scoring_fn",
     "get_mask_from_transitions",
     "make_policy_network_play_step_fn_brax",
@@ -35,6 +37,25 @@ __all__ = [
 
 ScoresAndKey = tuple[jax.Array, jax.Array, dict[str, Any], jax.Array]
 ScoringFunction = Callable[[Any, jax.Array], ScoresAndKey]
+
+
+def create(env_name: str, *args: Any, **kwargs: Any) -> Env:
+    """Builds an environment by its name.
+
+    Args:
+        env_name: One of ``newton_qd.registered_envs()``.
+        *args: As for ``newton_qd.create``.
+        **kwargs: As for ``newton_qd.create``; ``brax_views`` is on.
+
+    Returns:
+        The environment, whose states have ``qp``, with ``sys``.
+    """
+    return registry.create(env_name, *args, **{"brax_views": True, **kwargs})
+
+
+def create_fn(env_name: str, **kwargs: Any) -> Callable[..., Env]:
+    """Returns ``create`` with its arguments filled in; nothing is built yet."""
+    return functools.partial(create, env_name, **kwargs)
 
 
 @functools.partial(

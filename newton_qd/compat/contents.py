@@ -29,11 +29,12 @@ _EVALUATION: Contents = {
 }
 _REWARD: Contents = {"newton_qd.wrappers": ("ClipRewardWrapper", "OffsetRewardWrapper")}
 _EXPLORATION: Contents = {"newton_qd.wrappers": ("MazeWrapper", "TrapWrapper")}
-_INITIAL: Contents = {"newton_qd.wrappers": ("FixedInitialStateWrapper",)}
+_INITIAL: Contents = {"newton_qd.brax_views": ("FixedInitialStateWrapper",)}
 _HUMANOID_TRAP: Contents = {"newton_qd.envs.humanoid_trap": ("HumanoidTrap",)}
 _POINT_MAZE: Contents = {"newton_qd.envs.pointmaze": ("PointMaze",)}
 _ENVIRONMENTS: Contents = {
     **_HUMANOID_TRAP,
+    **_INITIAL,
     **_POINT_MAZE,
     "newton_qd.envs.base": ("Env", "QDEnv"),
     "newton_qd.extractors": _EXTRACTORS,
@@ -43,7 +44,6 @@ _ENVIRONMENTS: Contents = {
         "EpisodeWrapper",
         "EvalWrapper",
         "FeetContactWrapper",
-        "FixedInitialStateWrapper",
         "MazeWrapper",
         "NoForwardRewardWrapper",
         "StateDescriptorResetWrapper",
@@ -89,7 +89,7 @@ _NEW: dict[str, Contents] = {
 _OLD: dict[str, Contents] = {
     "qdax.environments": {
         **_ENVIRONMENTS,
-        "newton_qd.registry": ("create", "create_fn"),
+        "newton_qd.compat.brax_envs": ("create", "create_fn"),
         "newton_qd.tables": ("behavior_descriptor_extractor", "reward_offset"),
     },
     "qdax.environments.base_wrappers": _BASE,

@@ -43,7 +43,10 @@ def create(env_name: str, *args: Any, legacy_spring: bool = True, **kwargs: Any)
         env_name: One of ``newton_qd.registered_envs()``.
         *args: As for ``newton_qd.create``.
         legacy_spring: Chose between two engines of brax v1; here there is one.
-        **kwargs: As for ``newton_qd.create``.
+        **kwargs: As for ``newton_qd.create``; ``brax_views`` is on.
+
+    Returns:
+        The environment, whose states have ``qp``, with ``sys``.
 
     Raises:
         ValueError: ``legacy_spring`` is false.
@@ -53,7 +56,7 @@ def create(env_name: str, *args: Any, legacy_spring: bool = True, **kwargs: Any)
             f"legacy_spring={legacy_spring!r}: allowed: True; brax's position-based "
             "dynamics are not in this library, which has one physics"
         )
-    return registry.create(env_name, *args, **kwargs)
+    return registry.create(env_name, *args, **{"brax_views": True, **kwargs})
 
 
 def create_fn(env_name: str, **kwargs: Any) -> Callable[..., Env]:

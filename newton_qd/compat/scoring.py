@@ -123,7 +123,7 @@ def default_task(
     """Makes an environment, and the perceptron that QDax gives to it."""
     from qdax.core.neuroevolution.networks.networks import MLP
 
-    env = registry.create(env_name, episode_length=episode_length)
+    env = registry.create(env_name, episode_length=episode_length, brax_views=True)
     policy_network = MLP(
         layer_sizes=(*hidden, env.action_size),
         kernel_init=jax.nn.initializers.lecun_uniform(),

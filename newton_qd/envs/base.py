@@ -6,6 +6,7 @@ import abc
 import copy
 import dataclasses
 from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -13,9 +14,9 @@ import numpy as np
 
 from newton_qd import physics
 from newton_qd.envs import inputs
+from newton_qd.envs.joints import joint_indices
 from newton_qd.envs.options import float_type
-from newton_qd.envs.state import State, select
-from newton_qd.envs.views import SystemView, joint_indices
+from newton_qd.envs.state import State, no_brax_view, select
 from newton_qd.physics.system import PhysicsState, System
 from newton_qd.robots import Material, RobotSpec
 from newton_qd.scenes import Scene
@@ -124,6 +125,12 @@ class Env(abc.ABC):
             f"material={material!r}: {self.name} is not a simulated robot; allowed: "
             "environments whose unwrapped is a PhysicsEnv"
         )
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            """Says where views of brax v1 are."""
+            raise AttributeError(no_brax_view(self, name, ("sys",)))
 
 
 class QDEnv(Env):
@@ -361,11 +368,6 @@ class PhysicsEnv(Env):
         """Name of the robot."""
         return self.robot.name
 
-    @property
-    def sys(self) -> SystemView:
-        """What code for brax v1 reads of the robot."""
-        return SystemView(self.system)
-
     def _rest(self) -> PhysicsState:
         """Returns the default pose, at rest."""
         q = jnp.asarray(self.system.rest_q, self._dtype)
@@ -393,5 +395,4 @@ class PhysicsEnv(Env):
             done=jnp.zeros((), self._dtype),
             metrics={name: jnp.zeros((), self._dtype) for name in self._metrics},
             info={"fault": jnp.zeros((), jnp.int32)},
-            system=self.system,
         )

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from newton_qd.envs.views import QP, qp_view
 from newton_qd.errors import FaultError
-from newton_qd.physics.system import System
 from newton_qd.types import Info, Metrics, Observation
 
 Tree = TypeVar("Tree")
@@ -33,7 +31,6 @@ class State:
         done: () 1 where the episode has ended, else 0.
         metrics: Parts of the reward and other () readings, 0 after a reset.
         info: What wrappers remember; ``newton_qd.types.INFO_KEYS`` lists the keys.
-        system: The robot, for ``qp``; no leaf but part of the tree's structure.
     """
 
     pipeline_state: Any
@@ -42,24 +39,31 @@ class State:
     done: jax.Array
     metrics: Metrics
     info: Info
-    system: System | None = dataclasses.field(
-        default=None, repr=False, metadata={"static": True}
-    )
+    if not TYPE_CHECKING:
 
-    @property
-    def qp(self) -> QP:
-        """Bodies as brax v1 shows them, computed when asked for; read-only.
-
-        Raises:
-            AttributeError: The environment has no bodies.
-        """
-        if self.system is None:
-            raise AttributeError("qp: this state is of an environment without bodies")
-        return qp_view(self.system, self.pipeline_state)
+        def __getattr__(self, name: str) -> Any:
+            """Says where views of brax v1 are."""
+            raise AttributeError(no_brax_view(self, name, ("qp", "system")))
 
     def replace(self, **changes: Any) -> State:
         """Returns a copy with some fields replaced."""
         return dataclasses.replace(self, **changes)
+
+
+def no_brax_view(thing: object, name: str, views: tuple[str, ...]) -> str:
+    """Returns the message for an attribute that is missing.
+
+    Args:
+        thing: What was asked for it.
+        name: Name of the attribute.
+        views: Attributes that are there for code written for brax v1.
+    """
+    if name in views:
+        return (
+            f"{name}: {type(thing).__name__} without bodies as brax v1 shows them; "
+            "allowed: simulated robots, with newton_qd.create(..., brax_views=True)"
+        )
+    return f"{type(thing).__name__!r} object has no attribute {name!r}"
 
 
 def select(condition: jax.Array, chosen: Tree, other: Tree) -> Tree:

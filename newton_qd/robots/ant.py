@@ -25,13 +25,4 @@ ANT = RobotSpec(
     dt=0.05,
     substeps=5,
     gravity=9.8,
-    original_names=(
-        ("torso", "$ Torso"),
-        *((f"aux_{leg}", f"Aux {leg}") for leg in _ANT_LEGS),
-        *zip(
-            (f"foot_{leg}" for leg in _ANT_LEGS),
-            ("$ Body 4", "$ Body 7", "$ Body 10", "$ Body 13"),
-            strict=True,
-        ),
-    ),
 )

@@ -85,8 +85,6 @@ class RobotSpec:
         substeps: Physics steps in a control step [-].
         gravity: Downward acceleration [m/s^2].
         material: Softness of contacts and limits.
-        original_names: ``(link, body)``: what a link's body is called in the original
-            suite, where that is another name; for ``env.sys``.
     """
 
     name: str
@@ -103,5 +101,12 @@ class RobotSpec:
     servos: tuple[str, ...] = ()
     gravity: float = 9.81
     material: Material = Material()
-    original_names: tuple[tuple[str, str], ...] = ()
+    original_names: dataclasses.InitVar[tuple[()]] = ()  # where it has gone is said
     pairs: tuple[tuple[Contact, Contact], ...] = ()
+
+    def __post_init__(self, original_names: tuple[()]) -> None:
+        if original_names:
+            raise TypeError(
+                f"original_names={original_names!r}: allowed: none; names of bodies go "
+                "to newton_qd.brax_views.BraxViewsWrapper(env, body_names=...)"
+            )

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 
@@ -84,11 +82,6 @@ class EpisodeWrapper(Wrapper):
     def dt(self) -> float:
         """Duration of a step: that of all repetitions [s]."""
         return self.env.dt * self.action_repeat
-
-    @property
-    def sys(self) -> Any:
-        """What code for brax v1 reads of the robot; its step is that of this one."""
-        return self.env.sys.repeated(self.action_repeat)  # pyright: ignore
 
 
 def _moving(state: State) -> jax.Array:

@@ -43,10 +43,6 @@ _TUPLES: dict[str, tuple[Callable[[object], bool], str]] = {
         'a tuple of (joint, angle), such as (("knee", 0.8),)',
     ),
     "servos": (_is_name, 'a tuple of joints, such as ("hip",)'),
-    "original_names": (
-        _is_named_value,
-        'a tuple of (link, body), such as (("foot", "Foot"),)',
-    ),
     "pairs": (
         _is_pair,
         "a tuple of pairs of Contact, such as "

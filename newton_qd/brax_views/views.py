@@ -1,6 +1,6 @@
-"""Views for code that was written for brax v1: ``state.qp`` and ``env.sys``.
+"""What code for brax v1 reads: the bodies of a state, and the robot.
 
-They are computed from the physics state when they are asked for. One row is one body:
+Both are computed from the physics state when they are asked for. One row is one body:
 the links of the robot in the order of its URDF file, then the ground. Links below
 1e-5 kg have no row: they stand between the axes of one joint of the original.
 """
@@ -16,10 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from newton_qd import physics
+from newton_qd.envs.joints import joint_chains, joint_indices, solid_bodies
 from newton_qd.physics.model.rest import grounding_coordinate
-from newton_qd.physics.system import JointKind, PhysicsState, System
+from newton_qd.physics.system import PhysicsState, System
 
-_LIGHTEST = 1e-5  # [kg]
 _GROUND = ("Ground", "floor")  # names of the last row in the original
 
 
@@ -120,32 +120,35 @@ class Config:
 class SystemView:
     """What old code reads of a robot; read-only."""
 
-    def __init__(self, system: System, action_repeat: int = 1) -> None:
+    def __init__(
+        self,
+        system: System,
+        action_repeat: int = 1,
+        body_names: Mapping[str, str] = types.MappingProxyType({}),
+    ) -> None:
         """Makes the view.
 
         Args:
             system: The robot.
             action_repeat: Control steps for each action.
+            body_names: What the body of a link is called in the original, where that
+                is another name.
         """
         self._system = system
         self._repeat = action_repeat
-
-    def repeated(self, action_repeat: int) -> SystemView:
-        """Returns the view of an environment that repeats its actions."""
-        return SystemView(self._system, self._repeat * action_repeat)
+        self._names = body_names
 
     @property
     def body(self) -> Bodies:
         """The rows of a view."""
-        system = self._system
-        names = dict(system.robot.original_names)
+        system, names = self._system, self._names
         rows: dict[str, int] = {}
-        for row, body in enumerate(shown_bodies(system)):
+        for row, body in enumerate(solid_bodies(system)):
             link = system.body_names[body]
             rows[link] = row
             if link in names:
                 rows[names[link]] = row
-        first = len(shown_bodies(system))
+        first = len(solid_bodies(system))
         for row, (aliases, _) in enumerate(_still_bodies(system), first):
             rows.update(dict.fromkeys(aliases, row))
         return Bodies(types.MappingProxyType(rows))
@@ -195,6 +198,9 @@ class SystemView:
         Args:
             joint_angle: (num_joint_dof,) as ``default_angle`` [rad]; ``None``: that.
             joint_velocity: (num_joint_dof,) [rad/s]; ``None``: 0.
+
+        Raises:
+            ValueError: An array is of another shape.
         """
         system = self._system
         dtype = jnp.dtype(system.dtype)
@@ -215,7 +221,7 @@ class SystemView:
     def info(self, qp: QP) -> Info:
         """Returns what the step that led to a view reported."""
         system = self._system
-        bodies = shown_bodies(system)
+        bodies = solid_bodies(system)
         impulse = qp.physics.impulse[..., bodies, :]
         dtype = impulse.dtype
         mass = np.asarray(system.mass[bodies], dtype)[:, None]
@@ -227,17 +233,12 @@ class SystemView:
         return Info(Changes(*(_with_still(system, change) for change in changes)))
 
 
-def shown_bodies(system: System) -> np.ndarray:
-    """Returns the moving bodies that have a row; those that never move come after."""
-    return np.flatnonzero(system.mass >= _LIGHTEST).astype(np.int32)
-
-
 def qp_view(system: System, state: PhysicsState) -> QP:
     """Returns where the bodies of a state are; every batch axis stays in front."""
 
     def read(state: PhysicsState) -> tuple[jax.Array, ...]:
         found = physics.seen_bodies(system, state)
-        bodies = shown_bodies(system)
+        bodies = solid_bodies(system)
         rotation = found.rotation[bodies]
         frames = np.array([frame for _, frame in _still_bodies(system)], state.q.dtype)
         rot = jnp.concatenate([rotation[:, 3:], rotation[:, :3]], axis=1)
@@ -251,32 +252,6 @@ def qp_view(system: System, state: PhysicsState) -> QP:
     for _ in range(state.q.ndim - 1):
         read = jax.vmap(read)
     return QP(*read(state), physics=state)
-
-
-def joint_chains(system: System) -> list[list[int]]:
-    """Returns, for each joint of a robot, its axes from the parent on.
-
-    Joints are between shown bodies, or hinges on the world; what slides or floats in
-    the world is a root.
-    """
-    shown = set(shown_bodies(system).tolist())
-    chains = []
-    for body in sorted(shown):
-        chain, parent = [body], int(system.parent[body])
-        while parent >= 0 and parent not in shown:
-            chain.insert(0, parent)
-            parent = int(system.parent[parent])
-        hinges = np.all(system.joint_kind[chain] == JointKind.REVOLUTE)
-        if parent >= 0 or hinges:
-            chains.append(chain)
-    return chains
-
-
-def joint_indices(system: System) -> tuple[np.ndarray, np.ndarray]:
-    """Returns coordinates and degrees of freedom (num_joint_dof,) of all joints."""
-    axes = [axis for chain in joint_chains(system) for axis in chain]
-    q, v = system.q_start[axes], system.v_start[axes]
-    return q.astype(np.int32), v.astype(np.int32)
 
 
 def _checked(

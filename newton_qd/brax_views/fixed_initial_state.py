@@ -1,0 +1,80 @@
+"""Resets without noise, with an observation of one's own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+from newton_qd.brax_views.views import QP, Info, SystemView, qp_view
+from newton_qd.envs.base import Env, PhysicsEnv
+from newton_qd.envs.state import State
+from newton_qd.wrappers import fixed_initial_state
+
+ObservationFunction = Callable[[QP, Info, jax.Array], jax.Array]
+
+
+class FixedInitialStateWrapper(fixed_initial_state.FixedInitialStateWrapper):
+    """Begins every episode in the default pose; its observation may be replaced.
+
+    This is the wrapper of the same name with the third argument of QDax's.
+    """
+
+    def __init__(
+        self,
+        env: Env,
+        base_env_name: str | None = None,
+        get_obs_fn: ObservationFunction | None = None,
+    ) -> None:
+        """Wraps an environment that has a ``fixed_state``.
+
+        Args:
+            env: The environment, with or without wrappers; it is not changed.
+            base_env_name: Its name, for the error.
+            get_obs_fn: Makes the observation of a reset from ``(qp, info, action)``:
+                the bodies, what ``env.sys.info(qp)`` reports, and a zero action.
+                ``None``: that of the environment.
+
+        Raises:
+            TypeError: ``get_obs_fn`` is no function.
+            NotImplementedError: The environment has no ``fixed_state``, or no bodies
+                for ``get_obs_fn``.
+        """
+        base = env.unwrapped
+        if get_obs_fn is not None and not callable(get_obs_fn):
+            raise TypeError(
+                f"get_obs_fn={get_obs_fn!r}: allowed: None, or a function of (qp, "
+                "info, action)"
+            )
+        if get_obs_fn is not None and not isinstance(base, PhysicsEnv):
+            raise NotImplementedError(
+                f"This wrapper does not support {base_env_name or base.name} yet. "
+                f"get_obs_fn={get_obs_fn!r} with {type(base).__name__}; allowed: None"
+            )
+        self._get_obs_fn = get_obs_fn
+        super().__init__(env, base_env_name)
+
+    def _around(self, inside: Env) -> Env:
+        return FixedInitialStateWrapper(inside, self._env_name, self._get_obs_fn)
+
+    def _first(self, state: State) -> State:
+        """Returns the state with the observation of ``get_obs_fn``.
+
+        Raises:
+            ValueError: The observation is of another shape.
+        """
+        if self._get_obs_fn is None:
+            return state
+        base = self.unwrapped
+        assert isinstance(base, PhysicsEnv)
+        qp = qp_view(base.system, state.pipeline_state)
+        action = jnp.zeros((self.action_size,), self.dtype)
+        info = SystemView(base.system).info(qp)
+        obs = jnp.asarray(self._get_obs_fn(qp, info, action))
+        if obs.shape != state.obs.shape:
+            raise ValueError(
+                f"get_obs_fn: returned shape {obs.shape}; allowed: {state.obs.shape}, "
+                "as the observations of the steps"
+            )
+        return state.replace(obs=obs.astype(self.dtype))

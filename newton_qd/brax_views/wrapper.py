@@ -1,0 +1,140 @@
+"""The wrapper that shows states and the robot as brax v1 does."""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+
+from newton_qd.brax_views.views import QP, SystemView, qp_view
+from newton_qd.envs.base import Env, PhysicsEnv
+from newton_qd.envs.state import State
+from newton_qd.physics.system import System
+from newton_qd.types import Action, Params, RNGKey
+from newton_qd.wrappers import EpisodeWrapper, Wrapper
+
+BODY_NAMES: Mapping[str, Mapping[str, str]] = types.MappingProxyType(
+    {
+        "ant": types.MappingProxyType(
+            {
+                "torso": "$ Torso",
+                **{f"aux_{leg}": f"Aux {leg}" for leg in range(1, 5)},
+                **{f"foot_{leg}": f"$ Body {1 + 3 * leg}" for leg in range(1, 5)},
+            }
+        )
+    }
+)
+"""By robot: what the body of a link is called in the original suite."""
+
+
+class _Shown:
+    """A robot as part of a tree's structure: compared by identity, printed in short."""
+
+    def __init__(self, system: System) -> None:
+        self.system = system
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Shown) and self.system is other.system
+
+    def __hash__(self) -> int:
+        return hash(id(self.system))
+
+    def __repr__(self) -> str:
+        scene = self.system.scene
+        place = "" if scene is None else f" in {scene.name}"
+        return f"<{self.system.robot.name}{place} at {id(self.system):#x}>"
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
+class BraxState(State):
+    """A state that knows its robot, for ``qp``.
+
+    Attributes:
+        shown: The robot; no leaf but part of the tree's structure.
+    """
+
+    shown: _Shown = dataclasses.field(repr=False, metadata={"static": True})
+
+    @property
+    def qp(self) -> QP:
+        """Bodies as brax v1 shows them, computed when asked for; read-only."""
+        return qp_view(self.system, self.pipeline_state)
+
+    @property
+    def system(self) -> System:
+        """The robot."""
+        return self.shown.system
+
+
+class BraxViewsWrapper(Wrapper):
+    """Gives ``state.qp`` to the states of a simulated robot, and ``env.sys``.
+
+    It goes around all other wrappers, changes no number, and leaves environments
+    without a simulated robot as they are. States with views are of the type
+    ``BraxState``: the robot is part of their structure, so that states of two robots,
+    or of one robot in two materials, cannot be mapped over together.
+    """
+
+    def __init__(self, env: Env, body_names: Mapping[str, str] | None = None) -> None:
+        """Wraps an environment.
+
+        Args:
+            env: The environment.
+            body_names: What the body of a link is called in the original, where that
+                is another name; ``None``: as in ``BODY_NAMES``.
+        """
+        super().__init__(env)
+        self._body_names = body_names
+
+    def reset(self, rng: RNGKey) -> State:
+        """Begins an episode."""
+        return self._viewed(self.env.reset(rng))
+
+    def step(self, state: State, action: Action, params: Params = None) -> State:
+        """Advances by one step."""
+        return self._viewed(self.env.step(state, action, params))
+
+    def fixed_state(self) -> State:
+        """Returns the state of a reset without noise."""
+        inside: Any = self.env
+        return self._viewed(inside.fixed_state())
+
+    @property
+    def sys(self) -> SystemView:
+        """What code for brax v1 reads of the robot.
+
+        Raises:
+            AttributeError: The environment inside is not a simulated robot.
+        """
+        system = self._system
+        if system is None:
+            raise AttributeError(f"sys: {self.name} is not a simulated robot")
+        repeat, inside = 1, self.env
+        while isinstance(inside, Wrapper):
+            repeat *= inside.action_repeat if isinstance(inside, EpisodeWrapper) else 1
+            inside = inside.env
+        names = self._body_names
+        if names is None:
+            names = BODY_NAMES.get(system.robot.name, {})
+        return SystemView(system, repeat, names)
+
+    @property
+    def _system(self) -> System | None:
+        # of what is inside now: ``with_base`` may have put something else there
+        base = self.unwrapped
+        return base.system if isinstance(base, PhysicsEnv) else None
+
+    def _viewed(self, state: State) -> State:
+        """Returns the state with the robot that it is of now."""
+        system = self._system
+        if system is None:
+            return state
+        fields = {
+            field.name: getattr(state, field.name)
+            for field in dataclasses.fields(State)
+        }
+        return BraxState(**fields, shown=_Shown(system))

@@ -1,0 +1,46 @@
+"""The joints of a robot, and the coordinates of their axes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from newton_qd.physics.system import JointKind, System
+
+_LIGHTEST = 1e-5  # [kg]
+
+
+def solid_bodies(system: System) -> np.ndarray:
+    """Returns the bodies (n,) of 1e-5 kg or more.
+
+    The others stand between the axes of one joint.
+    """
+    return np.flatnonzero(system.mass >= _LIGHTEST).astype(np.int32)
+
+
+def joint_chains(system: System) -> list[list[int]]:
+    """Returns, for each joint of a robot, its axes from the parent on.
+
+    Joints are between solid bodies, or hinges on the world; what slides or floats in
+    the world is a root.
+    """
+    solid = set(solid_bodies(system).tolist())
+    chains = []
+    for body in sorted(solid):
+        chain, parent = [body], int(system.parent[body])
+        while parent >= 0 and parent not in solid:
+            chain.insert(0, parent)
+            parent = int(system.parent[parent])
+        hinges = np.all(system.joint_kind[chain] == JointKind.REVOLUTE)
+        if parent >= 0 or hinges:
+            chains.append(chain)
+    return chains
+
+
+def joint_indices(system: System) -> tuple[np.ndarray, np.ndarray]:
+    """Returns coordinates (n,) and degrees of freedom (n,) of the axes of all joints.
+
+    They are in the order of the URDF file, joint by joint.
+    """
+    axes = [axis for chain in joint_chains(system) for axis in chain]
+    q, v = system.q_start[axes], system.v_start[axes]
+    return q.astype(np.int32), v.astype(np.int32)
