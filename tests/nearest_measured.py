@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 
 from newton_qd.physics.buffers import build_model
-from newton_qd.physics.precision import kernels
+from newton_qd.physics.precision import Variant, build_kernels
 from newton_qd.physics.system import System
 
 PACK = 4  # worlds of a pack in float64 on a CPU
@@ -38,7 +38,7 @@ def measure(m: MODEL, c: int, o: int, at: wp.array(dtype=VEC3),
 @functools.cache
 def measuring(folder: Path, boxes: bool) -> Any:
     """A kernel of the geometry alone."""
-    space = kernels("float64", PACK, boxes=boxes)
+    space = build_kernels(Variant("float64", PACK, boxes=boxes))
     package = space.package
     nearest = importlib.import_module(f"{package.__name__}.nearest")
     path = folder / "measure.py"
@@ -69,7 +69,9 @@ class Measured:
         self, folder: Path, system: System, contact: int, at: Any, along: Any
     ) -> None:
         kernel = measuring(folder, system.has_boxes)
-        package = kernels("float64", PACK, boxes=system.has_boxes).package
+        package = build_kernels(
+            Variant("float64", PACK, boxes=system.has_boxes)
+        ).package
         held = [packed(at, package.vec3), packed(along, package.vec3)]
         packs = len(at) // PACK
         y = wp.zeros(5 * packs, dtype=package.real, device="cpu", requires_grad=True)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from newton_qd.physics.precision import kernels
+from newton_qd.physics.precision import Variant, build_kernels
 
 WIDTH = 4
 STEP = 1e-6
@@ -21,7 +21,7 @@ STEP = 1e-6
 @functools.cache
 def functions() -> dict[str, Any]:
     """Every overload that has an adjoint, by its name and argument types."""
-    package = kernels("float64", WIDTH).package.__name__
+    package = build_kernels(Variant("float64", WIDTH)).package.__name__
     found = {}
     for part in ("algebra", "numbers", "smooth"):
         module = importlib.import_module(f"{package}.cpp.{part}")

@@ -18,7 +18,7 @@ from jax.core import Tracer
 from newton_qd.physics import interrupts, layout
 from newton_qd.physics.launch import Launcher, thread_count
 from newton_qd.physics.layout import Layout
-from newton_qd.physics.precision import SCALARS, kernels
+from newton_qd.physics.precision import SCALARS, Variant, build_kernels
 from newton_qd.physics.system import Kinematics, PhysicsState, System
 from newton_qd.physics.warp_internals import ffi_callback
 
@@ -256,7 +256,7 @@ def contact_gaps(system: System, q: jax.Array) -> jax.Array:
 @functools.cache
 def _episode_call(name: str, dtype: str, steps: int, nd: int) -> Any:
     """A kernel of ``kernels.episodes`` as a function of one episode's row."""
-    kernel = getattr(kernels(dtype, 1).episodes, name)
+    kernel = getattr(build_kernels(Variant(dtype, 1)).episodes, name)
 
     def launch(x: Any, *arrays: Any) -> None:
         episodes = x.shape[0] // (steps * (nd + 1))

@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from newton_qd.physics import layout, reference
-from newton_qd.physics.precision import kernels, pack_width
+from newton_qd.physics.precision import Kernels, Variant, build_kernels, pack_width
 from newton_qd.physics.system import CONTACT_FRACTION, STANDARD_GRAVITY, System
 from newton_qd.physics.tree import Tree, build_tree, origin_axes
 from newton_qd.physics.warp_internals import field_dtype
@@ -40,9 +40,7 @@ def _iterations_and_solves(system: System) -> tuple[int, int]:
     return _TOUCHING if len(system.contact_body) else _FREE
 
 
-def kernels_of(
-    system: System, device: Any, parametric: bool = False
-) -> SimpleNamespace:
+def kernels_of(system: System, device: Any, parametric: bool = False) -> Kernels:
     """The kernels for a system on a device, with what it needs and no more.
 
     Args:
@@ -51,7 +49,7 @@ def kernels_of(
         parametric: Whether every world brings physical parameters of its own.
     """
     width = pack_width(system.dtype, device)
-    return kernels(system.dtype, width, parametric=parametric, boxes=system.has_boxes)
+    return build_kernels(Variant(system.dtype, width, parametric, system.has_boxes))
 
 
 def build_model(system: System, device: Any, parametric: bool = False) -> Any:

@@ -1,31 +1,50 @@
-"""Warp kernels of one control step, in one precision, for packs of worlds.
+"""Warp kernels of one control step, for packs of worlds.
 
-The package is a template: :func:`newton_qd.physics.precision.kernels` loads it once
-per scalar type and width under a name of its own, so that float32 and float64, CPU
-and GPU come from one source; and once more where worlds bring physical parameters of
-their own or a scene has boxes, so that those who have none pay nothing for them, not
-even time to compile. A thread computes
-``width`` worlds side by side: as the elements of one vector instruction on a CPU,
-where they fill it, and one on a GPU, whose threads are such elements already. So
-``real``, ``vec3`` and the other types below hold one value for each world of a pack;
-what :mod:`.cpp` does with them it does with each world by itself, and a world's
-result depends neither on its place in the pack nor on its neighbours.
+A thread computes a *pack*: ``width`` worlds side by side. On a CPU they are the
+elements of a vector instruction, and fill it; on a GPU a thread is such an element
+already, and a pack is one world. ``real``, ``vec3`` and the other types below hold one
+value for each world of the pack. Functions of :mod:`.cpp` compute all of them at once
+and each by itself: a world's result depends neither on its place in the pack nor on its
+neighbours.
 
-Rules that the adjoint needs (Warp 1.19): every intermediate is stored once per step;
-a function that is marked ``stage`` is skipped when a caller is replayed, so its
-results travel through the scratch arrays only; a loop may only add up terms, into
-a variable of its own that is only stored afterwards.
+**Where to read first.** :mod:`.simulate` has the order of the stages. They are in
+:mod:`.kinematics`, :mod:`.contact` (with :mod:`.nearest`, :mod:`.box`, :mod:`.pair`),
+:mod:`.inertia`, :mod:`.articulation`, :mod:`.integration` and :mod:`.readings`.
+:mod:`.structs` declares what they read (``Model``), their intermediates (``Scratch``)
+and where these begin (``Offsets``). :mod:`.world` moves inputs and outputs, with
+:mod:`.parameters` for physical parameters of each world. :mod:`.forward` and
+:mod:`.backward` are the kernels of a step; :mod:`.inspect` and :mod:`.gaps` show a
+system from inside; :mod:`.episodes` and :mod:`.conventions` do not use packs.
+
+**Variants.** The package is a template. Its files run once for each
+:class:`~newton_qd.physics.precision.Variant`, as a package of its own name: float32 and
+float64, CPU and GPU come from one source, and what a scene does not need is not
+compiled. docs/physics.md says why the files run again.
+
+**Rules.** Warp (1.19) makes the adjoint from the source, and does it correctly only if:
+
+1. Every intermediate is stored once: a store's adjoint takes the element's adjoint and
+   clears it. One substep has entries of its own where the adjoint runs (``keep``).
+2. A function that stores is marked ``stage``, or has an adjoint by hand. Warp does not
+   repeat a stage when it replays its caller. So a stage returns nothing: its results
+   travel through the scratch arrays.
+3. A loop only adds terms to a variable, and nothing in the loop but its own sum reads
+   that variable. Warp does not run a loop again before it walks back through what
+   follows it.
+4. No atomics and no ``+=`` on arrays: sums have a fixed order.
+5. ``sync`` takes the lane: Warp leaves out the adjoint of a function without arguments.
 """
 
 import warp as wp
 
-# Set by the loader before this file runs; these when imported directly.
-scalar = globals().get("scalar", wp.float32)
-width = globals().get("width", 1)
-# Whether every world brings physical parameters of its own.
-parametric = globals().get("parametric", False)
-# Whether obstacles may be boxes.
-boxes = globals().get("boxes", True)
+from newton_qd.physics.precision import variant_of
+
+# What this copy of the package is for.
+_variant = variant_of(__name__)
+scalar = _variant.scalar
+width = _variant.width
+parametric = _variant.parametric
+boxes = _variant.boxes
 
 # One value for each world of a pack.
 real = wp.types.vector(length=width, dtype=scalar)
