@@ -126,6 +126,7 @@ def test_traced_arrays_have_no_memory() -> None:
         jax.grad(lambda x: physics.from_jax(x) and x.sum())(jnp.zeros(3))
 
 
+@pytest.mark.optimized
 def test_nested_vmap() -> None:
     """Worlds of any nesting are one batch; each row equals the world alone."""
     alone = jax.jit(advance)
@@ -139,6 +140,7 @@ def test_nested_vmap() -> None:
     np.testing.assert_array_equal(turned, nested.transpose(0, 2, 1))
 
 
+@pytest.mark.optimized
 def test_vmap_over_some_arguments() -> None:
     """Unbatched arguments are shared by the worlds."""
     states = jax.vmap(lambda x: physics.initial_state(SYSTEM, x, jnp.zeros(14)))(
@@ -155,6 +157,7 @@ def test_vmap_over_some_arguments() -> None:
         np.testing.assert_array_equal(many[world], jax.jit(step)(state, action))
 
 
+@pytest.mark.optimized
 @pytest.mark.slow
 def test_derivatives_under_vmap() -> None:
     """vmap of grad, grad of vmap and the rows of a Jacobian agree."""
@@ -226,6 +229,7 @@ def test_wrong_precision(x64: None) -> None:
         physics.step(SYSTEM, start(), jnp.zeros(8, jnp.float64))
 
 
+@pytest.mark.optimized
 @pytest.mark.slow
 def test_shards_of_a_batch(tmp_path: Path, device: jax.Device) -> None:
     """Two devices of one process: the same values as one, gradients included."""

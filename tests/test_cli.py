@@ -22,7 +22,7 @@ from newton_qd.qd.scoring.task import Task
 # QDax and what it imports warn about their own use of other packages.
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
 
-ROOT = Path(__file__).resolve().parent.parent
+TESTS = Path(__file__).resolve().parent
 POINT = ["evolve", "point", "--quiet", "--iterations", "3", "--batch-size", "16"]
 POINT += ["--episode-length", "9", "--hidden", "4", "--grid", "4x4"]
 POINT += ["--reevaluations", "2"]
@@ -199,7 +199,7 @@ def test_help_is_quick_and_light() -> None:
     )
     done = subprocess.run(
         [sys.executable, "-c", code],
-        cwd=ROOT,
+        cwd=TESTS,
         capture_output=True,
         text=True,
         check=False,
@@ -242,7 +242,7 @@ def test_ant_uni_evolves_and_resumes(tmp_path: Path) -> None:
     arguments = [*small, "--checkpoint-seconds", "0", "--out", str(parts)]
     killed = subprocess.run(
         [sys.executable, "-c", code, *arguments],
-        cwd=ROOT,
+        cwd=TESTS,
         capture_output=True,
         check=False,
         timeout=300,

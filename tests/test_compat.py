@@ -24,7 +24,7 @@ from newton_qd.errors import MissingExtra
 # QDax and what it imports warn about their own use of other packages.
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
 
-ROOT = Path(__file__).resolve().parent.parent
+TESTS = Path(__file__).resolve().parent
 
 
 @pytest.fixture(autouse=True)
@@ -96,7 +96,7 @@ def test_every_module_of_qdax_can_be_imported() -> None:
     )
     done = subprocess.run(
         [sys.executable, "-c", code],
-        cwd=ROOT,
+        cwd=TESTS,
         capture_output=True,
         text=True,
         check=False,

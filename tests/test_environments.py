@@ -120,6 +120,7 @@ def test_float32_stays_float32_under_x64(name: str, stack: str, x64: None) -> No
     assert outline(first) == outline(second)
 
 
+@pytest.mark.optimized
 @pytest.mark.parametrize("name", EVERY_NAME)
 def test_x64_changes_no_value(name: str, x64: None) -> None:
     env = make(name)
@@ -167,6 +168,7 @@ def test_no_buffer_is_in_a_state_twice(name: str) -> None:
     assert len({id(leaf) for leaf in leaves}) == len(leaves)
 
 
+@pytest.mark.optimized
 @pytest.mark.parametrize("name", EVERY_NAME)
 def test_repetition_and_batch_size_change_nothing(name: str) -> None:
     env = make(name)
@@ -180,6 +182,7 @@ def test_repetition_and_batch_size_change_nothing(name: str) -> None:
         assert same(alone, row(batch, one))
 
 
+@pytest.mark.optimized
 @pytest.mark.parametrize("name", EVERY_NAME)
 def test_reset_does_not_depend_on_the_batch(name: str) -> None:
     env = make(name)
@@ -187,6 +190,7 @@ def test_reset_does_not_depend_on_the_batch(name: str) -> None:
     assert same(reset(env)(keys(64)[5]), row(batch, 5))
 
 
+@pytest.mark.optimized
 @pytest.mark.parametrize("name", EVERY_NAME)
 def test_population_axis(name: str) -> None:
     env = make(name, "bare")
@@ -197,6 +201,7 @@ def test_population_axis(name: str) -> None:
     assert same(reshaped(nested, 2, (4,)), flat)
 
 
+@pytest.mark.optimized
 @pytest.mark.parametrize("name", EVERY_NAME)
 def test_batched_environment_under_a_population(name: str) -> None:
     env = make(name, "eval")

@@ -125,6 +125,7 @@ def hoppers() -> tuple[Any, Callable[..., EpisodeGradients], Any, jax.Array]:
     return env, jax.jit(run), feedback_weights(env, 16), jax.random.key(3)
 
 
+@pytest.mark.optimized
 def test_value_is_that_without_gradient(hoppers: Any) -> None:
     env, gradient, weights, key = hoppers
     plain = make_episode(
@@ -155,6 +156,7 @@ def test_directions_are_sums_of_rows(hoppers: Any) -> None:
     jax.tree.map(check, result.gradients, rows.gradients)
 
 
+@pytest.mark.optimized
 def test_worlds_and_runs_are_independent(
     hoppers: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:

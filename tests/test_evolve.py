@@ -47,7 +47,6 @@ evolve_module = sys.modules[evolve.__module__]
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
 
 TESTS = Path(__file__).resolve().parent
-ROOT = TESTS.parent
 FILES = ("archive.npz", "archive.png", "checkpoint.bin", "config.json", "metrics.csv")
 SMALL = EvolveConfig(
     env_name="point",
@@ -351,6 +350,7 @@ def interrupt_after(
     monkeypatch.setattr(Search, "advance", advance_and_signal)
 
 
+@pytest.mark.optimized
 @pytest.mark.parametrize("generation", [0, 1, 7, 12])
 @pytest.mark.usefixtures("sigint")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -435,7 +435,7 @@ def kill_at(patch: pytest.MonkeyPatch, moment: int) -> None:
 
 
 PROGRAM = (
-    f"import sys; sys.path[:0] = [{str(TESTS)!r}, {str(ROOT)!r}]\n"
+    f"import sys; sys.path[:0] = [{str(TESTS)!r}]\n"
     "from test_evolve import point_task\n"
     "from newton_qd.cli import main\n"
     "sys.exit(main(sys.argv[1:], task_factory=point_task))"
@@ -511,7 +511,7 @@ def test_a_second_signal_quits_at_once_even_from_compiled_code() -> None:
         "    print('ready', flush=True)\n"
         "    hashlib.pbkdf2_hmac('sha256', b'', b'', 2**31 - 1)\n"
     )
-    process = processes.start([sys.executable, "-c", code], cwd=ROOT)
+    process = processes.start([sys.executable, "-c", code], cwd=TESTS)
     assert process.stdout is not None and process.stderr is not None
     assert process.stdout.readline() == "ready\n"
     process.send_signal(signal.SIGINT)

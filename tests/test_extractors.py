@@ -152,6 +152,7 @@ def test_a_foot_that_always_touches_has_proportion_one(
     np.testing.assert_allclose(found, 1.0, rtol=division_error(device), atol=0)
 
 
+@pytest.mark.optimized
 @pytest.mark.parametrize("steps", [1, 2, 7, 1000])
 @pytest.mark.parametrize(
     ("extractor", "kernel"),

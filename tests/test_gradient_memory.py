@@ -14,7 +14,7 @@ from test_episode_gradients import feedback, feedback_weights, make
 from newton_qd.extractors import get_feet_contact_proportion
 from newton_qd.gradients import GradientOptions, make_episode_gradient
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.optimized]
 FEET = 4  # of an ant: rows of the Jacobian beside that of the fitness
 
 

@@ -134,6 +134,7 @@ def same(ours: Any, theirs: Any) -> None:
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5 * np.abs(b).max())
 
 
+@pytest.mark.optimized
 def test_gradient_and_vmap_commute() -> None:
     value, states = flat_functional()
     gradient = jax.grad(value, argnums=(0, 1, 2))
@@ -168,6 +169,7 @@ def test_jacobian_has_the_rows_of_gradients() -> None:
         same(jax.grad(lambda u, row=row: velocity(u)[row])(control), jacobian[row])
 
 
+@pytest.mark.optimized
 def test_scan_checkpoint_and_unrolled_loop_agree() -> None:
     _, states = flat_functional()
     step = one_step(ant("float32"))
@@ -197,6 +199,7 @@ def test_scan_checkpoint_and_unrolled_loop_agree() -> None:
     assert np.abs(np.asarray(kept)).max() > 0
 
 
+@pytest.mark.optimized
 def test_value_with_gradient_is_the_value_without() -> None:
     _, states = flat_functional()
     step = batched_step(ant("float32"))

@@ -22,6 +22,8 @@ import newton_qd
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "newton_qd"
+# where the package under test is: the checkout, or an installation
+TESTED = Path(newton_qd.__file__).parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 # A module may import those of its own name and those before it.
@@ -241,7 +243,10 @@ def test_import_is_light(tmp_path: Path) -> None:
     cache = tmp_path / "kernels"
     cache.mkdir()
     result = run_python(
-        code, tmp_path, PYTHONPATH=str(ROOT), WARP_CACHE_PATH=str(cache)
+        code,
+        tmp_path,
+        PYTHONPATH=str(TESTED),
+        WARP_CACHE_PATH=str(cache),
     )
     assert result.returncode == 0, result.stderr
     # One line: nothing greets the user, Warp's start-up banner included.
@@ -351,7 +356,8 @@ def test_ci_runs_the_test_command_of_the_readme() -> None:
     script = (ROOT / ".ci" / "run").read_text(encoding="utf-8").splitlines()
     assert command in script
     # what the README leaves out runs too
-    assert "python -m pytest -n auto -m slow" in script
+    assert "pytest -n auto -m slow" in script
+    assert "pytest -n auto --optimized -m optimized" in script
 
 
 def test_readme_names_commands_that_exist() -> None:

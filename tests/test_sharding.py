@@ -20,7 +20,7 @@ from newton_qd.qd.config import ConfigError, EvolveConfig
 from newton_qd.qd.run.evolution import evolve
 from newton_qd.qd.scoring.sharding import device_mesh
 
-ROOT = Path(__file__).resolve().parent.parent
+TESTS = Path(__file__).resolve().parent
 COMMON = """
 import json, sys
 import jax, jax.numpy as jnp, numpy as np
@@ -41,7 +41,7 @@ def start(code: str, **variables: str) -> subprocess.Popen[str]:
     return processes.start(
         [sys.executable, "-W", "ignore", "-c", COMMON + code],
         seconds=540.0,
-        cwd=ROOT,
+        cwd=TESTS,
         env={**os.environ, "JAX_PLATFORMS": "cpu", **variables},
     )
 
@@ -62,7 +62,8 @@ def two_processes_and_one(code: str) -> list[Any]:
     return [answer(process) for process in runs]
 
 
-FOUR_DEVICES = {"XLA_FLAGS": "--xla_force_host_platform_device_count=4"}
+FLAGS = os.environ.get("XLA_FLAGS", "")
+FOUR_DEVICES = {"XLA_FLAGS": f"{FLAGS} --xla_force_host_platform_device_count=4"}
 
 
 def test_a_mesh_has_the_devices_that_exist() -> None:
@@ -72,6 +73,7 @@ def test_a_mesh_has_the_devices_that_exist() -> None:
         device_mesh(count + 1)
 
 
+@pytest.mark.optimized
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["ant_uni", "pointmaze"])
 def test_results_do_not_depend_on_the_number_of_devices(name: str) -> None:
@@ -208,7 +210,7 @@ def check_devices(**variables: str) -> None:
     arguments = ["--batch-size", "30", "--episode-length", "10"]
     done = subprocess.run(
         [sys.executable, "benchmarks/devices.py", *arguments],
-        cwd=ROOT,
+        cwd=TESTS.parent,
         env={**os.environ, **variables},
         capture_output=True,
         text=True,

@@ -191,6 +191,7 @@ def test_ten_thousand_steps_are_finite(name: str) -> None:
 # Bitwise
 
 
+@pytest.mark.optimized
 def test_row_of_a_batch_is_the_world_alone() -> None:
     system, states = single_states(64)
     batch = outputs(system, states)
@@ -202,6 +203,7 @@ def test_row_of_a_batch_is_the_world_alone() -> None:
         assert_bitwise(one, tuple(x[world : world + 1] for x in batch))
 
 
+@pytest.mark.optimized
 def test_runs_are_equal() -> None:
     """Again, and in scratch memory that other worlds have used or nobody yet."""
     system, states = single_states(64)
@@ -211,6 +213,7 @@ def test_runs_are_equal() -> None:
     assert_bitwise(outputs(build_system(ANT, "float32"), states), first)
 
 
+@pytest.mark.optimized
 @pytest.mark.slow
 def test_another_process_is_equal(device: jax.Device) -> None:
     script = f"""
@@ -240,6 +243,7 @@ def digest() -> str:
     return hashlib.sha256(data).hexdigest()
 
 
+@pytest.mark.optimized
 def test_threads_change_nothing(
     device: jax.Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -13,6 +13,8 @@ from pathlib import Path
 import processes
 import pytest
 
+import newton_qd
+
 TESTS = Path(__file__).parent
 
 
@@ -39,6 +41,18 @@ def test_a_process_is_killed_when_its_time_is_over() -> None:
     output, _ = process.communicate(timeout=30)
     assert process.returncode == -signal.SIGKILL
     assert output in ("ready\n", "")
+
+
+@pytest.mark.skipif(
+    "NEWTON_QD_TEST_INSTALLED" not in os.environ, reason="asked for by .ci/run only"
+)
+def test_the_tests_run_against_the_installed_wheel() -> None:
+    command = [sys.executable, "-c", "import newton_qd; print(newton_qd.__file__)"]
+    done = subprocess.run(
+        command, cwd=TESTS, capture_output=True, text=True, check=True, timeout=60
+    )
+    for file in (newton_qd.__file__, done.stdout.strip()):
+        assert TESTS.parent not in Path(file).parents
 
 
 def test_xla_compiles_fast_unless_asked(request: pytest.FixtureRequest) -> None:

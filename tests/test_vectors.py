@@ -11,6 +11,7 @@ import pytest
 
 from newton_qd.envs.vectors import cross, length, ordered_sum
 
+pytestmark = pytest.mark.optimized
 ROWS = np.random.default_rng(0).normal(size=(2, 64, 3)).astype(np.float32)
 
 
