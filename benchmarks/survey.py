@@ -27,30 +27,33 @@ from newton_qd.qd.scoring.task import Task
 WORLDS, STEPS, CELLS, HIDDEN = 1000, 1000, 1024, (64, 64)
 HEAD = f"""# Survey of the tasks
 
-Written by `python benchmarks/survey.py --out docs/survey.md` ({os.cpu_count()} cores of
-a CPU): {WORLDS:,} untrained policies, perceptrons with two hidden layers of
-{HIDDEN[0]} and tanh, run one episode of {STEPS:,} steps each from one start.
+This page is written by `python benchmarks/survey.py --out docs/survey.md`
+({os.cpu_count()} cores of a CPU). {WORLDS:,} untrained policies run one episode of
+{STEPS:,} steps each, from one start state. They are perceptrons with two hidden layers
+of {HIDDEN[0]} and tanh.
 
-- *Coverage*: share of {CELLS:,} cells of the descriptor space that they reach: of a
-  line, of a grid of 32 x 32, or, beyond two dimensions, of a centroidal Voronoi
-  tessellation. {WORLDS:,} points spread evenly at random would reach 62 %.
-- *5 % to 95 %*: quantiles of each component of the descriptors, and its limits.
-- *Lowest reward*: of a step of these episodes, and of {WORLDS:,} more with uniform
-  random actions. Minus it, rounded up, is `newton_qd.tables.reward_offset`, which keeps
-  QD scores positive; `newton_qd.tables.original_reward_offset` has the original's.
+- *Coverage*: share of the {CELLS:,} cells of the descriptor space that the policies reach.
+  The cells are those of a line, of a grid of 32 x 32 or, beyond two dimensions, of a
+  centroidal Voronoi tessellation. {WORLDS:,} uniformly random points would reach 62 %.
+- *5 % to 95 %*: quantiles of each component of the descriptors, with its limits.
+- *Lowest reward*: lowest reward of a step in these episodes, and in {WORLDS:,} more with
+  uniformly random actions.
+- *Offset*: minus the lowest reward, rounded up. This is `newton_qd.tables.reward_offset`,
+  which keeps QD scores positive. *Original* is that of the original suite,
+  `newton_qd.tables.original_reward_offset`.
 
 | task | coverage [%] | 5 % to 95 % (limits) | lowest reward | original | offset |
 |---|---|---|---|---|---|
 """
 TAIL = """
-The limits are the original's. Those of the position tasks are wide, for robots that
-run: an untrained one falls near its start and reaches few cells, least of all a
-humanoid.
+The limits are those of the original suite. For position tasks they are wide, because
+trained robots run far. Untrained robots fall near their start and reach few cells,
+humanoids the fewest.
 
-The original is no different. Of 500 such policies on its `humanoid_omni`
-(`benchmarks/original_spread.py`) the quantiles are -0.36 and 0.54 m in x, -0.50 and
-0.51 m in y; of 500 here -0.37 and 0.54 m, -0.54 and 0.51 m: in both suites the four
-cells of 1.9 m that meet at the start, 0.4 %.
+This is the same in the original suite. For 500 such policies on its `humanoid_omni`
+(`benchmarks/original_spread.py`), the quantiles are -0.36 and 0.54 m in x, -0.50 and
+0.51 m in y. For 500 policies here they are -0.37 and 0.54 m, -0.54 and 0.51 m. In both
+suites, these are the four cells of 1.9 m that meet at the start: 0.4 %.
 """
 
 Act = Callable[[jax.Array, jax.Array], jax.Array]
