@@ -28,10 +28,12 @@ import prebuild
 import pytest
 
 FAST_COMPILING = (
-    "--xla_cpu_use_fusion_emitters=false",
     "--xla_backend_optimization_level=0",
     "--xla_llvm_disable_expensive_passes=true",
 )
+# JAX 0.11 has lost this flag, and XLA ends the process where it does not know one.
+if jax.__version_info__ < (0, 11):
+    FAST_COMPILING += ("--xla_cpu_use_fusion_emitters=false",)
 
 # JAX's cache of what XLA compiled keeps every program, however small.
 PROGRAM_CACHE: dict[str, Any] = {
@@ -50,6 +52,21 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    """Sets what holds for the whole session, before anything is collected."""
+    make_our_warnings_errors(config)
+    choose_compilation(config)
+
+
+def make_our_warnings_errors(config: pytest.Config) -> None:
+    """Makes warnings errors for code of ours that is not in the package."""
+    root = Path(__file__).resolve().parent.parent
+    folders = ("benchmarks", "docs", "examples", "tests")
+    ours = [path.stem for folder in folders for path in (root / folder).glob("*.py")]
+    names = "|".join([*ours, "__main__", "<string>"])
+    config.addinivalue_line("filterwarnings", rf"error:::({names})\Z")
+
+
+def choose_compilation(config: pytest.Config) -> None:
     """Sets how XLA compiles, here and in all processes of this session."""
     has_gpu = Path("/proc/driver/nvidia").exists()
     if not config.getoption("optimized") and not has_gpu:

@@ -315,6 +315,12 @@ def test_wheel_holds_the_robots(distributions: Path, tmp_path: Path) -> None:
     assert found == (tmp_path / "newton_qd" / "urdf" / "ant.urdf").resolve()
 
 
+def test_wheel_says_that_it_is_typed(distributions: Path) -> None:
+    (wheel,) = distributions.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        assert "newton_qd/py.typed" in archive.namelist()
+
+
 def test_source_distribution_holds_the_robots(distributions: Path) -> None:
     (sdist,) = distributions.glob("*.tar.gz")
     with tarfile.open(sdist) as archive:
