@@ -32,14 +32,15 @@ This page is written by `python benchmarks/survey.py --out docs/survey.md`
 {STEPS:,} steps each, from one start state. They are perceptrons with two hidden layers
 of {HIDDEN[0]} and tanh.
 
-- *Coverage*: share of the {CELLS:,} cells of the descriptor space that the policies reach.
-  The cells are those of a line, of a grid of 32 x 32 or, beyond two dimensions, of a
-  centroidal Voronoi tessellation. {WORLDS:,} uniformly random points would reach 62 %.
+- *Coverage*: share of the {CELLS:,} cells of the descriptor space that the policies
+  reach. The cells are those of a line, of a grid of 32 x 32 or, beyond two dimensions,
+  of a centroidal Voronoi tessellation. {WORLDS:,} uniformly random points would reach
+  62 %.
 - *5 % to 95 %*: quantiles of each component of the descriptors, with its limits.
-- *Lowest reward*: lowest reward of a step in these episodes, and in {WORLDS:,} more with
-  uniformly random actions.
-- *Offset*: minus the lowest reward, rounded up. This is `newton_qd.tables.reward_offset`,
-  which keeps QD scores positive. *Original* is that of the original suite,
+- *Lowest reward*: lowest reward of a step in these episodes, and in {WORLDS:,} more
+  with uniformly random actions.
+- *Offset*: minus the lowest reward, rounded up. It keeps QD scores positive and is
+  `newton_qd.tables.reward_offset`. *Original* is that of the original suite,
   `newton_qd.tables.original_reward_offset`.
 
 | task | coverage [%] | 5 % to 95 % (limits) | lowest reward | original | offset |

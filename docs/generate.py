@@ -21,13 +21,18 @@ import newton_qd
 from newton_qd.envs.base import Env, PhysicsEnv, QDEnv
 from newton_qd.envs.pointmaze import PointMaze
 from newton_qd.physics.system import JointKind
+from newton_qd.tasks import ENVIRONMENTS
 
 PAGE = Path(__file__).with_name("environments.md")
 
 HEAD = """# Environments
 
-What every name of `newton_qd.create` observes, drives and is rewarded for. This page is
-written by `docs/generate.py` from the code.
+This page lists the observation, actions, reward, metrics and options of every
+environment of `newton_qd.create`. It is generated from the code by `docs/generate.py`.
+
+A dash means that there is no state descriptor. Options are keyword arguments of
+`create`. [Differences](differences.md) compares these environments with the original
+ones.
 
 | name | robot or task | observation | action | step [s] | state descriptor |
 |---|---|---|---|---|---|
@@ -83,10 +88,22 @@ def _descriptor(name: str, env: QDEnv) -> str:
     offset = newton_qd.tables.reward_offset[name]
     original = newton_qd.tables.original_reward_offset[name]
     return (
-        f"\nState descriptor: `{env.state_descriptor_name}`, from ({_numbers(low)}) to "
-        f"({_numbers(high)}). Descriptor of an episode: `{extractor}`. Reward offset: "
-        f"{offset:g} (the original's: {original:g}).\n"
+        f"\nState descriptor: `{env.state_descriptor_name}`, limits ({_numbers(low)}) "
+        f"to ({_numbers(high)}). Descriptor of an episode: `{extractor}`. Reward "
+        f"offset: {offset:g} (in the original suite: {original:g}).\n"
     )
+
+
+def _wrappers(name: str, base_name: str) -> str:
+    """What the wrappers of a task change."""
+    text = (
+        f"The environment [`{base_name}`](#{base_name}) with these wrappers, from the "
+        "inside to the outside:\n\n"
+    )
+    for spec in ENVIRONMENTS[name].wrappers:
+        meaning = " ".join((inspect.getdoc(spec.wrapper) or "").split())
+        text += f"- `{getattr(spec.wrapper, '__name__', '')}`: {meaning}\n"
+    return text
 
 
 def _drive(env: PhysicsEnv, joint: str, gear: float) -> str:
@@ -160,7 +177,7 @@ def page() -> str:
         sections += f"\n## {name}\n\n"
         known = described.setdefault(type(base), name)
         if known != name:
-            sections += f"The task of [`{known}`](#{known}) with a state descriptor.\n"
+            sections += _wrappers(name, known)
         else:
             sections += f"{_meanings(type(base))[0]}\n"
         if name in newton_qd.tables.descriptor_extractor:
