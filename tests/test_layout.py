@@ -7,10 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+import warp as wp
 
 import newton_qd
 from newton_qd import physics
-from newton_qd.physics import layout
+from newton_qd.physics import buffers, layout
+from newton_qd.physics.kernels import rows
 from newton_qd.physics.layout import Layout
 from newton_qd.physics.system import System
 from newton_qd.robots import ANT
@@ -73,3 +75,31 @@ def test_parameters_follow_the_other_inputs() -> None:
     assert list(own.shapes) == [*plain.shapes, *layout.parameters(system).shapes]
     assert own.size == plain.size + layout.parameters(system).size
     assert own["gravity"].offset == plain.size
+
+
+def test_kernels_have_a_place_for_every_field() -> None:
+    """The structs of the kernels are the tables: nothing missing, nothing more."""
+    system = dataclasses.replace(physics.load_system(ANT), reports_bodies=True)
+    written, seen = layout.outputs(system).offsets, layout.bodies(system).offsets
+    expected = {
+        rows.Coordinates: layout.coordinates(system).offsets,
+        rows.Inputs: layout.inputs(system, parametric=True).offsets,
+        rows.Outputs: [name for name in written if name not in seen],
+        rows.Bodies: seen,
+        rows.Dynamics: layout.dynamics(system).offsets,
+        rows.Parameters: layout.scratch_parameters(system).offsets,
+    }
+    for struct, fields in expected.items():
+        assert list(struct.vars) == ["size", *fields], struct
+
+
+def test_a_model_holds_the_offsets() -> None:
+    system = dataclasses.replace(physics.load_system(ANT), reports_bodies=True)
+    model = buffers.build_model(system, wp.get_device("cpu"), parametric=True)
+    read = layout.inputs(system, parametric=True)
+    assert model.inputs.size == read.size
+    assert model.inputs.gear_scale == read["gear_scale"].offset
+    written = layout.outputs(system)
+    assert model.outputs.torso_xy == written["torso_xy"].offset
+    assert model.reported.com == written["com"].offset
+    assert model.bodies.com == layout.bodies(system)["com"].offset

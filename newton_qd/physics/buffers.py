@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 import warp as wp
 
 from newton_qd.physics import layout, reference
+from newton_qd.physics.layout import Layout
 from newton_qd.physics.precision import Kernels, Variant, build_kernels, pack_width
 from newton_qd.physics.system import CONTACT_FRACTION, STANDARD_GRAVITY, System
 from newton_qd.physics.tree import Tree, build_tree, origin_axes
@@ -101,7 +103,42 @@ def build_model(system: System, device: Any, parametric: bool = False) -> Any:
     model.foot_weight = system.total_mass * gravity * robot.dt
     model.foot_fraction = CONTACT_FRACTION
     model.foot_width = system.feet_width
+    _put_rows(model, space.structs, system, parametric)
     return model
+
+
+def fill_row(struct: Any, fields: Layout, names: Iterable[str] | None = None) -> Any:
+    """Tell the kernels where the fields of a row begin.
+
+    Args:
+        struct: A struct of :mod:`newton_qd.physics.kernels.rows`.
+        fields: The row.
+        names: Its fields that the struct has; ``None``: all.
+
+    Returns:
+        ``struct``.
+    """
+    struct.size = fields.size
+    for name in fields.offsets if names is None else names:
+        setattr(struct, name, fields[name].offset)
+    return struct
+
+
+def _put_rows(model: Any, structs: Any, system: System, parametric: bool) -> None:
+    rows: dict[str, tuple[Any, Layout]] = {
+        "inputs": (structs.Inputs(), layout.inputs(system, parametric)),
+        "coordinates": (structs.Coordinates(), layout.coordinates(system)),
+        "bodies": (structs.Bodies(), layout.bodies(system)),
+        "dynamics": (structs.Dynamics(), layout.dynamics(system)),
+        "parameters": (structs.Parameters(), layout.scratch_parameters(system)),
+    }
+    for name, (struct, fields) in rows.items():
+        setattr(model, name, fill_row(struct, fields))
+    written, seen = layout.outputs(system), layout.bodies(system).offsets
+    names = [name for name in written.offsets if name not in seen]
+    model.outputs = fill_row(structs.Outputs(), written, names)
+    if system.reports_bodies:
+        model.reported = fill_row(structs.Bodies(), written, seen)
 
 
 def _put_bodies(put: Any, system: System, tree: Tree) -> None:

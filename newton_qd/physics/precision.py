@@ -63,7 +63,7 @@ class Kernels:
     Attributes:
         package: Types of a number and of vectors.
         structs: The structs that kernels take.
-        world: Sizes of inputs and outputs.
+        world: What moves inputs and outputs.
         forward: ``step_forward``.
         backward: ``step_backward``.
         inspect: Kinematics and dynamics.

@@ -15,7 +15,9 @@ from newton.solvers import SolverBase
 
 from newton_qd.assets import find_urdf
 from newton_qd.physics import layout
+from newton_qd.physics.buffers import fill_row
 from newton_qd.physics.kernels.conventions import read_rows, write_rows
+from newton_qd.physics.kernels.rows import Inputs, Outputs
 from newton_qd.physics.launch import Launcher
 from newton_qd.physics.model import load_system, newton_builder
 from newton_qd.physics.model.description import read_description
@@ -108,9 +110,11 @@ class NewtonQDSolver(SolverBase):
         self._system = load_system(robot, "float32")
         self._worlds = model.world_count
         nb, driven = self._system.nb, _driven_by_forces(self._system)
+        self._read = fill_row(Inputs(), layout.inputs(driven))
+        self._written = fill_row(Outputs(), layout.outputs(driven))
         with wp.ScopedDevice(model.device):
-            self._inputs = self._zeros(layout.inputs(driven).size)
-            self._outputs = self._zeros(layout.outputs(driven).size)
+            self._inputs = self._zeros(self._read.size)
+            self._outputs = self._zeros(self._written.size)
             self.impulse = self._zeros(nb, 6)
             self.normal_impulse = self._zeros(nb)
             self.fault = self._zeros()
@@ -163,11 +167,12 @@ class NewtonQDSolver(SolverBase):
         worlds, x, y = self._worlds, self._inputs, self._outputs
         reports = (self.impulse.reshape((worlds, -1)), self.normal_impulse, self.fault)
         with wp.ScopedDevice(self.model.device):
-            sources = [*self._root, q, qd, force]
+            sources = [*self._root, q, qd, force, self._read]
             wp.launch(write_rows, dim=worlds, inputs=sources, outputs=[x])
             self._launcher(float(dt)).forward(worlds, x.flatten(), y.flatten())
             results = [q_new, qd_new, *reports]
-            wp.launch(read_rows, dim=worlds, inputs=[*self._root, y], outputs=results)
+            sources = [*self._root, self._written, y]
+            wp.launch(read_rows, dim=worlds, inputs=sources, outputs=results)
         newton.eval_fk(self.model, q_new.flatten(), qd_new.flatten(), state_out)
 
     def notify_model_changed(self, flags: newton.ModelFlags | int) -> None:

@@ -11,8 +11,9 @@ neighbours.
 :mod:`.kinematics`, :mod:`.contact` (with :mod:`.nearest`, :mod:`.box`, :mod:`.pair`),
 :mod:`.inertia`, :mod:`.articulation`, :mod:`.integration` and :mod:`.readings`.
 :mod:`.structs` declares what they read (``Model``), their intermediates (``Scratch``)
-and where these begin (``Offsets``). :mod:`.world` moves inputs and outputs, with
-:mod:`.parameters` for physical parameters of each world. :mod:`.forward` and
+and where these begin (``Offsets``); :mod:`.rows` where the fields of a row of inputs or
+outputs begin. :mod:`.world` moves these rows, with :mod:`.parameters` for physical
+parameters of each world. :mod:`.forward` and
 :mod:`.backward` are the kernels of a step; :mod:`.inspect` and :mod:`.gaps` show a
 system from inside; :mod:`.episodes` and :mod:`.conventions` do not use packs.
 
@@ -38,6 +39,7 @@ compiled. docs/physics.md says why the files run again.
 import warp as wp
 
 from newton_qd.physics.precision import variant_of
+from newton_qd.physics.warp_internals import never_replay
 
 # What this copy of the package is for.
 _variant = variant_of(__name__)
@@ -72,6 +74,4 @@ def sync(lane: int):
 
 def stage(function):
     """Declare a Warp function that stores its results and is never replayed."""
-    stage_function = wp.func(function)
-    stage_function.skip_replay = True
-    return stage_function
+    return never_replay(wp.func(function))

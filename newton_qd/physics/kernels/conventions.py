@@ -2,10 +2,12 @@
 
 Newton's free joint has the velocity of the child's centre of mass, and its force acts
 there; ours are those of the child's origin. Both are in world axes, linear part first.
-Rows are as in ``world``: the force of every degree of freedom is its control.
+The force of every degree of freedom is its control.
 """
 
 import warp as wp
+
+from .rows import Inputs, Outputs
 
 
 @wp.kernel
@@ -17,7 +19,8 @@ def write_rows(
     q: wp.array2d[float],
     qd: wp.array2d[float],
     joint_f: wp.array2d[float],
-    # out: q, v, force
+    at: Inputs,
+    # out
     x: wp.array2d[float],
 ):
     """Write coordinates, and velocities and forces moved to the origin of the root."""
@@ -25,10 +28,10 @@ def write_rows(
     nq = q.shape[1]
     nv = qd.shape[1]
     for k in range(nq):
-        x[w, k] = q[w, k]
+        x[w, at.q + k] = q[w, k]
     for k in range(nv):
-        x[w, nq + k] = qd[w, k]
-        x[w, nq + nv + k] = joint_f[w, k]
+        x[w, at.v + k] = qd[w, k]
+        x[w, at.control + k] = joint_f[w, k]
     if free_root != 0:
         arm = wp.quat_rotate(wp.quat(q[w, 3], q[w, 4], q[w, 5], q[w, 6]), com)
         # v_origin = v_com - omega x arm
@@ -36,8 +39,8 @@ def write_rows(
         # the same power at every velocity: torque_origin = torque_com + arm x force
         torque = wp.cross(arm, wp.vec3(joint_f[w, 0], joint_f[w, 1], joint_f[w, 2]))
         for k in range(3):
-            x[w, nq + k] = qd[w, k] - moved[k]
-            x[w, nq + nv + 3 + k] = joint_f[w, 3 + k] + torque[k]
+            x[w, at.v + k] = qd[w, k] - moved[k]
+            x[w, at.control + 3 + k] = joint_f[w, 3 + k] + torque[k]
 
 
 @wp.kernel
@@ -45,7 +48,8 @@ def read_rows(
     # system
     free_root: int,
     com: wp.vec3,
-    # in: q, v, impulse, normal impulse, fault
+    # in
+    at: Outputs,
     y: wp.array2d[float],
     # out, first index: world
     q: wp.array2d[float],
@@ -58,19 +62,21 @@ def read_rows(
     w = wp.tid()
     nq = q.shape[1]
     nv = qd.shape[1]
-    n = impulse.shape[1]
     for k in range(nq):
-        q[w, k] = y[w, k]
+        q[w, k] = y[w, at.q + k]
     for k in range(nv):
-        qd[w, k] = y[w, nq + k]
-    for k in range(n):
-        impulse[w, k] = y[w, nq + nv + k]
+        qd[w, k] = y[w, at.v + k]
+    for k in range(impulse.shape[1]):
+        impulse[w, k] = y[w, at.impulse + k]
     for k in range(normal_impulse.shape[1]):
-        normal_impulse[w, k] = y[w, nq + nv + n + k]
-    fault[w] = y[w, nq + nv + n + normal_impulse.shape[1]]
+        normal_impulse[w, k] = y[w, at.normal_impulse + k]
+    fault[w] = y[w, at.fault]
     if free_root != 0:
-        arm = wp.quat_rotate(wp.quat(y[w, 3], y[w, 4], y[w, 5], y[w, 6]), com)
-        omega = wp.vec3(y[w, nq + 3], y[w, nq + 4], y[w, nq + 5])
-        moved = wp.cross(omega, arm)
+        turn = at.q + 3
+        spin = at.v + 3
+        arm = wp.quat_rotate(
+            wp.quat(y[w, turn], y[w, turn + 1], y[w, turn + 2], y[w, turn + 3]), com
+        )
+        moved = wp.cross(wp.vec3(y[w, spin], y[w, spin + 1], y[w, spin + 2]), arm)
         for k in range(3):
-            qd[w, k] = y[w, nq + k] + moved[k]
+            qd[w, k] = y[w, at.v + k] + moved[k]

@@ -1,7 +1,7 @@
 """Kernels that show a system from inside: bodies, mass matrix, bias forces.
 
-Inputs: q and v of each world. Outputs: the bodies as in :mod:`.readings`; or the mass
-matrix, row by row, and the bias forces.
+Inputs and outputs are rows as in :mod:`.rows`: ``Coordinates``, and ``Bodies`` or
+``Dynamics``.
 """
 
 import warp as wp
@@ -22,7 +22,7 @@ from .cpp.algebra import (
 from .cpp.memory import constant, load, read_input, store, write_output
 from .cpp.numbers import uniform
 from .inertia import rigid_inertia
-from .readings import BODY_SIZE, body_reading, seed_bodies, store_bodies
+from .readings import body_reading, seed_bodies, store_bodies
 from .simulate import kinematics
 from .structs import Model, Offsets, Scratch, offsets_at
 from .world import Pack, pack_at
@@ -39,12 +39,13 @@ def load_views(
     pack: Pack,
 ):
     """Copy coordinates and velocities of a pack into its slot."""
-    size = m.nq + m.nv
-    at = pack.first * size
+    size = m.coordinates.size
+    q = pack.first * size + m.coordinates.q
+    v = pack.first * size + m.coordinates.v
     for k in range(m.nq):
-        store(sc.q, offsets.q + k, read_input(x, at + k, size, pack.count))
+        store(sc.q, offsets.q + k, read_input(x, q + k, size, pack.count))
     for k in range(m.nv):
-        store(sc.v, offsets.v + k, read_input(x, at + m.nq + k, size, pack.count))
+        store(sc.v, offsets.v + k, read_input(x, v + k, size, pack.count))
 
 
 @wp.func_grad(load_views)
@@ -58,13 +59,14 @@ def adj_load_views(
     pack: Pack,
 ):
     """Hand the adjoints of coordinates and velocities to the caller."""
-    size = m.nq + m.nv
-    at = pack.first * size
+    size = m.coordinates.size
+    q = pack.first * size + m.coordinates.q
+    v = pack.first * size + m.coordinates.v
     for k in range(m.nq):
-        write_output(x_bar, at + k, size, pack.count, load(g.q, offsets.q + k))
+        write_output(x_bar, q + k, size, pack.count, load(g.q, offsets.q + k))
         store(g.q, offsets.q + k, real())
     for k in range(m.nv):
-        write_output(x_bar, at + m.nq + k, size, pack.count, load(g.v, offsets.v + k))
+        write_output(x_bar, v + k, size, pack.count, load(g.v, offsets.v + k))
         store(g.v, offsets.v + k, real())
 
 
@@ -81,9 +83,9 @@ def seed_views(
     m: Model, g: Scratch, offsets: Offsets, y_bar: wp.array[scalar], pack: Pack
 ):
     """Start the reverse pass with the caller's adjoints of the bodies."""
-    size = BODY_SIZE * m.nb
+    size = m.bodies.size
     at = pack.first * size
-    seed_bodies(m, g, offsets, real(), y_bar, at, size, pack.count, 0, 1)
+    seed_bodies(m, g, offsets, real(), y_bar, m.bodies, at, size, pack.count, 0, 1)
 
 
 @wp.func_grad(seed_views)
@@ -154,8 +156,9 @@ def store_body(
     m: Model, sc: Scratch, offsets: Offsets, y: wp.array[scalar], pack: Pack, i: int
 ):
     """Rows of joint ``i``: M_kj = S_j . I_c S_k (Featherstone 2008, table 6.2)."""
-    size = m.nv * (m.nv + 1)
-    out = pack.first * size
+    size = m.dynamics.size
+    matrix = pack.first * size + m.dynamics.mass_matrix
+    forces = pack.first * size + m.dynamics.bias
     at = offsets.solve_body + i
     ww = load(sc.total_ww, at)
     wv = load(sc.total_wv, at)
@@ -164,7 +167,7 @@ def store_body(
         k = load(m.v_start, i) + a
         sw, sv = dof_axis(m, sc, offsets, i, a)
         bias = dot(sw, load(sc.total_w, at)) + dot(sv, load(sc.total_v, at))
-        write_output(y, out + m.nv * m.nv + k, size, pack.count, bias)
+        write_output(y, forces + k, size, pack.count, bias)
         angular = ww * sw + wv * sv
         linear = sw * wv + vv * sv
         up = int(i)
@@ -175,8 +178,8 @@ def store_body(
                 value = dot(tw, angular) + dot(tv, linear)
                 if j == k:
                     value = value + constant(m.armature, k)
-                write_output(y, out + k * m.nv + j, size, pack.count, value)
-                write_output(y, out + j * m.nv + k, size, pack.count, value)
+                write_output(y, matrix + k * m.nv + j, size, pack.count, value)
+                write_output(y, matrix + j * m.nv + k, size, pack.count, value)
             up = load(m.body_parent, up)
 
 
@@ -190,9 +193,10 @@ def store_dynamics(
     # children come after their parents
     for n in range(m.nb):
         composite(m, sc, offsets, m.nb - n)
-    size = m.nv * (m.nv + 1)
+    size = m.dynamics.size
+    matrix = pack.first * size + m.dynamics.mass_matrix
     for k in range(m.nv * m.nv):
-        write_output(y, pack.first * size + k, size, pack.count, real())
+        write_output(y, matrix + k, size, pack.count, real())
     for i in range(1, m.nb + 1):
         store_body(m, sc, offsets, y, pack, i)
 
@@ -232,8 +236,9 @@ def kinematics_forward(
     offsets = offsets_at(m, pack.slot, 0, 0, 0)
     load_views(m, sc, sc, offsets, x, x, pack)
     read_bodies(m, sc, offsets)
-    size = BODY_SIZE * m.nb
-    store_bodies(m, sc, offsets, y, pack.first * size, size, pack.count, 0, 1)
+    size = m.bodies.size
+    at = pack.first * size
+    store_bodies(m, sc, offsets, y, m.bodies, at, size, pack.count, 0, 1)
 
 
 @wp.kernel

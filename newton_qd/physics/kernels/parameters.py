@@ -1,9 +1,8 @@
 """Physical parameters: the model's, or where the package is parametric each world's.
 
-A parametric row of inputs goes on, after the controls, with gravity, friction and the
-scales of contact stiffness (1), mass (nb), inertia (nb), damping (nv) and gear (nu).
-The scratch holds, for a pack: gravity, friction, contact stiffness and total mass, then
-mass (nb), scale of inertia (nb) and damping (nv); the gear scales the controls.
+A parametric row of inputs goes on, after the controls, with the parameters; what the
+scratch holds of them for a pack is in ``Parameters``. Both are in :mod:`.rows`. The
+scale of the gear is not kept: it scales the controls.
 
 Otherwise nothing of this is compiled: the functions below are the model's constants.
 """
@@ -20,19 +19,10 @@ PARAMETRIC = wp.constant(parametric)
 
 
 @wp.func
-def parameter_inputs(m: Model):
-    """Length of a world's parameters in a row of inputs."""
-    if PARAMETRIC:
-        return 3 + 2 * m.nb + m.nv + m.nu
-    else:
-        return 0
-
-
-@wp.func
 def gravity(m: Model, sc: Scratch, offsets: Offsets):
     """Downward acceleration [m/s^2]."""
     if PARAMETRIC:
-        return load(sc.parameter, offsets.parameter)
+        return load(sc.parameter, offsets.parameter + m.parameters.gravity)
     else:
         return uniform(m.gravity)
 
@@ -41,7 +31,7 @@ def gravity(m: Model, sc: Scratch, offsets: Offsets):
 def friction(m: Model, sc: Scratch, offsets: Offsets):
     """Coulomb coefficient."""
     if PARAMETRIC:
-        return load(sc.parameter, offsets.parameter + 1)
+        return load(sc.parameter, offsets.parameter + m.parameters.friction)
     else:
         return m.friction
 
@@ -50,7 +40,7 @@ def friction(m: Model, sc: Scratch, offsets: Offsets):
 def contact_stiffness(m: Model, sc: Scratch, offsets: Offsets):
     """Stiffness of a contact [N/m]."""
     if PARAMETRIC:
-        return load(sc.parameter, offsets.parameter + 2)
+        return load(sc.parameter, offsets.parameter + m.parameters.contact_stiffness)
     else:
         return m.contact_stiffness
 
@@ -59,7 +49,7 @@ def contact_stiffness(m: Model, sc: Scratch, offsets: Offsets):
 def total_mass(m: Model, sc: Scratch, offsets: Offsets):
     """Mass of the robot [kg]."""
     if PARAMETRIC:
-        return load(sc.parameter, offsets.parameter + 3)
+        return load(sc.parameter, offsets.parameter + m.parameters.total_mass)
     else:
         return uniform(m.total_mass)
 
@@ -68,7 +58,7 @@ def total_mass(m: Model, sc: Scratch, offsets: Offsets):
 def body_mass(m: Model, sc: Scratch, offsets: Offsets, i: int):
     """Mass of body ``i`` [kg]."""
     if PARAMETRIC:
-        return load(sc.parameter, offsets.parameter + 3 + i)
+        return load(sc.parameter, offsets.parameter + m.parameters.mass + i - 1)
     else:
         return constant(m.mass, i)
 
@@ -77,7 +67,8 @@ def body_mass(m: Model, sc: Scratch, offsets: Offsets, i: int):
 def body_inertia(m: Model, sc: Scratch, offsets: Offsets, i: int):
     """Inertia of body ``i`` about its centre of mass, body axes [kg m^2]."""
     if PARAMETRIC:
-        scale = load(sc.parameter, offsets.parameter + 3 + m.nb + i)
+        scales = offsets.parameter + m.parameters.inertia_scale
+        scale = load(sc.parameter, scales + i - 1)
         return scale * constant(m.inertia, i)
     else:
         return constant(m.inertia, i)
@@ -87,7 +78,7 @@ def body_inertia(m: Model, sc: Scratch, offsets: Offsets, i: int):
 def joint_damping(m: Model, sc: Scratch, offsets: Offsets, k: int):
     """Damping of dof ``k`` [N m s/rad or N s/m]."""
     if PARAMETRIC:
-        return load(sc.parameter, offsets.parameter + 4 + 2 * m.nb + k)
+        return load(sc.parameter, offsets.parameter + m.parameters.damping + k)
     else:
         return constant(m.damping, k)
 
@@ -99,7 +90,6 @@ def load_parameters(
     offsets: Offsets,
     x: wp.array[scalar],
     at: int,
-    size: int,
     count: int,
     lane: int,
     lanes: int,
@@ -111,37 +101,42 @@ def load_parameters(
         sc: The scratch.
         offsets: Offsets of the first substep.
         x: Rows of inputs.
-        at: Where the parameters of the pack's first world begin.
-        size: Length of a row of inputs.
+        at: Where the row of the pack's first world begins.
         count: Worlds of the pack.
         lane: This lane.
         lanes: Lanes of a pack.
     """
     one = scalar(1.0)
+    size = m.inputs.size
+    masses = at + m.inputs.mass_scale
+    inertias = at + m.inputs.inertia_scale
+    dampings = at + m.inputs.damping_scale
+    gears = at + m.inputs.gear_scale
     out = offsets.parameter
-    masses = at + 3
-    inertias = masses + m.nb
-    dampings = inertias + m.nb
-    gears = dampings + m.nv
     if lane == 0:
-        store(sc.parameter, out, read_input(x, at, size, count))
-        store(sc.parameter, out + 1, read_input(x, at + 1, size, count))
-        stiffness = m.contact_stiffness * read_input(x, at + 2, size, count)
-        store(sc.parameter, out + 2, stiffness)
+        value = read_input(x, at + m.inputs.gravity, size, count)
+        store(sc.parameter, out + m.parameters.gravity, value)
+        value = read_input(x, at + m.inputs.friction, size, count)
+        store(sc.parameter, out + m.parameters.friction, value)
+        scale = read_input(x, at + m.inputs.contact_stiffness_scale, size, count)
+        value = m.contact_stiffness * scale
+        store(sc.parameter, out + m.parameters.contact_stiffness, value)
         # scales of 1 give the model's total mass to the last digit
         change = real()
         for i in range(m.nb):
             scale = read_input(x, masses + i, size, count)
             change = change + constant(m.mass, i + 1) * (scale - one)
-        store(sc.parameter, out + 3, uniform(m.total_mass) + change)
+        value = uniform(m.total_mass) + change
+        store(sc.parameter, out + m.parameters.total_mass, value)
     for i in range(lane, m.nb, lanes):
         scale = read_input(x, masses + i, size, count)
-        store(sc.parameter, out + 4 + i, scale * constant(m.mass, i + 1))
+        mass = scale * constant(m.mass, i + 1)
+        store(sc.parameter, out + m.parameters.mass + i, mass)
         inertia = scale * read_input(x, inertias + i, size, count)
-        store(sc.parameter, out + 4 + m.nb + i, inertia)
+        store(sc.parameter, out + m.parameters.inertia_scale + i, inertia)
     for k in range(lane, m.nv, lanes):
         damping = read_input(x, dampings + k, size, count) * constant(m.damping, k)
-        store(sc.parameter, out + 4 + 2 * m.nb + k, damping)
+        store(sc.parameter, out + m.parameters.damping + k, damping)
     for k in range(lane, m.nu, lanes):
         gear = read_input(x, gears + k, size, count)
         store(sc.ctrl, offsets.ctrl + k, gear * load(sc.ctrl, offsets.ctrl + k))
@@ -154,20 +149,37 @@ def return_gears(
     offsets: Offsets,
     x: wp.array[scalar],
     x_bar: wp.array[scalar],
-    controls: int,
-    gears: int,
-    size: int,
+    at: int,
     count: int,
     fault: real,
     lane: int,
     lanes: int,
 ):
-    """Adjoint of the gears, which scale the controls; both are in ``x`` from there."""
+    """Adjoint of the gears, which scale the controls."""
+    size = m.inputs.size
+    controls = at + m.inputs.control
+    gears = at + m.inputs.gear_scale
     for k in range(lane, m.nu, lanes):
         force = load(g.ctrl, offsets.ctrl + k)
         value = force * read_input(x, controls + k, size, count)
         write_output(x_bar, gears + k, size, count, choose(fault, real(), value))
         store(g.ctrl, offsets.ctrl + k, force * read_input(x, gears + k, size, count))
+
+
+@wp.func
+def return_one(
+    m: Model,
+    g: Scratch,
+    x_bar: wp.array[scalar],
+    held: int,
+    given: int,
+    count: int,
+    fault: real,
+):
+    """Hand over and clear the adjoint of a single parameter."""
+    value = load(g.parameter, held)
+    write_output(x_bar, given, m.inputs.size, count, choose(fault, real(), value))
+    store(g.parameter, held, real())
 
 
 @wp.func
@@ -178,7 +190,6 @@ def return_parameters(
     x: wp.array[scalar],
     x_bar: wp.array[scalar],
     at: int,
-    size: int,
     count: int,
     fault: real,
     lane: int,
@@ -192,45 +203,48 @@ def return_parameters(
         offsets: Offsets of the first substep.
         x: Rows of inputs.
         x_bar: Their adjoints, to write.
-        at: Where the parameters of the pack's first world begin.
-        size: Length of a row of inputs.
+        at: Where the row of the pack's first world begins.
         count: Worlds of the pack.
         fault: Whether a world's gradient is 0.
         lane: This lane.
         lanes: Lanes of a pack.
     """
     zero = real()
+    size = m.inputs.size
+    masses = at + m.inputs.mass_scale
+    inertias = at + m.inputs.inertia_scale
+    dampings = at + m.inputs.damping_scale
     start = offsets.parameter
-    masses = at + 3
-    inertias = masses + m.nb
-    dampings = inertias + m.nb
-    gears = dampings + m.nv
-    total = load(g.parameter, start + 3)
+    total = load(g.parameter, start + m.parameters.total_mass)
     for i in range(lane, m.nb, lanes):
-        mass = load(g.parameter, start + 4 + i) + total
-        inertia = load(g.parameter, start + 4 + m.nb + i)
+        held = start + m.parameters.mass + i
+        kept = start + m.parameters.inertia_scale + i
+        mass = load(g.parameter, held) + total
+        inertia = load(g.parameter, kept)
         value = constant(m.mass, i + 1) * mass + inertia * read_input(
             x, inertias + i, size, count
         )
         write_output(x_bar, masses + i, size, count, choose(fault, zero, value))
         value = inertia * read_input(x, masses + i, size, count)
         write_output(x_bar, inertias + i, size, count, choose(fault, zero, value))
-        store(g.parameter, start + 4 + i, zero)
-        store(g.parameter, start + 4 + m.nb + i, zero)
+        store(g.parameter, held, zero)
+        store(g.parameter, kept, zero)
     for k in range(lane, m.nv, lanes):
-        value = load(g.parameter, start + 4 + 2 * m.nb + k) * constant(m.damping, k)
+        held = start + m.parameters.damping + k
+        value = load(g.parameter, held) * constant(m.damping, k)
         write_output(x_bar, dampings + k, size, count, choose(fault, zero, value))
-        store(g.parameter, start + 4 + 2 * m.nb + k, zero)
-    return_gears(
-        m, g, offsets, x, x_bar, at - m.nu, gears, size, count, fault, lane, lanes
-    )
+        store(g.parameter, held, zero)
+    return_gears(m, g, offsets, x, x_bar, at, count, fault, lane, lanes)
     # every lane has read the adjoint of the total mass
     sync(lane)
     if lane == 0:
-        stiffness = m.contact_stiffness * load(g.parameter, start + 2)
-        store(g.parameter, start + 2, stiffness)
-        for k in range(3):
-            value = load(g.parameter, start + k)
-            write_output(x_bar, at + k, size, count, choose(fault, zero, value))
-        for k in range(4):
-            store(g.parameter, start + k, zero)
+        held = start + m.parameters.contact_stiffness
+        store(g.parameter, held, m.contact_stiffness * load(g.parameter, held))
+        return_one(
+            m, g, x_bar, held, at + m.inputs.contact_stiffness_scale, count, fault
+        )
+        held = start + m.parameters.gravity
+        return_one(m, g, x_bar, held, at + m.inputs.gravity, count, fault)
+        held = start + m.parameters.friction
+        return_one(m, g, x_bar, held, at + m.inputs.friction, count, fault)
+        store(g.parameter, start + m.parameters.total_mass, zero)

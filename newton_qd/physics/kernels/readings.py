@@ -1,8 +1,7 @@
 """What is read from a state: where its bodies are, and which feet touch the ground.
 
-Bodies are seen from the origin of the world, each row field by field: position of the
-link frame (3), its rotation (4), then of the centre of mass position (3), velocity (3),
-and the angular velocity (3).
+Bodies are seen from the origin of the world: position and rotation of the link frame,
+position and velocity of the centre of mass, and the angular velocity.
 """
 
 import warp as wp
@@ -24,9 +23,8 @@ from .cpp.algebra import (
 from .cpp.memory import constant, load, read_input, store, write_output
 from .cpp.numbers import above, choose, uniform
 from .cpp.smooth import logistic
+from .rows import Bodies
 from .structs import Model, Offsets, Scratch, offsets_at
-
-BODY_SIZE = wp.constant(16)
 
 
 @stage
@@ -50,28 +48,31 @@ def store_bodies(
     sc: Scratch,
     offsets: Offsets,
     y: wp.array[scalar],
+    fields: Bodies,
     at: int,
     size: int,
     count: int,
     lane: int,
     lanes: int,
 ):
-    """Write the bodies of a pack to entries from ``at`` on of rows of ``size``."""
-    n = m.nb
-    for i in range(lane, n, lanes):
+    """Write the bodies of a pack to ``fields`` of rows of ``size`` from ``at`` on."""
+    for i in range(lane, m.nb, lanes):
         position = load(sc.position, offsets.reading + i + 1)
         pose = load(sc.pose, offsets.body + i + 1)
         com = load(sc.com, offsets.reading + i + 1)
         linear = load(sc.com_velocity, offsets.reading + i + 1)
         angular = load(sc.twist_w, offsets.body + i + 1)
+        turn = at + fields.rotation + 4 * i
         for j in range(4):
-            write_output(y, at + 3 * n + 4 * i + j, size, count, component(pose, 3 + j))
+            write_output(y, turn + j, size, count, component(pose, 3 + j))
         for j in range(3):
             k = at + 3 * i + j
-            write_output(y, k, size, count, component(position, j))
-            write_output(y, k + 7 * n, size, count, component(com, j))
-            write_output(y, k + 10 * n, size, count, component(linear, j))
-            write_output(y, k + 13 * n, size, count, component(angular, j))
+            write_output(y, k + fields.position, size, count, component(position, j))
+            write_output(y, k + fields.com, size, count, component(com, j))
+            value = component(linear, j)
+            write_output(y, k + fields.linear_velocity, size, count, value)
+            value = component(angular, j)
+            write_output(y, k + fields.angular_velocity, size, count, value)
 
 
 @wp.func
@@ -81,6 +82,7 @@ def seed_bodies(
     offsets: Offsets,
     fault: real,
     y_bar: wp.array[scalar],
+    fields: Bodies,
     at: int,
     size: int,
     count: int,
@@ -88,20 +90,19 @@ def seed_bodies(
     lanes: int,
 ):
     """Start the reverse pass of the bodies; 0 for a faulty world."""
-    n = m.nb
-    for i in range(lane, n, lanes):
+    for i in range(lane, m.nb, lanes):
         k = at + 3 * i
-        r = at + 3 * n + 4 * i
+        r = at + fields.rotation + 4 * i
         turn = quaternion(
             seed(fault, y_bar, r, size, count),
             seed(fault, y_bar, r + 1, size, count),
             seed(fault, y_bar, r + 2, size, count),
             seed(fault, y_bar, r + 3, size, count),
         )
-        position = seed_vector(fault, y_bar, k, size, count)
-        com = seed_vector(fault, y_bar, k + 7 * n, size, count)
-        linear = seed_vector(fault, y_bar, k + 10 * n, size, count)
-        angular = seed_vector(fault, y_bar, k + 13 * n, size, count)
+        position = seed_vector(fault, y_bar, k + fields.position, size, count)
+        com = seed_vector(fault, y_bar, k + fields.com, size, count)
+        linear = seed_vector(fault, y_bar, k + fields.linear_velocity, size, count)
+        angular = seed_vector(fault, y_bar, k + fields.angular_velocity, size, count)
         store(g.position, offsets.reading + i + 1, position)
         store(g.pose, offsets.body + i + 1, rigid(vec3(), turn))
         store(g.com, offsets.reading + i + 1, com)

@@ -4,6 +4,7 @@ import warp as wp
 
 from . import mat33, real, scalar, transform, vec3
 from .cpp.memory import TABLES
+from .rows import Bodies, Coordinates, Dynamics, Inputs, Outputs, Parameters
 
 _vec3, _mat33, _transform = TABLES[vec3], TABLES[mat33], TABLES[transform]
 
@@ -86,6 +87,15 @@ class Model:
     foot_weight: scalar  # impulse of the robot's weight over a control step [N s]
     foot_fraction: scalar  # share of it above which a foot touches the ground
     foot_width: scalar  # share of it over which the smooth contact rises
+    # rows of the caller's arrays
+    inputs: Inputs
+    outputs: Outputs
+    reported: Bodies  # in the outputs of a step
+    coordinates: Coordinates
+    bodies: Bodies
+    dynamics: Dynamics
+    # rows of the scratch
+    parameters: Parameters
 
 
 @wp.struct
@@ -99,7 +109,7 @@ class Scratch:
     q: wp.array[real]
     v: wp.array[real]
     ctrl: wp.array[real]
-    parameter: wp.array[real]  # see the module of that name
+    parameter: wp.array[real]  # as Parameters says
     # (slots,), 0 or 1: the step failed; its inputs were not finite
     fault: wp.array[real]
     lost: wp.array[real]
@@ -213,7 +223,7 @@ def offsets_at(m: Model, slot: int, keep: int, s: int, p: int):
         mean = m.substeps + 1 + s * (m.iterations - 1) + iteration
         r.v_body = (slot * (iterations + 2) + mean) * m.nv
     r.ctrl = slot * m.nu
-    r.parameter = slot * (4 + 2 * m.nb + m.nv)
+    r.parameter = slot * m.parameters.size
     r.body = step * (m.nb + 1)
     r.dof = step * m.nv
     r.contact = step * m.nc

@@ -1,9 +1,6 @@
 """Moving a pack of worlds between the caller's arrays and the scratch, with adjoints.
 
-The arrays hold one contiguous row per world. Inputs: q, v, ctrl, and its parameters
-where it has its own. Outputs: q, v, the contact impulse of each body (6), the normal
-impulse of each body, the fault, contact and smooth contact of each foot, x and y of the
-torso, and, where the model reports them, the bodies as in :mod:`.readings`.
+The arrays hold one contiguous row per world: its fields are in :mod:`.rows`.
 """
 
 import warp as wp
@@ -12,13 +9,8 @@ from . import real, scalar, stage, sync, width
 from .cpp.algebra import add, component, mul
 from .cpp.memory import constant, load, read_input, store, write_output
 from .cpp.numbers import beyond, choose
-from .parameters import (
-    PARAMETRIC,
-    load_parameters,
-    parameter_inputs,
-    return_parameters,
-)
-from .readings import BODY_SIZE, seed, seed_bodies, seed_vector, store_bodies
+from .parameters import PARAMETRIC, load_parameters, return_parameters
+from .readings import seed, seed_bodies, seed_vector, store_bodies
 from .structs import Model, Offsets, Scratch, offsets_at
 
 WIDTH = wp.constant(width)
@@ -46,21 +38,6 @@ def pack_at(n: int, first: int, worlds: int, slot_stride: int):
 
 
 @wp.func
-def input_size(m: Model):
-    """Length of a row of inputs."""
-    return m.nq + m.nv + m.nu + parameter_inputs(m)
-
-
-@wp.func
-def output_size(m: Model):
-    """Length of a row of outputs."""
-    size = m.nq + m.nv + 7 * m.nb + 1 + 2 * m.nf + 2
-    if m.reports_bodies == 1:
-        size += BODY_SIZE * m.nb
-    return size
-
-
-@wp.func
 def load_world(
     m: Model,
     sc: Scratch,
@@ -73,19 +50,19 @@ def load_world(
     lanes: int,
 ):
     """Copy the inputs of a pack into its slot, from ``offsets`` on."""
-    size = input_size(m)
+    size = m.inputs.size
     at = pack.first * size
+    q = at + m.inputs.q
+    v = at + m.inputs.v
+    control = at + m.inputs.control
     for k in range(lane, m.nq, lanes):
-        store(sc.q, offsets.q + k, read_input(x, at + k, size, pack.count))
-    at += m.nq
+        store(sc.q, offsets.q + k, read_input(x, q + k, size, pack.count))
     for k in range(lane, m.nv, lanes):
-        store(sc.v, offsets.v + k, read_input(x, at + k, size, pack.count))
-    at += m.nv
+        store(sc.v, offsets.v + k, read_input(x, v + k, size, pack.count))
     for k in range(lane, m.nu, lanes):
-        store(sc.ctrl, offsets.ctrl + k, read_input(x, at + k, size, pack.count))
+        store(sc.ctrl, offsets.ctrl + k, read_input(x, control + k, size, pack.count))
     if PARAMETRIC:
-        at += m.nu
-        load_parameters(m, sc, offsets, x, at, size, pack.count, lane, lanes)
+        load_parameters(m, sc, offsets, x, at, pack.count, lane, lanes)
     sync(lane)
 
 
@@ -103,27 +80,25 @@ def adj_load_world(
 ):
     """Hand the adjoints of the inputs to the caller; exactly 0 for a faulty world."""
     sync(lane)
-    size = input_size(m)
+    size = m.inputs.size
     at = pack.first * size
+    q = at + m.inputs.q
+    v = at + m.inputs.v
+    control = at + m.inputs.control
     fault = load(sc.fault, pack.slot)
     if PARAMETRIC:
-        last = at + m.nq + m.nv + m.nu
-        return_parameters(
-            m, g, offsets, x, x_bar, last, size, pack.count, fault, lane, lanes
-        )
+        return_parameters(m, g, offsets, x, x_bar, at, pack.count, fault, lane, lanes)
     for k in range(lane, m.nq, lanes):
         value = choose(fault, real(), load(g.q, offsets.q + k))
-        write_output(x_bar, at + k, size, pack.count, value)
+        write_output(x_bar, q + k, size, pack.count, value)
         store(g.q, offsets.q + k, real())
-    at += m.nq
     for k in range(lane, m.nv, lanes):
         value = choose(fault, real(), load(g.v, offsets.v + k))
-        write_output(x_bar, at + k, size, pack.count, value)
+        write_output(x_bar, v + k, size, pack.count, value)
         store(g.v, offsets.v + k, real())
-    at += m.nv
     for k in range(lane, m.nu, lanes):
         value = choose(fault, real(), load(g.ctrl, offsets.ctrl + k))
-        write_output(x_bar, at + k, size, pack.count, value)
+        write_output(x_bar, control + k, size, pack.count, value)
         store(g.ctrl, offsets.ctrl + k, real())
 
 
@@ -134,11 +109,13 @@ def detect_fault(m: Model, sc: Scratch, pack: Pack, x: wp.array[scalar], lane: i
         # zero times a finite number is zero, anything else is not a number
         zero = scalar(0.0)
         total = real()
-        size = input_size(m)
-        for k in range(m.nq + m.nv):
-            total = total + zero * read_input(
-                x, pack.first * size + k, size, pack.count
-            )
+        size = m.inputs.size
+        q = pack.first * size + m.inputs.q
+        v = pack.first * size + m.inputs.v
+        for k in range(m.nq):
+            total = total + zero * read_input(x, q + k, size, pack.count)
+        for k in range(m.nv):
+            total = total + zero * read_input(x, v + k, size, pack.count)
         store(sc.lost, pack.slot, beyond(total, scalar(1.0)))
         end = offsets_at(m, pack.slot, 0, m.substeps, 0)
         for k in range(m.nq):
@@ -181,15 +158,15 @@ def freeze_faulty(
     """The returned state: a faulty world stays where it was, or at rest."""
     fault = load(sc.fault, pack.slot)
     lost = load(sc.lost, pack.slot)
-    size = input_size(m)
-    at = pack.first * size
+    size = m.inputs.size
+    q = pack.first * size + m.inputs.q
+    v = pack.first * size + m.inputs.v
     for k in range(lane, m.nq, lanes):
-        before = read_input(x, at + k, size, pack.count)
+        before = read_input(x, q + k, size, pack.count)
         stay = choose(lost, constant(m.rest_q, k), before)
         store(sc.q, offsets.q + k, choose(fault, stay, load(sc.q, end.q + k)))
-    at += m.nq
     for k in range(lane, m.nv, lanes):
-        stay = choose(lost, real(), read_input(x, at + k, size, pack.count))
+        stay = choose(lost, real(), read_input(x, v + k, size, pack.count))
         store(sc.v, offsets.v + k, choose(fault, stay, load(sc.v, end.v + k)))
 
 
@@ -205,38 +182,37 @@ def store_world(
 ):
     """Write the outputs of a pack; impulses are zero at a fault."""
     fault = load(sc.fault, pack.slot)
-    size = output_size(m)
+    count = pack.count
+    size = m.outputs.size
     at = pack.first * size
     for k in range(lane, m.nq, lanes):
-        write_output(y, at + k, size, pack.count, load(sc.q, offsets.q + k))
-    at += m.nq
+        write_output(y, at + m.outputs.q + k, size, count, load(sc.q, offsets.q + k))
     for k in range(lane, m.nv, lanes):
-        write_output(y, at + k, size, pack.count, load(sc.v, offsets.v + k))
-    at += m.nv
+        write_output(y, at + m.outputs.v + k, size, count, load(sc.v, offsets.v + k))
     for i in range(lane, m.nb, lanes):
         linear = load(sc.body_impulse, offsets.reading + i + 1)
         angular = load(sc.body_angular_impulse, offsets.reading + i + 1)
         normal = load(sc.body_normal_impulse, offsets.reading + i + 1)
+        impulse = at + m.outputs.impulse + 6 * i
         for j in range(3):
             value = choose(fault, real(), component(linear, j))
-            write_output(y, at + 6 * i + j, size, pack.count, value)
+            write_output(y, impulse + j, size, count, value)
             value = choose(fault, real(), component(angular, j))
-            write_output(y, at + 6 * i + 3 + j, size, pack.count, value)
+            write_output(y, impulse + 3 + j, size, count, value)
         value = choose(fault, real(), normal)
-        write_output(y, at + 6 * m.nb + i, size, pack.count, value)
-    at += 7 * m.nb
+        write_output(y, at + m.outputs.normal_impulse + i, size, count, value)
     if lane == 0:
-        write_output(y, at, size, pack.count, fault)
+        write_output(y, at + m.outputs.fault, size, count, fault)
     for f in range(lane, m.nf, lanes):
         value = load(sc.foot_contact, pack.slot * m.nf + f)
-        write_output(y, at + 1 + f, size, pack.count, value)
+        write_output(y, at + m.outputs.feet_contact + f, size, count, value)
         value = load(sc.smooth_foot_contact, pack.slot * m.nf + f)
-        write_output(y, at + 1 + m.nf + f, size, pack.count, value)
-    at += 1 + 2 * m.nf
+        write_output(y, at + m.outputs.smooth_feet_contact + f, size, count, value)
     for k in range(lane, 2, lanes):
-        write_output(y, at + k, size, pack.count, load(sc.torso_xy, 2 * pack.slot + k))
+        value = load(sc.torso_xy, 2 * pack.slot + k)
+        write_output(y, at + m.outputs.torso_xy + k, size, count, value)
     if m.reports_bodies == 1:
-        store_bodies(m, sc, offsets, y, at + 2, size, pack.count, lane, lanes)
+        store_bodies(m, sc, offsets, y, m.reported, at, size, count, lane, lanes)
 
 
 @wp.func
@@ -252,32 +228,34 @@ def seed_world(
 ):
     """Start the reverse pass: the caller's adjoints of the outputs; 0 at a fault."""
     fault = load(sc.fault, pack.slot)
-    size = output_size(m)
+    count = pack.count
+    size = m.outputs.size
     at = pack.first * size
     for k in range(lane, m.nq, lanes):
-        store(g.q, offsets.q + k, seed(fault, y_bar, at + k, size, pack.count))
-    at += m.nq
+        value = seed(fault, y_bar, at + m.outputs.q + k, size, count)
+        store(g.q, offsets.q + k, value)
     for k in range(lane, m.nv, lanes):
-        store(g.v, offsets.v + k, seed(fault, y_bar, at + k, size, pack.count))
-    at += m.nv
+        value = seed(fault, y_bar, at + m.outputs.v + k, size, count)
+        store(g.v, offsets.v + k, value)
     for i in range(lane, m.nb, lanes):
-        linear = seed_vector(fault, y_bar, at + 6 * i, size, pack.count)
-        angular = seed_vector(fault, y_bar, at + 6 * i + 3, size, pack.count)
-        normal = seed(fault, y_bar, at + 6 * m.nb + i, size, pack.count)
+        impulse = at + m.outputs.impulse + 6 * i
+        linear = seed_vector(fault, y_bar, impulse, size, count)
+        angular = seed_vector(fault, y_bar, impulse + 3, size, count)
+        normal = seed(fault, y_bar, at + m.outputs.normal_impulse + i, size, count)
         store(g.body_impulse, offsets.reading + i + 1, linear)
         store(g.body_angular_impulse, offsets.reading + i + 1, angular)
         store(g.body_normal_impulse, offsets.reading + i + 1, normal)
-    at += 7 * m.nb + 1
     for f in range(lane, m.nf, lanes):
         # the contact itself is a step: its gradient is 0
-        value = seed(fault, y_bar, at + m.nf + f, size, pack.count)
+        value = seed(fault, y_bar, at + m.outputs.smooth_feet_contact + f, size, count)
         store(g.smooth_foot_contact, pack.slot * m.nf + f, value)
-    at += 2 * m.nf
     for k in range(lane, 2, lanes):
-        value = seed(fault, y_bar, at + k, size, pack.count)
+        value = seed(fault, y_bar, at + m.outputs.torso_xy + k, size, count)
         store(g.torso_xy, 2 * pack.slot + k, value)
     if m.reports_bodies == 1:
-        seed_bodies(m, g, offsets, fault, y_bar, at + 2, size, pack.count, lane, lanes)
+        seed_bodies(
+            m, g, offsets, fault, y_bar, m.reported, at, size, count, lane, lanes
+        )
     sync(lane)
 
 
