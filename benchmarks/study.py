@@ -158,7 +158,7 @@ def execute(run: Run, seconds: float, device: str, file: Path) -> None:
     """Carries out a run and writes its file."""
     import newton_qd.compat
     from newton_qd.qd import make_task
-    from newton_qd.qd.algorithms import ALGORITHMS as TABLE
+    from newton_qd.qd.algorithms import algorithm_named
     from newton_qd.qd.run.archive import Archive
     from newton_qd.qd.run.search import Search
 
@@ -168,7 +168,8 @@ def execute(run: Run, seconds: float, device: str, file: Path) -> None:
     task = make_task(config)
     config = config.resolve(task.descriptor_length)
     search = Search(config, task)
-    gradients = TABLE[run.algorithm].gradients(config)
+    spec = algorithm_named(run.algorithm)
+    gradients = spec.gradients(config, search.options) if spec.gradients else 0
     rows: list[dict] = []
     state: Any = None
     for row in curve(search, gradients, seconds, device == "cuda"):

@@ -1,7 +1,8 @@
-"""Write the page of the environments from their code.
+"""Write what the documentation says of environments and algorithms from their code.
 
-python docs/generate.py            writes docs/environments.md
-python docs/generate.py --check    fails if the page is out of date
+python docs/generate.py            writes docs/environments.md, and parts of
+                                   docs/evolve.md
+python docs/generate.py --check    fails if a page is out of date
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import argparse
 import inspect
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import cast
 
@@ -21,9 +22,12 @@ import newton_qd
 from newton_qd.envs.base import Env, PhysicsEnv, QDEnv
 from newton_qd.envs.pointmaze import PointMaze
 from newton_qd.physics.system import JointKind
+from newton_qd.qd.algorithms import ALGORITHMS
+from newton_qd.qd.algorithms.options import option_texts
 from newton_qd.tasks import ENVIRONMENTS
 
 PAGE = Path(__file__).with_name("environments.md")
+EVOLVE_PAGE = Path(__file__).with_name("evolve.md")
 
 HEAD = """# Environments
 
@@ -188,14 +192,86 @@ def page() -> str:
     return HEAD + rows + sections
 
 
+def _algorithms() -> str:
+    """Table of the algorithms of ``evolve``."""
+    rows = [(f"`{spec.name}`", spec.summary) for spec in ALGORITHMS]
+    return _table(("`--algorithm`", "what it is"), rows)
+
+
+def _algorithm_options() -> str:
+    """Tables of their options, one for each class that declares some."""
+    bases = [base for spec in ALGORITHMS for base in spec.options.__mro__]
+    kinds = [kind for kind in dict.fromkeys(bases) if inspect.get_annotations(kind)]
+    sections = ""
+    # what several algorithms have in common comes after all that inherit it
+    for kind in sorted(kinds, key=lambda kind: sum(issubclass(k, kind) for k in kinds)):
+        title = (inspect.getdoc(kind) or "").partition("\n")[0]
+        names = [spec.name for spec in ALGORITHMS if issubclass(spec.options, kind)]
+        rows = [
+            (f"`{name}`", f"`{default}`" if default else "from the run", _code(meaning))
+            for name, default, meaning in option_texts(kind, own=True)
+        ]
+        users = ", ".join(f"`{name}`" for name in names)
+        sections += f"{users}: {_code(title)}\n\n"
+        sections += _table(("option", "default", "meaning"), rows) + "\n"
+    rows = [
+        (f"`{spec.name}`", f"`{env_name}`", _defaults(tuned))
+        for spec in ALGORITHMS
+        for env_name, tuned in spec.tuned.items()
+    ]
+    rows = _merged(_merged(rows, 1), 0)
+    sections += "Defaults that differ for an environment:\n\n"
+    return sections + _table(("`--algorithm`", "environment", "defaults"), rows)
+
+
+def _merged(rows: Sequence[tuple[str, ...]], column: int) -> list[tuple[str, ...]]:
+    """Makes one row of those that differ in one column only."""
+    cells: dict[tuple[str, ...], list[str]] = {}
+    for row in rows:
+        rest = (*row[:column], *row[column + 1 :])
+        cells.setdefault(rest, []).append(row[column])
+    return [
+        (*rest[:column], ", ".join(found), *rest[column:])
+        for rest, found in cells.items()
+    ]
+
+
+def _code(text: str) -> str:
+    return text.replace("``", "`")
+
+
+def _defaults(tuned: Mapping[str, object]) -> str:
+    return ", ".join(f"`{name}` {value}" for name, value in tuned.items())
+
+
+def evolve_page() -> str:
+    """Returns the text of the page on ``evolve``, with its generated parts anew.
+
+    Raises:
+        ValueError: The page has no place for one of them.
+    """
+    text = EVOLVE_PAGE.read_text(encoding="utf-8")
+    for name, part in (
+        ("algorithms", _algorithms()),
+        ("options", _algorithm_options()),
+    ):
+        begin, end = f"<!-- {name}: docs/generate.py ", f"<!-- end of {name} -->"
+        found = re.search(rf"(?s)({re.escape(begin)}.*?-->\n).*?({end})", text)
+        if found is None:
+            raise ValueError(f"{EVOLVE_PAGE.name}: no part {begin!r} to {end!r}")
+        text = f"{text[: found.end(1)]}\n{part}\n{text[found.start(2) :]}"
+    return text
+
+
 def main() -> int:
-    """Writes the page, or compares it."""
+    """Writes the pages, or compares them."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--check", action="store_true")
-    text = page()
+    texts = {PAGE: page(), EVOLVE_PAGE: evolve_page()}
     if parser.parse_args().check:
-        return int(PAGE.read_text(encoding="utf-8") != text)
-    PAGE.write_text(text, encoding="utf-8")
+        return int(any(p.read_text(encoding="utf-8") != t for p, t in texts.items()))
+    for path, text in texts.items():
+        path.write_text(text, encoding="utf-8")
     return 0
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 from pathlib import Path
 from typing import Any
@@ -15,9 +14,9 @@ from test_steady import compiled
 
 import newton_qd.compat
 from newton_qd import cli
-from newton_qd.qd.algorithms import ALGORITHMS, CMAMEOptions
-from newton_qd.qd.algorithms.gradient_algorithms import GRADIENT_ALGORITHMS
-from newton_qd.qd.algorithms.gradient_options import TUNED
+from newton_qd.qd.algorithms import ALGORITHMS
+from newton_qd.qd.algorithms.cma_me import CMAMEOptions
+from newton_qd.qd.algorithms.options import read_options
 from newton_qd.qd.config import ConfigError, EvolveConfig, read_config
 from newton_qd.qd.emitters import GradientLineEmitter
 from newton_qd.qd.run.checkpoint import (
@@ -75,14 +74,18 @@ def count_after_generations(
 
 
 def test_every_algorithm_is_tested() -> None:
-    assert set(OPTIONS) == set(ALGORITHMS)
+    assert set(OPTIONS) == {spec.name for spec in ALGORITHMS}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("env_name", TUNED)
+@pytest.mark.parametrize(
+    "env_name", list(dict.fromkeys(name for spec in ALGORITHMS for name in spec.tuned))
+)
 def test_defaults_of_an_environment_are_accepted(env_name: str) -> None:
     task = make_task(EvolveConfig(env_name=env_name))
-    for name in GRADIENT_ALGORITHMS:
+    names = [spec.name for spec in ALGORITHMS if spec.gradients is not None]
+    assert len(names) == 5
+    for name in names:
         config = EvolveConfig(
             env_name=env_name,
             algorithm=name,
@@ -232,9 +235,8 @@ def test_algorithms_of_one_precision(name: str) -> None:
 
 
 def test_a_whole_number_is_a_number() -> None:
-    parts: Any = importlib.import_module("newton_qd.qd.algorithms.parts")
     config = SMALL.replace(algorithm="cma-me", options={"sigma_g": 1}, iso_sigma=1)
-    options = parts.settings(CMAMEOptions, config)
+    options = read_options(CMAMEOptions, config)
     assert type(options.sigma_g) is float and options.sigma_g == 1.0
     assert type(config.iso_sigma) is float
 

@@ -15,7 +15,6 @@ QD = "newton_qd.qd"
         ("ribs", "make_ribs_evaluation", QD),
         ("sharding", "shard_scoring", QD),
         ("actor_critic", "ActorCriticSettings", f"{QD}.emitters"),
-        ("gradient_options", "TUNED", f"{QD}.algorithms.gradient_options"),
     ],
 )
 def test_an_old_module_has_its_names(old: str, name: str, new: str) -> None:
@@ -25,3 +24,14 @@ def test_an_old_module_has_its_names(old: str, name: str, new: str) -> None:
     assert value is getattr(importlib.import_module(new), name)
     with pytest.raises(AttributeError, match=f"'{QD}.{old}' has no attribute"):
         module.nothing  # noqa: B018
+
+
+def test_old_defaults_of_environments() -> None:
+    old = importlib.import_module(f"{QD}.gradient_options")
+    with pytest.warns(DeprecationWarning, match="TUNED is now tuned of each"):
+        tuned = old.TUNED
+    falls = {"shortest": 0.0005, "longest": 0.02, "sigma_g": 0.02}
+    assert tuned["halfcheetah_uni"] == {"window": 10, "clip": 0.0, "longest": 1.0}
+    assert tuned["hopper_uni"] == tuned["humanoidtrap"] == falls and len(tuned) == 6
+    with pytest.raises(AttributeError, match="has no attribute 'FlowOptions'"):
+        old.FlowOptions  # noqa: B018

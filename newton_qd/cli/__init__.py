@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-from newton_qd.cli import doctor, envs, evolve
+from newton_qd.cli import algorithms, doctor, envs, evolve
 from newton_qd.cli.arguments import BAD_ARGUMENTS, FAILED, OK, complain
 from newton_qd.errors import FaultError, MissingExtra, UnknownEnvironment
 from newton_qd.qd.config import ConfigError, EvolveConfig
@@ -39,7 +39,7 @@ def main(
         prog="newton-qd", description="Quality-Diversity on differentiable physics."
     )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for command in (envs, evolve, doctor):
+    for command in (envs, algorithms, evolve, doctor):
         command.add_parser(commands)
     arguments = parser.parse_args(argv)
     try:

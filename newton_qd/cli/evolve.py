@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from newton_qd.cli.arguments import FAILED, OK, complain, integers, widths
+from newton_qd.qd.algorithms import ALGORITHMS
 from newton_qd.qd.config import (
     ConfigError,
     EvolveConfig,
@@ -106,9 +107,8 @@ def _add_setting_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--algorithm",
         metavar="NAME",
-        help="me, cma-me, pga-me, dcrl-me, me-es, or, with gradients, "
-        "me-gradient, me-actor-critic, "
-        f"omg-mega, cma-mega or cma-maega (default: {_DEFAULTS.algorithm})",
+        help=f"{', '.join(spec.name for spec in ALGORITHMS)} (default: "
+        f"{_DEFAULTS.algorithm}); 'newton-qd algorithms' says what they are",
     )
     group.add_argument(
         "--option",
@@ -117,7 +117,7 @@ def _add_setting_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         metavar="NAME=VALUE",
         help="setting that the algorithm alone has, for example discount=0.95; may be "
-        "repeated",
+        "repeated; 'newton-qd algorithms NAME' lists them",
     )
     group.add_argument(
         "--hidden",

@@ -54,7 +54,7 @@ class EvolveConfig:
             relative to the distance of the parents [-].
         reevaluations: Evaluations of each elite at the end of the run, for corrected
             metrics; 0 leaves them out.
-        algorithm: Name of a row of ``ALGORITHMS``.
+        algorithm: Name of one of ``newton_qd.qd.algorithms.ALGORITHMS``.
         options: Settings that this algorithm alone has, as ``(name, value)`` in the
             order of their names; may be given as a dictionary.
     """

@@ -1,16 +1,24 @@
-"""Old place of what ``newton_qd.qd.algorithms`` has."""
+"""Old place of the defaults that differ for an environment."""
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
-
-from newton_qd.moved import moved_name
-
-_MOVED = {
-    "TUNED": "newton_qd.qd.algorithms.gradient_options.TUNED",
-}
 
 
 def __getattr__(name: str) -> Any:
-    """Finds an old name in its new place."""
-    return moved_name(__name__, name, _MOVED)
+    """Gathers the defaults of all algorithms."""
+    if name != "TUNED":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from newton_qd.qd.algorithms import ALGORITHMS
+
+    warnings.warn(
+        f"{__name__}.TUNED is now tuned of each of newton_qd.qd.algorithms.ALGORITHMS",
+        DeprecationWarning,
+        stacklevel=2,
+    )
+    found: dict[str, dict[str, Any]] = {}
+    for spec in ALGORITHMS:
+        for env_name, defaults in spec.tuned.items():
+            found[env_name] = {**found.get(env_name, {}), **defaults}
+    return found

@@ -5,49 +5,53 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from newton_qd.gradients.factories import make_episode_gradient, make_mixed_gradient
-from newton_qd.gradients.flow import GradientOptions
-from newton_qd.gradients.smooth import with_smooth_descriptor
-from newton_qd.qd.algorithms.parts import refused_options, settings
-from newton_qd.qd.config import EvolveConfig
-from newton_qd.qd.scoring.task import Task
+from newton_qd.qd.algorithms.options import Options
 
-# A robot that falls ends its episode, which no gradient sees: short steps only.
-_FALLS: Mapping[str, Any] = {"shortest": 0.0005, "longest": 0.02, "sigma_g": 0.02}
-
-TUNED: Mapping[str, Mapping[str, Any]] = {
-    # Its return is chaotic after some ten control steps.
-    "halfcheetah_uni": {"window": 10, "clip": 0.0, "longest": 1.0},
-    "hopper_uni": _FALLS,
-    "walker2d_uni": _FALLS,
-    "humanoid_uni": _FALLS,
-    "humanoid_omni": _FALLS,
-    "humanoidtrap": _FALLS,
-}
-"""Defaults of ``FlowOptions`` and its kind that differ for an environment."""
+if TYPE_CHECKING:  # importing the options imports no JAX
+    from newton_qd.gradients import GradientOptions
+    from newton_qd.qd.config import EvolveConfig
+    from newton_qd.qd.scoring.rollout import Policy, ScoringFunction
+    from newton_qd.qd.scoring.task import Task
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class FlowOptions:
-    """How gradients come about; every algorithm here has these options.
+class DifferentiableOptions(Options):
+    """Options of every algorithm that differentiates an environment.
 
     Attributes:
-        window: Control steps after which the gradient is cut; 0: never.
-        clip: Largest norm of the adjoint of a state; 0: no limit.
-        discount: Factor of the adjoint for each control step that it goes back [-].
         smooth_width: Share of a robot's weight over which the reading of a foot has a
             gradient [-]; its value stays 0 or 1.
         initial_scale: Factor of the weights of the initial population [-]: small
             feedback keeps gradients small over more control steps.
     """
 
+    smooth_width: float = 0.1
+    initial_scale: float = 1.0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FlowOptions(DifferentiableOptions):
+    """Options of algorithms that differentiate whole episodes.
+
+    Attributes:
+        window: Control steps after which the gradient is cut; 0: never.
+        clip: Largest norm of the adjoint of a state; 0: no limit.
+        discount: Factor of the adjoint for each control step that it goes back [-].
+    """
+
     window: int = 0
     clip: float = 10.0
     discount: float = 1.0
-    smooth_width: float = 0.1
-    initial_scale: float = 1.0
+
+    def check(self) -> None:
+        """Refuses values that no gradient can have.
+
+        Raises:
+            ValueError: A value is out of its range.
+        """
+        self.flow()
 
     def flow(self) -> GradientOptions:
         """The options of a gradient, in the fastest way, that keeps intermediates.
@@ -55,6 +59,8 @@ class FlowOptions:
         Raises:
             ValueError: A value is out of its range.
         """
+        from newton_qd.gradients import GradientOptions
+
         return GradientOptions(
             window=self.window or None,
             clip=self.clip or None,
@@ -79,6 +85,8 @@ class MixedOptions(FlowOptions):
     @property
     def estimator(self) -> Any:
         """Builds the gradient, as ``make_gradient_scoring_function`` wants it."""
+        from newton_qd.gradients import make_episode_gradient, make_mixed_gradient
+
         if not self.samples:
             return make_episode_gradient
         return functools.partial(
@@ -91,25 +99,45 @@ class MixedOptions(FlowOptions):
         return 2 * self.samples or 1
 
 
-def flow_options(kind: Any, config: EvolveConfig) -> Any:
-    """Options of a run that differentiates whole episodes, checked.
+# Its return is chaotic after some ten control steps.
+CHAOTIC: Mapping[str, Any] = {"window": 10, "clip": 0.0}
+
+
+def on_robots_that_fall(**defaults: Any) -> dict[str, Mapping[str, Any]]:
+    """Gives robots that fall defaults of their own.
+
+    A fall ends the episode, which no gradient sees: they take short steps only.
 
     Args:
-        kind: ``FlowOptions`` or a class of its kind.
-        config: Settings of the run.
-
-    Raises:
-        ConfigError: There is no option of this name, or its value is not allowed.
+        **defaults: Options with their defaults.
     """
-    names = {field.name for field in dataclasses.fields(kind)}
-    tuned = TUNED.get(config.env_name, {}).items()
-    options = settings(kind, config, **{k: v for k, v in tuned if k in names})
-    with refused_options():
-        options.flow()
-    return options
+    names = ("hopper_uni", "walker2d_uni", "humanoid_uni", "humanoid_omni")
+    return dict.fromkeys((*names, "humanoidtrap"), defaults)
 
 
 def differentiable(task: Task, smooth_width: float) -> Task:
     """The task with a descriptor of the same values that has a gradient."""
+    from newton_qd.gradients import with_smooth_descriptor
+
     env = with_smooth_descriptor(task.env, smooth_width, straight_through=True)
     return dataclasses.replace(task, env=env)
+
+
+def gradient_scoring(
+    config: EvolveConfig, options: MixedOptions, task: Task, policy: Policy
+) -> ScoringFunction:
+    """Scores with the gradients of fitness and descriptor."""
+    from newton_qd.qd.scoring.gradient_scoring import make_gradient_scoring_function
+
+    return make_gradient_scoring_function(
+        differentiable(task, options.smooth_width),
+        policy,
+        config.episode_length,
+        options.flow(),
+        estimator=options.estimator,
+    )
+
+
+def initial_scale(options: DifferentiableOptions) -> float:
+    """Factor of the weights of the initial population."""
+    return options.initial_scale

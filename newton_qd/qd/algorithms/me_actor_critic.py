@@ -1,35 +1,34 @@
-"""MAP-Elites with actors that learn by the gradient of the physics, for ``evolve``."""
+"""MAP-Elites with actors that learn over short horizons."""
 
 from __future__ import annotations
 
 import dataclasses
 from typing import Any
 
-from newton_qd.qd.algorithms.gradient_options import differentiable
-from newton_qd.qd.algorithms.parts import Algorithm, Parts, isoline_emitter, settings
-from newton_qd.qd.config import ConfigError, EvolveConfig
-from newton_qd.qd.emitters.actor_critic_learner import (
-    ActorCritic,
-    ActorCriticSettings,
-    measure_of,
+from newton_qd.qd.algorithms.gradient_options import (
+    DifferentiableOptions,
+    differentiable,
+    initial_scale,
 )
+from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext
+from newton_qd.qd.algorithms.variation import with_isoline
+from newton_qd.qd.config import ConfigError, EvolveConfig
+from newton_qd.qd.emitters.actor_critic_settings import ActorCriticSettings
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ActorCriticOptions(ActorCriticSettings):
+class ActorCriticOptions(DifferentiableOptions, ActorCriticSettings):
     """Options of MAP-Elites with actors that learn by the gradient of the physics.
 
     Attributes:
         actors: Number of actors.
-        branches: Times in a generation that actors have offspring.
-        copies: Offspring of an actor then; the rest of the generation are iso+line
-            variations.
-        updates: Updates of an actor between two of these times.
+        branches: Times per generation that each actor produces offspring.
+        copies: Offspring of an actor each time; the rest of the generation are
+            iso+line variations.
+        updates: Updates of an actor before each time that it produces offspring.
         steered: Share of the actors that follow directions of the descriptor [-].
-        fitness: Weight of the reward of these [-].
-        lifetime: Generations after which these begin again.
-        smooth_width: As in ``FlowOptions``.
-        initial_scale: As in ``FlowOptions``.
+        fitness: Weight of the reward of steered actors [-].
+        lifetime: Generations after which a steered actor restarts from a random elite.
     """
 
     actors: int = 2
@@ -39,8 +38,6 @@ class ActorCriticOptions(ActorCriticSettings):
     steered: float = 0.5
     fitness: float = 0.1
     lifetime: int = 10
-    smooth_width: float = 0.1
-    initial_scale: float = 1.0
 
     def episodes(self, config: EvolveConfig) -> int:
         """Episodes that the control steps of a generation's updates amount to."""
@@ -48,20 +45,13 @@ class ActorCriticOptions(ActorCriticSettings):
         return -(-updates * self.worlds * self.window // config.episode_length)
 
 
-def _options(config: EvolveConfig) -> ActorCriticOptions:
-    """Options of a run."""
-    return settings(ActorCriticOptions, config)
-
-
-def _me_actor_critic(parts: Parts) -> Any:
+def _make(context: EmitterContext, options: ActorCriticOptions) -> Any:
     """MAP-Elites with the policies of actors that learn over short horizons."""
-    from qdax.core.emitters.multi_emitter import MultiEmitter
+    from newton_qd.qd.emitters import ActorCritic, ActorCriticEmitter
+    from newton_qd.qd.emitters.actor_critic_learner import measure_of
 
-    from newton_qd.qd.emitters.actor_critic import ActorCriticEmitter
-
-    config, policy = parts.config, parts.policy
-    options = _options(config)
-    task = differentiable(parts.task, options.smooth_width)
+    config, policy = context.config, context.policy
+    task = differentiable(context.task, options.smooth_width)
     method = ActorCritic(
         task.env,
         lambda weights, obs: policy.apply(policy.unravel(weights), obs),
@@ -71,7 +61,7 @@ def _me_actor_critic(parts: Parts) -> Any:
     )
     emitter = ActorCriticEmitter(
         method,
-        task.env.reset(parts.reset_key),
+        task.env.reset(context.reset_key),
         actors=options.actors,
         branches=options.branches,
         copies=options.copies,
@@ -81,30 +71,31 @@ def _me_actor_critic(parts: Parts) -> Any:
         lifetime=options.lifetime,
         measures=task.descriptor_length,
     )
-    rest = config.batch_size - emitter.batch_size
-    if rest < 0:
+    if emitter.batch_size > config.batch_size:
         raise ConfigError(
             f"options: actors = {options.actors} times branches = {options.branches} "
             f"times copies = {options.copies} are more than batch_size = "
             f"{config.batch_size}"
         )
-    if not rest:
-        return emitter
-    return MultiEmitter((emitter, isoline_emitter(config, rest)))
+    return with_isoline(emitter, config)
 
 
-def _actor_critic_episodes(config: EvolveConfig) -> int:
-    return _options(config).episodes(config)
+def _gradients(config: EvolveConfig, options: ActorCriticOptions) -> int:
+    return options.episodes(config)
 
 
-def _actor_critic_scale(config: EvolveConfig) -> float:
-    return _options(config).initial_scale
+def _evaluations(config: EvolveConfig, options: ActorCriticOptions) -> int:
+    return config.batch_size + options.episodes(config)
 
 
-ME_ACTOR_CRITIC = Algorithm(
-    _me_actor_critic,
-    evaluations=lambda config: config.batch_size + _actor_critic_episodes(config),
-    gradients=_actor_critic_episodes,
-    initial_scale=_actor_critic_scale,
+ME_ACTOR_CRITIC = AlgorithmSpec(
+    name="me-actor-critic",
+    summary="MAP-Elites with actors that learn over short horizons from gradients of "
+    "the physics; some actors increase fitness, others move along directions of the "
+    "descriptor; a part of the offspring lies between actors and elites",
+    make=_make,
+    options=ActorCriticOptions,
+    evaluations=_evaluations,
+    gradients=_gradients,
+    initial_scale=initial_scale,
 )
-"""Its row of the table of algorithms."""

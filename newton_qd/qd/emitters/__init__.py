@@ -25,10 +25,8 @@ from newton_qd.qd.extras import require_extra
 
 if TYPE_CHECKING:
     from newton_qd.qd.emitters.actor_critic import ActorCriticEmitter
-    from newton_qd.qd.emitters.actor_critic_learner import (
-        ActorCritic,
-        ActorCriticSettings,
-    )
+    from newton_qd.qd.emitters.actor_critic_learner import ActorCritic
+    from newton_qd.qd.emitters.actor_critic_settings import ActorCriticSettings
     from newton_qd.qd.emitters.cma_maega import CMAMAEGAEmitter
     from newton_qd.qd.emitters.cma_mega import CMAMEGAEmitter
     from newton_qd.qd.emitters.gradient_line import GradientLineEmitter
@@ -55,7 +53,7 @@ __all__ = [
 _HOME = {
     "ActorCritic": "newton_qd.qd.emitters.actor_critic_learner",
     "ActorCriticEmitter": "newton_qd.qd.emitters.actor_critic",
-    "ActorCriticSettings": "newton_qd.qd.emitters.actor_critic_learner",
+    "ActorCriticSettings": "newton_qd.qd.emitters.actor_critic_settings",
     "CMAMAEGAEmitter": "newton_qd.qd.emitters.cma_maega",
     "CMAMEGAEmitter": "newton_qd.qd.emitters.cma_mega",
     "GradientLineEmitter": "newton_qd.qd.emitters.gradient_line",

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from newton_qd.qd.algorithms import ALGORITHMS
-from newton_qd.qd.algorithms.parts import Algorithm, Parts, refused_options
+from newton_qd.qd.algorithms import AlgorithmSpec, EmitterContext, algorithm_named
+from newton_qd.qd.algorithms.options import refused_options
 from newton_qd.qd.config import ConfigError, EvolveConfig, settings_text
 from newton_qd.qd.extras import require_extra
 from newton_qd.qd.run.archive import Archive
@@ -55,6 +55,9 @@ class Search:
 
     Generation ``i`` draws its random numbers from a key folded with ``i``; the state
     after it depends on the settings only.
+
+    Attributes:
+        options: Options of the algorithm, with the defaults of the environment.
     """
 
     def __init__(
@@ -74,7 +77,8 @@ class Search:
                 does not run with these settings.
         """
         require_extra("qdax", "qd")
-        self._algorithm = _row(config)
+        self._algorithm = _runnable(config)
+        self.options = self._algorithm.read_options(config)
         self._config = config
         self._task = task
         self._mesh = mesh
@@ -88,14 +92,15 @@ class Search:
         with refused_options():
             score = self._scoring()
             self._emitter = self._algorithm.make(
-                Parts(
+                EmitterContext(
                     config,
                     task,
                     self._policy,
                     lambda genotypes, _: score(genotypes, self._key_reset),
                     self._key_reset,
                     self._centroids,
-                )
+                ),
+                self.options,
             )
         learns_on_mesh = self._algorithm.evaluates
         self._score = self._compiled(score)
@@ -136,7 +141,7 @@ class Search:
             repertoire, emitter, metrics = self._tell(
                 state.repertoire, state.emitter, genotypes, remembered, scores
             )
-        each = self._algorithm.evaluations(self._config)
+        each = self._algorithm.evaluations(self._config, self.options)
         evaluations = self._config.batch_size + iteration * each
         row = {
             "iteration": iteration,
@@ -227,7 +232,7 @@ class Search:
 
     def _initial(self, key: jax.Array) -> jax.Array:
         """Weights (size,) of an individual of the initial population."""
-        scale = self._algorithm.initial_scale(self._config)
+        scale = self._algorithm.initial_scale(self.options)
         return scale * self._policy.init(key)
 
     def _scoring(self) -> ScoringFunction:
@@ -235,7 +240,9 @@ class Search:
         if self._algorithm.scoring is None:
             return self._plain_scoring(self._algorithm.transitions)
         return self._split(
-            self._algorithm.scoring(self._config, self._task, self._policy)
+            self._algorithm.scoring(
+                self._config, self.options, self._task, self._policy
+            )
         )
 
     def _plain_scoring(self, transitions: bool = False) -> ScoringFunction:
@@ -312,25 +319,24 @@ class Search:
         return {**metrics, "rejected": jnp.sum(~finite)}
 
 
-def _row(config: EvolveConfig) -> Algorithm:
-    """The row of a run's algorithm; raises where it cannot run."""
-    row = ALGORITHMS.get(config.algorithm)
-    if row is None:
+def _runnable(config: EvolveConfig) -> AlgorithmSpec[Any]:
+    """Returns the algorithm of a run.
+
+    Raises:
+        ConfigError: It does not exist, or it cannot run with these settings.
+    """
+    spec = algorithm_named(config.algorithm)
+    if config.batch_size < spec.smallest:
         raise ConfigError(
-            f"algorithm: {config.algorithm!r} does not exist; allowed: "
-            f"{', '.join(ALGORITHMS)}"
+            f"batch_size must be at least {spec.smallest} for {config.algorithm!r}, "
+            f"got {config.batch_size}"
         )
-    if config.batch_size < row.smallest:
-        raise ConfigError(
-            f"batch_size must be at least {row.smallest} for {config.algorithm!r}, got "
-            f"{config.batch_size}"
-        )
-    if jax.config.read("jax_enable_x64") and not row.double:
+    if jax.config.read("jax_enable_x64") and not spec.double:
         raise ConfigError(
             f"algorithm: {config.algorithm!r} is QDax's and mixes precisions in JAX's "
             "64-bit mode; run it without jax_enable_x64"
         )
-    return row
+    return spec
 
 
 def _strongly_typed(tree: Any) -> Any:

@@ -1,0 +1,80 @@
+"""``newton-qd algorithms``: the algorithms of ``evolve``, and the options of one."""
+
+from __future__ import annotations
+
+import argparse
+import textwrap
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+from newton_qd.cli.arguments import OK
+from newton_qd.qd.algorithms import ALGORITHMS, AlgorithmSpec, algorithm_named
+from newton_qd.qd.algorithms.options import option_texts
+
+_WIDTH = 79
+
+
+def add_parser(commands: Any) -> None:
+    """Adds the command to the subparsers of ``newton-qd``."""
+    parser = commands.add_parser(
+        "algorithms",
+        help="list the algorithms of evolve, or the options of one",
+        description="Lists the algorithms of evolve. With NAME, lists the options "
+        "that this algorithm alone has, with their defaults; evolve takes them as "
+        "--option NAME=VALUE.",
+    )
+    parser.add_argument(
+        "name", nargs="?", metavar="NAME", help="algorithm, for example me-gradient"
+    )
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Prints the list, or the options of one, and returns the exit code.
+
+    Raises:
+        ConfigError: No algorithm has this name.
+    """
+    if arguments.name is None:
+        print("\n".join(_columns((spec.name, _plain(spec)) for spec in ALGORITHMS)))
+    else:
+        print("\n".join(_details(algorithm_named(arguments.name))))
+    return OK
+
+
+def _plain(spec: AlgorithmSpec[Any]) -> str:
+    """The summary without the marks of code."""
+    return spec.summary.replace("`", "")
+
+
+def _details(spec: AlgorithmSpec[Any]) -> Iterator[str]:
+    """Lines that describe an algorithm and its options."""
+    yield from textwrap.wrap(f"{spec.name}: {_plain(spec)}", _WIDTH)
+    rows = [
+        (f"{name}={default}" if default else name, meaning.replace("``", ""))
+        for name, default, meaning in option_texts(spec.options)
+    ]
+    if not rows:
+        yield "It has no options of its own."
+        return
+    yield "\noptions, with their defaults:"
+    yield from _columns(rows)
+    if spec.tuned:
+        yield "\ndefaults that differ for an environment:"
+        yield from _columns(
+            (env_name, " ".join(f"{name}={value}" for name, value in tuned.items()))
+            for env_name, tuned in spec.tuned.items()
+        )
+
+
+def _columns(rows: Iterable[tuple[str, str]]) -> Iterator[str]:
+    """Lines of two columns, the second of which is wrapped."""
+    rows = list(rows)
+    width = max(len(head) for head, _ in rows)
+    for head, text in rows:
+        yield from textwrap.wrap(
+            f"  {head.ljust(width)}  {text}",
+            max(_WIDTH, width + 34),
+            subsequent_indent=" " * (width + 4),
+            break_on_hyphens=False,
+        )

@@ -1,0 +1,52 @@
+"""CMA-ME, as QDax has it."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+from newton_qd.qd.algorithms.options import Options
+from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext
+from newton_qd.qd.config import ConfigError
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CMAMEOptions(Options):
+    """Options of CMA-ME (Fontaine et al. 2020).
+
+    Attributes:
+        emitters: Number of emitters that take turns.
+        sigma_g: Initial step size, in units of policy weights [-].
+    """
+
+    emitters: int = 4
+    sigma_g: float = 0.5
+
+
+def _make(context: EmitterContext, options: CMAMEOptions) -> Any:
+    """CMA-ME with improvement emitters; its memory grows with size squared."""
+    from qdax.core.emitters.cma_improvement_emitter import CMAImprovementEmitter
+    from qdax.core.emitters.cma_pool_emitter import CMAPoolEmitter
+
+    if not options.sigma_g > 0:
+        raise ConfigError(f"options: sigma_g must be positive, got {options.sigma_g}")
+    emitter = CMAImprovementEmitter(
+        batch_size=context.config.batch_size,
+        genotype_dim=context.policy.size,
+        centroids=context.centroids,
+        sigma_g=options.sigma_g,
+        min_count=1,
+    )
+    return CMAPoolEmitter(num_states=options.emitters, emitter=emitter)
+
+
+CMA_ME = AlgorithmSpec(
+    name="cma-me",
+    summary="CMA-ME with improvement emitters; its memory grows with the square of "
+    "the policy's size",
+    make=_make,
+    options=CMAMEOptions,
+    least=1,
+    smallest=2,
+    double=False,
+)

@@ -1,0 +1,113 @@
+"""CMA-MEGA, and what CMA-MAEGA shares with it."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING, Any
+
+from newton_qd.qd.algorithms.gradient_options import (
+    CHAOTIC,
+    MixedOptions,
+    gradient_scoring,
+    initial_scale,
+    on_robots_that_fall,
+)
+from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext
+from newton_qd.qd.config import ConfigError, EvolveConfig
+
+if TYPE_CHECKING:
+    from newton_qd.qd.emitters.arborescence import ArborescenceEmitter
+
+_SMALLEST_POPULATION = 3  # a solution point and two offspring
+
+TUNED = {"halfcheetah_uni": CHAOTIC, **on_robots_that_fall(sigma_g=0.02)}
+"""Defaults of ``CMAMEGAOptions`` that differ for an environment."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CMAMEGAOptions(MixedOptions):
+    """Options of CMA-MEGA (Fontaine and Nikolaidis 2021).
+
+    Attributes:
+        points: Solution points, among which a generation is divided.
+        sigma_g: Initial standard deviation of the coefficients of the normalized
+            gradients, in units of policy weights [-].
+        adam: Learning rate of Adam [-]; 0: points move to the weighted mean of their
+            best offspring.
+        restart_period: Restart a point after this many generations in any case; 0:
+            by its restart rule alone.
+    """
+
+    points: int = 4
+    sigma_g: float = 0.1
+    adam: float = 0.0
+    restart_period: int = 0
+
+    def population(self, config: EvolveConfig) -> int:
+        """Individuals of a generation that belong to one solution point.
+
+        Raises:
+            ConfigError: The points do not divide a generation, or are too many.
+        """
+        if self.points < 1 or config.batch_size % self.points:
+            raise ConfigError(
+                f"options: points must divide batch_size = {config.batch_size}, got "
+                f"{self.points!r}"
+            )
+        each = config.batch_size // self.points
+        if each < _SMALLEST_POPULATION:
+            raise ConfigError(
+                f"options: points = {self.points} leave {each} of batch_size = "
+                f"{config.batch_size} each; at least {_SMALLEST_POPULATION}"
+            )
+        return each
+
+
+def make_search(
+    kind: type[ArborescenceEmitter], context: EmitterContext, options: CMAMEGAOptions
+) -> ArborescenceEmitter:
+    """Makes an emitter of solution points with the options of a run."""
+    import optax
+
+    config = context.config
+    score = gradient_scoring(config, options, context.task, context.policy)
+    return kind(
+        lambda genotypes, _: score(genotypes, context.reset_key),
+        sigma_g=options.sigma_g,
+        batch_size=options.population(config),
+        num_emitters=options.points,
+        optimizer=optax.adam(options.adam) if options.adam else None,
+        restart_period=options.restart_period or None,
+    )
+
+
+def gradients(config: EvolveConfig, options: CMAMEGAOptions) -> int:
+    """Episodes of a generation that are differentiated: those of solution points."""
+    del config
+    return options.points * options.episodes
+
+
+def evaluations(config: EvolveConfig, options: CMAMEGAOptions) -> int:
+    """Episodes of a generation."""
+    return config.batch_size + gradients(config, options)
+
+
+def _make(context: EmitterContext, options: CMAMEGAOptions) -> Any:
+    """CMA-MEGA: CMA-ES searches for steps along the gradients of solution points."""
+    from newton_qd.qd.emitters import CMAMEGAEmitter
+
+    return make_search(CMAMEGAEmitter, context, options)
+
+
+CMA_MEGA = AlgorithmSpec(
+    name="cma-mega",
+    summary="CMA-MEGA: CMA-ES searches for steps along the gradients of a few solution "
+    "points",
+    make=_make,
+    options=CMAMEGAOptions,
+    tuned=TUNED,
+    evaluations=evaluations,
+    gradients=gradients,
+    takes_faulty=True,
+    initial_scale=initial_scale,
+)

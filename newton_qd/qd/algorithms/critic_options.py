@@ -1,0 +1,56 @@
+"""Options of QDax's emitters that learn with a critic."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from newton_qd.qd.algorithms.options import Options
+from newton_qd.qd.config import ConfigError, EvolveConfig
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CriticOptions(Options):
+    """Options of an emitter that learns a critic, with the names that QDax gives them.
+
+    Attributes:
+        num_critic_training_steps: Updates of the critic in a generation.
+        num_pg_training_steps: Updates of each policy that follows the critic.
+        replay_buffer_size: Transitions that are kept; checkpoints hold them.
+        critic_hidden_layer_size: Widths of the critic's hidden layers.
+        critic_learning_rate: Learning rate of the critic [-].
+        policy_learning_rate: Learning rate of policies that follow the critic [-].
+        noise_clip: Largest noise on the actions of the critic's targets [-].
+        policy_noise: Standard deviation of this noise [-].
+        discount: Discount of a control step [-].
+        reward_scaling: Factor of the rewards [-].
+        batch_size: Transitions of one update.
+        soft_tau_update: Share of the new weights in an update of target networks [-].
+        policy_delay: Updates of the critic for each update of its greedy actor.
+    """
+
+    num_critic_training_steps: int = 300
+    num_pg_training_steps: int = 100
+    # A million, as QDax has it, would be in every checkpoint.
+    replay_buffer_size: int = 100_000
+    critic_hidden_layer_size: tuple[int, ...] = (256, 256)
+    critic_learning_rate: float = 3e-4
+    policy_learning_rate: float = 1e-3
+    noise_clip: float = 0.5
+    policy_noise: float = 0.2
+    discount: float = 0.99
+    reward_scaling: float = 1.0
+    batch_size: int = 256
+    soft_tau_update: float = 0.005
+    policy_delay: int = 2
+
+
+def require_batch_size(config: EvolveConfig, name: str, value: int | None) -> None:
+    """Refuses an option that would give a generation another size.
+
+    Raises:
+        ConfigError: The value is given, and is not the size of a generation.
+    """
+    if value not in (None, config.batch_size):
+        raise ConfigError(
+            f"options: {name} is batch_size ({config.batch_size}), not {value!r}"
+        )

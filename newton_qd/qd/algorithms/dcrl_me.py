@@ -1,0 +1,111 @@
+"""DCRL-ME, as QDax has it."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING, Any
+
+from newton_qd.qd.algorithms.critic_options import CriticOptions
+from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext
+from newton_qd.qd.algorithms.variation import isoline
+from newton_qd.qd.config import ConfigError, EvolveConfig
+
+if TYPE_CHECKING:
+    import jax
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class DCRLMEOptions(CriticOptions):
+    """Options of DCRL-ME (Faldor et al. 2024); QDax's ``DCRLMEConfig``.
+
+    Attributes:
+        ga_batch_size: Iso+line variations in a generation; by default the rest.
+        dcrl_batch_size: Individuals that follow the critic; by default a quarter.
+        ai_batch_size: Individuals that the actor makes; by default a quarter.
+        lengthscale: Distance of descriptors over which a reward falls by a factor e.
+        actor_learning_rate: Learning rate of the actor [-].
+    """
+
+    ga_batch_size: int | None = None
+    dcrl_batch_size: int | None = None
+    ai_batch_size: int | None = None
+    lengthscale: float = 0.1
+    actor_learning_rate: float = 3e-4
+    num_critic_training_steps: int = 3000
+    num_pg_training_steps: int = 150
+    batch_size: int = 100
+
+    def shares(self, config: EvolveConfig) -> dict[str, int]:
+        """Sizes of the three parts of a generation, by the names of the options.
+
+        Raises:
+            ConfigError: One is empty, or they do not add up to a generation.
+        """
+        quarter = config.batch_size // 4
+        found = {
+            "ga_batch_size": config.batch_size - 2 * quarter,
+            "dcrl_batch_size": quarter,
+            "ai_batch_size": quarter,
+        }
+        given = {name: getattr(self, name) for name in found}
+        found |= {name: value for name, value in given.items() if value is not None}
+        sizes = tuple(found.values())
+        if min(sizes) < 1 or sum(sizes) != config.batch_size:
+            raise ConfigError(
+                "options: ga_batch_size, dcrl_batch_size and ai_batch_size must be at "
+                f"least 1 and add up to batch_size ({config.batch_size}), got {sizes}"
+            )
+        return found
+
+
+def _make(context: EmitterContext, options: DCRLMEOptions) -> Any:
+    """DCRL-ME: critic and actor depend on the descriptor (Faldor et al. 2024)."""
+    import jax
+    import jax.numpy as jnp
+
+    from newton_qd import compat
+
+    compat.install()  # QDax's file imports environments that JAX of today refuses
+    from qdax.core.emitters.dcrl_me_emitter import DCRLMEConfig, DCRLMEEmitter
+    from qdax.core.neuroevolution.buffers.buffer import DCRLTransition
+    from qdax.core.neuroevolution.networks.networks import MLPDC
+
+    from newton_qd.qd.algorithms.network_emitter import OfParameters
+
+    config, task = context.config, context.task
+    settings = {**dataclasses.asdict(options), **options.shares(config)}
+    actor = MLPDC(
+        layer_sizes=(*config.hidden, task.env.action_size),
+        kernel_init=jax.nn.initializers.lecun_uniform(),
+        final_activation=jnp.tanh,
+    )
+
+    def convert(steps: dict[str, jax.Array]) -> Any:
+        # It weighs rewards by the distance of descriptors, so none may be negative.
+        rewards = jnp.maximum(steps["rewards"] + task.reward_offset, 0.0)
+        shape = (*rewards.shape, task.descriptor_length)
+        unknown = jnp.full(shape, jnp.nan, rewards.dtype)  # the emitter fills it in
+        return DCRLTransition(
+            **{**steps, "rewards": rewards}, desc=unknown, desc_prime=unknown
+        )
+
+    emitter = DCRLMEEmitter(
+        DCRLMEConfig(**settings),
+        context.policy.network,
+        actor,
+        task.env,
+        isoline(config),
+    )
+    return OfParameters(emitter, context.policy, convert)
+
+
+DCRL_ME = AlgorithmSpec(
+    name="dcrl-me",
+    summary="DCRL-ME: like `pga-me`, with a critic and an actor that depend on the "
+    "descriptor; the critic and the actor each produce a quarter of the generation",
+    make=_make,
+    options=DCRLMEOptions,
+    least=1,
+    transitions=True,
+    double=False,
+)

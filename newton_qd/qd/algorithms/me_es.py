@@ -1,0 +1,107 @@
+"""ME-ES, as QDax has it."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING, Any
+
+from newton_qd.qd.algorithms.critic_options import require_batch_size
+from newton_qd.qd.algorithms.options import Options
+from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext
+from newton_qd.qd.config import ConfigError, EvolveConfig
+
+if TYPE_CHECKING:
+    import jax
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class MEESOptions(Options):
+    """Options of ME-ES (Colas et al. 2020); QDax's ``MEESConfig``.
+
+    Attributes:
+        sample_number: Samples for each gradient; ``--batch-size`` sets it.
+        sample_sigma: Standard deviation of the samples, in units of policy weights
+            [-].
+        sample_mirror: Whether each sample has a mirror image.
+        sample_rank_norm: Whether samples are weighed by their ranks.
+        num_optimizer_steps: Generations after which a new parent is chosen.
+        adam_optimizer: Whether Adam takes the steps, or plain gradient ascent.
+        learning_rate: Learning rate [-].
+        l2_coefficient: Weight of the penalty on large policy weights [-].
+        novelty_nearest_neighbors: Nearest neighbours that novelty is measured with.
+        last_updated_size: Newest elites among which parents are chosen.
+        exploit_num_cell_sample: Fittest elites among which parents are chosen.
+        explore_num_cell_sample: Most novel elites among which parents are chosen.
+        use_explore: Whether some generations follow novelty.
+        use_exploit: Whether some generations follow fitness.
+    """
+
+    sample_number: int | None = None
+    sample_sigma: float = 0.02
+    sample_mirror: bool = True
+    sample_rank_norm: bool = True
+    num_optimizer_steps: int = 10
+    adam_optimizer: bool = True
+    learning_rate: float = 0.01
+    l2_coefficient: float = 0.02
+    novelty_nearest_neighbors: int = 10
+    last_updated_size: int = 5
+    exploit_num_cell_sample: int = 2
+    explore_num_cell_sample: int = 5
+    use_explore: bool = True
+    use_exploit: bool = True
+
+
+class _FromOne:
+    """ME-ES, which grows from one individual, in a population of any size."""
+
+    def __init__(self, emitter: Any) -> None:
+        self.emit = emitter.emit
+        self.state_update = emitter.state_update
+        self._emitter = emitter
+
+    def init(self, key: jax.Array, genotypes: jax.Array, **told: Any) -> Any:
+        """Returns the state before the second generation."""
+        return self._emitter.init(key=key, genotypes=genotypes[:1], **told)
+
+
+def _make(context: EmitterContext, options: MEESOptions) -> Any:
+    """ME-ES: evolution strategies from elites (Colas et al. 2020)."""
+    from qdax.core.emitters.mees_emitter import MEESConfig, MEESEmitter
+
+    samples = context.config.batch_size
+    require_batch_size(context.config, "sample_number", options.sample_number)
+    if options.sample_mirror and samples % 2:
+        raise ConfigError(
+            f"batch_size must be even for 'me-es' with sample_mirror, got {samples}"
+        )
+    emitter = MEESEmitter(
+        MEESConfig(**{**dataclasses.asdict(options), "sample_number": samples}),
+        # The archive of its novelty holds one descriptor for each generation.
+        total_generations=max(
+            context.config.iterations + 1, options.novelty_nearest_neighbors
+        ),
+        scoring_fn=context.score,
+        num_descriptors=context.task.descriptor_length,
+    )
+    return _FromOne(emitter)
+
+
+def _evaluations(config: EvolveConfig, options: MEESOptions) -> int:
+    """The samples of a gradient, and the individual that they lead to."""
+    del options
+    return config.batch_size + 1
+
+
+ME_ES = AlgorithmSpec(
+    name="me-es",
+    summary="ME-ES: evolution strategies that start from elites; `--batch-size` is the "
+    "number of samples for each gradient",
+    make=_make,
+    options=MEESOptions,
+    least=1,
+    evaluates=True,
+    evaluations=_evaluations,
+    smallest=2,
+    double=False,
+)

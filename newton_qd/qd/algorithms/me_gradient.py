@@ -1,0 +1,108 @@
+"""MAP-Elites with gradient variations."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+from newton_qd.qd.algorithms.gradient_options import (
+    CHAOTIC,
+    FlowOptions,
+    differentiable,
+    initial_scale,
+    on_robots_that_fall,
+)
+from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext
+from newton_qd.qd.algorithms.variation import with_isoline
+from newton_qd.qd.config import ConfigError, EvolveConfig
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class MEGradientOptions(FlowOptions):
+    """Options of MAP-Elites with gradient variations.
+
+    Attributes:
+        share: Share of a generation that follows gradients [-]; the rest are iso+line
+            variations.
+        branches: Offspring along each gradient.
+        shortest: Shortest step, in units of policy weights [-].
+        longest: Longest step, in units of policy weights [-].
+        steered: Share of the parents that move towards empty cells [-]; the others
+            increase their fitness.
+    """
+
+    share: float = 0.5
+    branches: int = 4
+    shortest: float = 0.02
+    longest: float = 0.5
+    steered: float = 0.5
+
+    def parents(self, config: EvolveConfig) -> int:
+        """Parents of a generation whose gradient is evaluated.
+
+        Raises:
+            ConfigError: A generation is too small, or a value out of its range.
+        """
+        if not 0 < self.share <= 1:
+            raise ConfigError(f"options: share must be in (0, 1], got {self.share!r}")
+        if self.branches < 1:
+            raise ConfigError(
+                f"options: branches must be at least 1, got {self.branches!r}"
+            )
+        parents = int(self.share * config.batch_size) // self.branches
+        if parents < 1:
+            raise ConfigError(
+                f"options: share = {self.share} of batch_size = {config.batch_size} "
+                f"holds no parent with branches = {self.branches} offspring"
+            )
+        return parents
+
+
+def _make(context: EmitterContext, options: MEGradientOptions) -> Any:
+    """MAP-Elites in which a share of the offspring lies along gradients of elites."""
+    from newton_qd.gradients import make_directional_gradient
+    from newton_qd.qd.emitters.gradient_line import GradientLineEmitter
+
+    config, policy = context.config, context.policy
+    task = differentiable(context.task, options.smooth_width)
+    gradient = make_directional_gradient(
+        task.env,
+        policy.apply,
+        task.descriptor_extractor,
+        episode_length=config.episode_length,
+        unravel=policy.unravel,
+        options=options.flow(),
+    )
+    emitter = GradientLineEmitter(
+        lambda genotypes, ways, _: gradient(genotypes, ways, context.reset_key),
+        parents=options.parents(config),
+        branches=options.branches,
+        shortest=options.shortest,
+        longest=options.longest,
+        steered=options.steered,
+    )
+    return with_isoline(emitter, config)
+
+
+def _gradients(config: EvolveConfig, options: MEGradientOptions) -> int:
+    return options.parents(config)
+
+
+def _evaluations(config: EvolveConfig, options: MEGradientOptions) -> int:
+    return config.batch_size + options.parents(config)
+
+
+ME_GRADIENT = AlgorithmSpec(
+    name="me-gradient",
+    summary="MAP-Elites; half of the offspring are steps along exact gradients of "
+    "elites, which either increase fitness or lead to empty cells",
+    make=_make,
+    options=MEGradientOptions,
+    tuned={
+        "halfcheetah_uni": {**CHAOTIC, "longest": 1.0},
+        **on_robots_that_fall(shortest=0.0005, longest=0.02),
+    },
+    evaluations=_evaluations,
+    gradients=_gradients,
+    initial_scale=initial_scale,
+)

@@ -1,0 +1,64 @@
+"""PGA-ME, as QDax has it."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+from newton_qd.qd.algorithms.critic_options import CriticOptions, require_batch_size
+from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext
+from newton_qd.qd.algorithms.variation import isoline
+from newton_qd.qd.config import ConfigError
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PGAMEOptions(CriticOptions):
+    """Options of PGA-ME (Nilsson and Cully 2021); QDax's ``PGAMEConfig``.
+
+    Attributes:
+        env_batch_size: Individuals of a generation; ``--batch-size`` sets it.
+        proportion_mutation_ga: Share of the iso+line variations in a generation [-].
+        greedy_learning_rate: Learning rate of the greedy actor [-].
+    """
+
+    env_batch_size: int | None = None
+    proportion_mutation_ga: float = 0.5
+    greedy_learning_rate: float = 3e-4
+
+
+def _make(context: EmitterContext, options: PGAMEOptions) -> Any:
+    """PGA-ME: half of the variations follow a critic (Nilsson and Cully 2021)."""
+    from newton_qd import compat
+
+    compat.install()  # QDax's file imports environments that JAX of today refuses
+    from qdax.core.emitters.pga_me_emitter import PGAMEConfig, PGAMEEmitter
+    from qdax.core.neuroevolution.buffers.buffer import QDTransition
+
+    from newton_qd.qd.algorithms.network_emitter import OfParameters
+
+    size = context.config.batch_size
+    require_batch_size(context.config, "env_batch_size", options.env_batch_size)
+    if not 0 < int(options.proportion_mutation_ga * size) < size:
+        raise ConfigError(
+            f"options: proportion_mutation_ga = {options.proportion_mutation_ga} of "
+            f"batch_size = {size} must be some individuals, not all"
+        )
+    emitter = PGAMEEmitter(
+        PGAMEConfig(**{**dataclasses.asdict(options), "env_batch_size": size}),
+        context.policy.network,
+        context.task.env,
+        isoline(context.config),
+    )
+    return OfParameters(emitter, context.policy, lambda steps: QDTransition(**steps))
+
+
+PGA_ME = AlgorithmSpec(
+    name="pga-me",
+    summary="PGA-ME: half of the variations follow a learned critic",
+    make=_make,
+    options=PGAMEOptions,
+    least=1,
+    transitions=True,
+    smallest=2,
+    double=False,
+)

@@ -1,0 +1,50 @@
+"""The iso+line variation, which most algorithms have in common."""
+
+from __future__ import annotations
+
+import functools
+from typing import TYPE_CHECKING, Any
+
+from newton_qd.qd.config import EvolveConfig
+
+if TYPE_CHECKING:
+    import jax
+
+
+def isoline(config: EvolveConfig) -> Any:
+    """The iso+line variation (Vassiliades and Mouret 2018) of a run."""
+    from qdax.core.emitters.mutation_operators import isoline_variation
+
+    return functools.partial(
+        isoline_variation, iso_sigma=config.iso_sigma, line_sigma=config.line_sigma
+    )
+
+
+def isoline_emitter(config: EvolveConfig, batch_size: int) -> Any:
+    """Emitter of iso+line variations, as MAP-Elites has it."""
+    from qdax.core.emitters.standard_emitters import MixingEmitter
+
+    return MixingEmitter(
+        mutation_fn=_no_mutation,
+        variation_fn=isoline(config),
+        variation_percentage=1.0,
+        batch_size=batch_size,
+    )
+
+
+def with_isoline(emitter: Any, config: EvolveConfig) -> Any:
+    """Fills up a generation with iso+line variations.
+
+    Args:
+        emitter: Emitter of a part of a generation.
+        config: Settings of the run.
+    """
+    from qdax.core.emitters.multi_emitter import MultiEmitter
+
+    rest = config.batch_size - emitter.batch_size
+    return MultiEmitter((emitter, isoline_emitter(config, rest))) if rest else emitter
+
+
+def _no_mutation(genotypes: Any, key: jax.Array) -> Any:
+    del key
+    return genotypes
