@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from newton_qd.physics.solver import NewtonQDSolver
     from newton_qd.registry import create, create_fn, register, registered_envs
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "Env",
