@@ -1,29 +1,23 @@
-"""A robot of one's own as QD tasks: its file, its row, its names.
+"""A robot of one's own as QD tasks: its file, its spec, its names.
 
     python examples/own_robot.py [--env tripod_yard] [--iterations 40]
 
-``tripod.urdf`` has masses, joints and colliders; the row says what a URDF cannot.
-``yard.urdf`` has the walls of the second task.
+``tripod.urdf`` has masses, joints and colliders; the spec says what a URDF cannot.
+``yard.urdf`` has the walls of the second task. A reward, an observation or a descriptor
+of one's own: docs/own_environment.md.
 """
 
 from __future__ import annotations
 
 import argparse
-import functools
 from pathlib import Path
 
-import newton_qd
-from newton_qd.envs.locomotion import Locomotion
-from newton_qd.extractors import get_feet_contact_proportion, get_final_xy_position
-from newton_qd.robots import Contact, RobotSpec
-from newton_qd.scenes import Scene
-from newton_qd.tasks import WrapperSpec
-from newton_qd.wrappers import FeetContactWrapper, XYPositionWrapper
+import newton_qd.authoring as nq
 
 HERE = Path(__file__).resolve().parent
 LEGS = ("1", "2", "3")
 
-TRIPOD = RobotSpec(
+TRIPOD = nq.RobotSpec(
     name="tripod",
     urdf=str(HERE / "tripod.urdf"),
     torso="body",
@@ -31,34 +25,34 @@ TRIPOD = RobotSpec(
     actuators=tuple(
         (f"{joint}_{leg}", 30.0) for leg in LEGS for joint in ("hip", "knee")
     ),
-    contacts=(Contact("body"), *(Contact(f"foot_{leg}", end=-1) for leg in LEGS)),
+    contacts=(nq.Contact("body"), *(nq.Contact(f"foot_{leg}", end=-1) for leg in LEGS)),
     rest_pose=tuple((f"knee_{leg}", 0.8) for leg in LEGS),
     dt=0.04,
     substeps=5,
 )
 
-newton_qd.register(
+nq.register(
     "tripod_uni",
-    functools.partial(Locomotion, TRIPOD, healthy_z_range=(0.21, 1.0)),
+    nq.Locomotion,
     base_name="tripod",
-    wrappers=(WrapperSpec(FeetContactWrapper),),
-    descriptor_extractor=get_feet_contact_proportion,
+    descriptor=nq.FeetContactWrapper,
     reward_offset=2.0,
     robot=TRIPOD,
+    healthy_z_range=(0.21, 1.0),
 )
 
 # The same robot among walls, described by where it comes to.
-YARD = Scene("yard", str(HERE / "yard.urdf"))
-newton_qd.register(
+YARD = nq.Scene("yard", str(HERE / "yard.urdf"))
+LIMITS = {"minval": (-1.0, -4.0), "maxval": (8.0, 4.0)}
+nq.register(
     "tripod_yard",
-    functools.partial(Locomotion, TRIPOD, healthy_z_range=(0.21, 1.0), scene=YARD),
+    nq.Locomotion,
     base_name="tripod",
-    wrappers=(
-        WrapperSpec(XYPositionWrapper, {"minval": (-1.0, -4.0), "maxval": (8.0, 4.0)}),
-    ),
-    descriptor_extractor=get_final_xy_position,
+    descriptor=nq.WrapperSpec(nq.XYPositionWrapper, LIMITS),
     reward_offset=2.0,
     robot=TRIPOD,
+    healthy_z_range=(0.21, 1.0),
+    scene=YARD,
 )
 
 

@@ -13,7 +13,8 @@ The facade:
   ``step`` takes and ``env.default_params`` has; drawn at random
 - ``NewtonQDSolver``: the same physics as a solver of Newton
 
-Beside it, ``newton_qd.tables`` has tables by the name of an environment.
+Beside it, ``newton_qd.authoring`` has all that an environment of one's own needs, and
+``newton_qd.tables`` has tables by the name of an environment.
 
 Importing the package imports none of its parts: each name is loaded when it is
 first used.
@@ -25,6 +26,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from newton_qd import authoring as authoring
     from newton_qd import tables as tables
     from newton_qd.envs.base import Env
     from newton_qd.envs.randomization import randomize_params
@@ -74,7 +76,7 @@ _HOME = {
     "registered_envs": "newton_qd.registry",
 }
 
-_MODULES = ("tables",)
+_MODULES = ("authoring", "tables")
 """Modules that the facade loads as ``newton_qd.NAME``."""
 
 _MOVED = {

@@ -3,12 +3,26 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, Protocol, Self
+from collections.abc import Callable
+from typing import Any, Protocol, Self, TypeAlias
 
 import jax
 import jax.numpy as jnp
 
 from newton_qd.types import Descriptor, Mask, Observation
+
+
+class Transitions(Protocol):
+    """What extractors read: a batch of transitions, as QDax's ``QDTransition``."""
+
+    @property
+    def state_desc(self) -> jax.Array:
+        """(n, t, nd) state descriptors before each step."""
+        ...
+
+
+Extractor: TypeAlias = Callable[[Any, Mask], Descriptor]
+"""Maps transitions and their mask (n, t) to descriptors of episodes (n, nd)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,7 +59,7 @@ def folded_sum(values: jax.Array, axis: int) -> jax.Array:
     return rest[0]
 
 
-def get_final_xy_position(data: Any, mask: Mask) -> Descriptor:
+def get_final_xy_position(data: Transitions, mask: Mask) -> Descriptor:
     """Position before the last valid step of each episode.
 
     Args:
@@ -60,7 +74,7 @@ def get_final_xy_position(data: Any, mask: Mask) -> Descriptor:
     return jax.vmap(lambda rows, index: rows[index])(data.state_desc, last)
 
 
-def get_feet_contact_proportion(data: Any, mask: Mask) -> Descriptor:
+def get_feet_contact_proportion(data: Transitions, mask: Mask) -> Descriptor:
     """Proportion of the valid steps at which each foot touched the ground.
 
     Args:
@@ -76,6 +90,19 @@ def get_feet_contact_proportion(data: Any, mask: Mask) -> Descriptor:
     # its reciprocal, in some batches: 41 * (1 / 41) is not 1
     steps = folded_sum(jnp.broadcast_to(valid, data.state_desc.shape), 1)
     return folded_sum(data.state_desc * valid, 1) / jax.lax.optimization_barrier(steps)
+
+
+def get_mean_state_descriptor(data: Transitions, mask: Mask) -> Descriptor:
+    """Mean of the state descriptors over the valid steps of each episode.
+
+    Args:
+        data: Transitions with ``state_desc`` (n, t, nd).
+        mask: (n, t) 1 where a step comes after the end of the episode, else 0.
+
+    Returns:
+        (n, nd) means.
+    """
+    return get_feet_contact_proportion(data, mask)
 
 
 class Encoder(Protocol):

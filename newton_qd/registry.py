@@ -14,9 +14,10 @@ from newton_qd import tasks
 from newton_qd.envs.base import Env
 from newton_qd.envs.options import check_flag
 from newton_qd.errors import UnknownEnvironment
+from newton_qd.extractors import Extractor
 from newton_qd.moved import moved_name
 from newton_qd.robots import Material, RobotSpec
-from newton_qd.tasks import EnvironmentSpec, Extractor, WrapperSpec
+from newton_qd.tasks import EnvironmentSpec, WrapperSpec
 from newton_qd.wrappers import (
     AutoResetWrapper,
     CompletedEvalWrapper,
@@ -55,9 +56,11 @@ def register(
     *,
     base_name: str | None = None,
     wrappers: Sequence[WrapperSpec] = (),
+    descriptor: WrapperSpec | Callable[..., Env] | None = None,
     descriptor_extractor: Extractor | None = None,
     reward_offset: float | None = None,
     robot: RobotSpec | None = None,
+    **options: Any,
 ) -> None:
     """Adds an environment to the names that ``create`` knows.
 
@@ -66,28 +69,24 @@ def register(
         base: Class or function that makes the environment without wrappers.
         base_name: Name that the wrappers receive; ``None``: ``env_name``.
         wrappers: Wrappers, from the inside to the outside.
-        descriptor_extractor: Reads the descriptor of an episode, for QD tasks.
+        descriptor: Wrapper that writes the state descriptor, outside of ``wrappers``:
+            a class such as ``FeetContactWrapper``, or a ``WrapperSpec``.
+        descriptor_extractor: Reads the descriptor of an episode, for QD tasks;
+            ``None``: what the class ``descriptor`` says of itself, if there is one.
         reward_offset: Added to each step's reward to keep QD scores positive.
-        robot: Spec of the robot inside, for ``FEET_NAMES`` and ``COG_NAMES``; ``None``:
-            that of the suite called ``base_name``, if there is one.
+        robot: Spec of the robot inside, given to ``base`` where it takes a ``robot``;
+            for ``FEET_NAMES`` and ``COG_NAMES``. ``None``: that of the suite called
+            ``base_name``, if there is one.
+        **options: Keyword arguments of ``base``, which ``create`` may replace.
 
     Raises:
-        TypeError: An argument is of another type.
+        TypeError: An argument is of another type, or ``base`` does not take an option.
         ValueError: The name is taken, a name is not a name, or ``reward_offset`` is
             not finite.
     """
-    if not isinstance(env_name, str) or not env_name:
-        raise ValueError(f"env_name={env_name!r}: allowed: a string that is not empty")
-    if env_name in tasks.ENVIRONMENTS:
-        taken = ", ".join(registered_envs())
-        raise ValueError(f"env_name={env_name!r}: taken; allowed: any but {taken}")
+    _check_names(env_name, base_name)
     if not callable(base):
         raise TypeError(f"base={base!r}: allowed: a class or a function")
-    # A spec is read by every table: one that is wrong would break them all.
-    if base_name is not None and (not isinstance(base_name, str) or not base_name):
-        raise ValueError(
-            f"base_name={base_name!r}: allowed: None, or a string that is not empty"
-        )
     if descriptor_extractor is not None and not callable(descriptor_extractor):
         raise TypeError(
             f"descriptor_extractor={descriptor_extractor!r}: allowed: None, or a "
@@ -99,14 +98,60 @@ def register(
         )
     _check_offset(reward_offset)
     _check_wrappers(wrappers)
+    described = _descriptor_specs(descriptor)
+    if descriptor_extractor is None and described:
+        descriptor_extractor = getattr(
+            described[0].wrapper, "descriptor_extractor", None
+        )
+    if robot is not None and _takes_robot(base):
+        options = {"robot": robot, **options}
+    if options:
+        _require_keywords(env_name, base, options)
     tasks.ENVIRONMENTS[env_name] = EnvironmentSpec(
-        base,
+        functools.partial(base, **options) if options else base,
         env_name if base_name is None else base_name,
-        tuple(wrappers),
+        (*wrappers, *described),
         descriptor_extractor,
         reward_offset,
         robot=robot,
     )
+
+
+def _check_names(env_name: object, base_name: object) -> None:
+    """Raises for names that are not, and for one that is taken."""
+    if not isinstance(env_name, str) or not env_name:
+        raise ValueError(f"env_name={env_name!r}: allowed: a string that is not empty")
+    if env_name in tasks.ENVIRONMENTS:
+        taken = ", ".join(registered_envs())
+        raise ValueError(f"env_name={env_name!r}: taken; allowed: any but {taken}")
+    # A spec is read by every table: one that is wrong would break them all.
+    if base_name is not None and (not isinstance(base_name, str) or not base_name):
+        raise ValueError(
+            f"base_name={base_name!r}: allowed: None, or a string that is not empty"
+        )
+
+
+def _descriptor_specs(
+    descriptor: WrapperSpec | Callable[..., Env] | None,
+) -> tuple[WrapperSpec, ...]:
+    """Returns the wrapper that describes, if there is one; raises where it is none."""
+    if descriptor is None:
+        return ()
+    if not isinstance(descriptor, WrapperSpec):
+        if not callable(descriptor):
+            raise TypeError(
+                f"descriptor={descriptor!r}: allowed: None, a class such as "
+                "FeetContactWrapper, or a WrapperSpec of one"
+            )
+        descriptor = WrapperSpec(descriptor)
+    _check_wrappers((descriptor,))
+    return (descriptor,)
+
+
+def _takes_robot(base: Callable[..., Env]) -> bool:
+    """Returns whether an environment is made from a robot that it is not given yet."""
+    parameter = inspect.signature(base).parameters.get("robot")
+    return parameter is not None and parameter.default is parameter.empty
 
 
 def _check_offset(reward_offset: object) -> None:

@@ -22,7 +22,8 @@ from collections.abc import Iterator, Mapping
 from typing import Generic, TypeVar
 
 from newton_qd import tasks
-from newton_qd.tasks import EnvironmentSpec, Extractor
+from newton_qd.extractors import Extractor
+from newton_qd.tasks import EnvironmentSpec
 
 Value = TypeVar("Value")
 

@@ -24,7 +24,11 @@ from newton_qd.envs.pusher import Pusher
 from newton_qd.envs.reacher import Reacher, ReacherAngle
 from newton_qd.envs.swimmer import Swimmer
 from newton_qd.envs.walker2d import Walker2d
-from newton_qd.extractors import get_feet_contact_proportion, get_final_xy_position
+from newton_qd.extractors import (
+    Extractor,
+    get_feet_contact_proportion,
+    get_final_xy_position,
+)
 from newton_qd.moved import moved_name
 from newton_qd.robots import HUMANOID, ROBOTS, RobotSpec
 from newton_qd.wrappers import (
@@ -34,8 +38,6 @@ from newton_qd.wrappers import (
     TrapWrapper,
     XYPositionWrapper,
 )
-
-Extractor = Callable[[Any, Any], Any]
 
 _MOVED = {
     "EnvironmentRow": "newton_qd.tasks.EnvironmentSpec",

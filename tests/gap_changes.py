@@ -54,7 +54,7 @@ def gaps_of(env: Any) -> Callable[[Inputs], tuple[jax.Array, jax.Array]]:
         params = physics.PhysicsParams(**{name: inputs[name] for name in FIELDS})
 
         def advance(state: PhysicsState, action: jax.Array) -> Any:
-            control = base._control(state, action)
+            control = base.control(state, action)
 
             def substep(state: PhysicsState, _: None) -> Any:
                 after, _fault = physics.step(system, state, control, params)

@@ -207,7 +207,7 @@ def test_drag_is_that_of_the_links() -> None:
         q, v = rng.normal(size=5).astype(np.float32), rng.normal(size=5)
         v = v.astype(np.float32)
         state = newton_qd.physics.initial_state(system, q, v)
-        control = np.asarray(env._control(state, jnp.zeros(2, np.float32)))
+        control = np.asarray(env.control(state, jnp.zeros(2, np.float32)))
         linear, _ = reference.jacobians(system, q)
         expected = np.zeros(5)
         for body, angle in zip((2, 3, 4), np.cumsum(q[2:].astype(float)), strict=True):

@@ -138,10 +138,10 @@ def test_far_away_everything_is_as_near(name: str) -> None:
 class Lowered(PhysicsEnv):
     """Does nothing, on a rail whose axis points down."""
 
-    def _observe(self, state: PhysicsState, action: jax.Array) -> dict[str, jax.Array]:
+    def observe(self, state: PhysicsState, action: jax.Array) -> dict[str, jax.Array]:
         return {"q": state.q}
 
-    def _outcome(self, before: PhysicsState, after: PhysicsState, action: Any) -> Any:
+    def outcome(self, before: PhysicsState, after: PhysicsState, action: Any) -> Any:
         zero = jnp.zeros((), after.q.dtype)
         return zero, zero, {}
 

@@ -128,8 +128,8 @@ class Runner(Ant):
 
     forward_reward_name = "reward_run"
 
-    def _outcome(self, before: Any, after: Any, action: Any) -> Any:
-        reward, done, metrics = super()._outcome(before, after, action)
+    def outcome(self, before: Any, after: Any, action: Any) -> Any:
+        reward, done, metrics = super().outcome(before, after, action)
         return reward, done, {"reward_run": metrics["reward_forward"]}
 
 

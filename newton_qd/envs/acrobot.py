@@ -40,7 +40,7 @@ class Acrobot(PhysicsEnv):
         """
         super().__init__(ACROBOT, reset_noise_scale=reset_noise_scale, dtype=dtype)
 
-    def _observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
+    def observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
         """Returns the blocks of the observation."""
         del action
         return {
@@ -48,7 +48,7 @@ class Acrobot(PhysicsEnv):
             "joint velocities [rad/s]": state.v,
         }
 
-    def _outcome(
+    def outcome(
         self, before: PhysicsState, after: PhysicsState, action: Action
     ) -> tuple[jax.Array, jax.Array, Metrics]:
         """Returns reward, done and metrics of a step."""

@@ -80,7 +80,7 @@ class Ant(PhysicsEnv):
         self._omit_xy = exclude_current_positions_from_observation
         super().__init__(ANT, reset_noise_scale=reset_noise_scale, dtype=dtype)
 
-    def _observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
+    def observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
         """Returns the blocks of the observation."""
         del action
         q, v = state.q, state.v
@@ -109,7 +109,7 @@ class Ant(PhysicsEnv):
             }
         return blocks
 
-    def _outcome(
+    def outcome(
         self, before: PhysicsState, after: PhysicsState, action: Action
     ) -> tuple[jax.Array, jax.Array, Metrics]:
         """Returns reward, done and metrics of a step."""

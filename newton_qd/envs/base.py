@@ -1,12 +1,12 @@
-"""What an environment is, and the part that all simulated robots share."""
+"""What all simulated robots share, and what each of them says itself."""
 
 from __future__ import annotations
 
 import abc
 import copy
 import dataclasses
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+import warnings
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,180 +14,67 @@ import numpy as np
 
 from newton_qd import physics
 from newton_qd.envs import inputs
+from newton_qd.envs.env import Env, QDEnv
 from newton_qd.envs.joints import joint_indices
-from newton_qd.envs.options import float_type
-from newton_qd.envs.state import State, no_brax_view, select
-from newton_qd.physics.system import PhysicsState, System
+from newton_qd.envs.options import checked_options, float_type
+from newton_qd.envs.state import State, select
+from newton_qd.physics.system import Kinematics, PhysicsState, System
 from newton_qd.robots import Material, RobotSpec
 from newton_qd.scenes import Scene
 from newton_qd.types import Action, Metrics, Observation, Params, RNGKey
 
+__all__ = ["Env", "PhysicsEnv", "QDEnv"]
 
-class Env(abc.ABC):
-    """An environment: two pure functions and their sizes.
-
-    Environments are immutable, compare and hash by identity, and may be static
-    arguments of jitted functions.
-    """
-
-    @abc.abstractmethod
-    def reset(self, rng: RNGKey) -> State:
-        """Begins an episode.
-
-        Args:
-            rng: One key, ``jax.random.key(0)`` or ``jax.random.PRNGKey(0)``.
-        """
-
-    @abc.abstractmethod
-    def step(self, state: State, action: Action, params: Params = None) -> State:
-        """Advances by one control step of ``dt``.
-
-        Args:
-            state: Where to start; it is not changed and may be stepped again.
-            action: (nu,) array of the environment's dtype, meant for -1 to 1.
-            params: Physical parameters of the world, as ``default_params`` with fields
-                replaced; ``None``: as in its files.
-        """
-
-    @property
-    @abc.abstractmethod
-    def observation_size(self) -> int:
-        """Length of an observation."""
-
-    @property
-    @abc.abstractmethod
-    def action_size(self) -> int:
-        """Length of an action."""
-
-    @property
-    @abc.abstractmethod
-    def dtype(self) -> np.dtype:
-        """Type of every floating-point array of a state, and of the actions."""
-
-    @property
-    @abc.abstractmethod
-    def dt(self) -> float:
-        """Duration of a step [s]."""
-
-    @property
-    @abc.abstractmethod
-    def name(self) -> str:
-        """Name of the robot or of the task."""
-
-    @property
-    def default_params(self) -> Params:
-        """What a step takes for ``params``: as in the files, ``None`` without any.
-
-        In a batch every parameter has the batch axis in front.
-        """
-        return None
-
-    @property
-    def unwrapped(self) -> Env:
-        """The environment inside all wrappers."""
-        return self
-
-    def with_base(self, change: Callable[[Env], Env]) -> Env:
-        """Returns the same wrappers around another environment.
-
-        Args:
-            change: Makes the new inside from ``unwrapped``; this environment and its
-                wrappers stay as they are.
-        """
-        return change(self)
-
-    def with_scene(self, scene: Scene | None) -> Env:
-        """Returns the same wrappers around the same robot in another scene.
-
-        Args:
-            scene: What stands on the ground; ``None``: nothing. This environment and
-                its wrappers stay as they are.
-
-        Raises:
-            NotImplementedError: The environment inside is not a simulated robot.
-        """
-        raise NotImplementedError(
-            f"scene={scene!r}: {self.name} is not a simulated robot; allowed: "
-            "environments whose unwrapped is a PhysicsEnv"
-        )
-
-    def with_material(self, material: Material) -> Env:
-        """Returns the same wrappers around the same robot with other softness.
-
-        Args:
-            material: Softness of contacts and joint limits. This environment and its
-                wrappers stay as they are.
-
-        Raises:
-            NotImplementedError: The environment inside is not a simulated robot.
-        """
-        raise NotImplementedError(
-            f"material={material!r}: {self.name} is not a simulated robot; allowed: "
-            "environments whose unwrapped is a PhysicsEnv"
-        )
-
-    if not TYPE_CHECKING:
-
-        def __getattr__(self, name: str) -> Any:
-            """Says where views of brax v1 are."""
-            raise AttributeError(no_brax_view(self, name, ("sys",)))
-
-
-class QDEnv(Env):
-    """An environment that writes ``info["state_descriptor"]``.
-
-    The descriptor of an episode has the length and limits of the state descriptor,
-    under both names that QDax has used for them.
-    """
-
-    @property
-    @abc.abstractmethod
-    def state_descriptor_length(self) -> int:
-        """Length of a state descriptor."""
-
-    @property
-    @abc.abstractmethod
-    def state_descriptor_name(self) -> str:
-        """What a state descriptor measures."""
-
-    @property
-    @abc.abstractmethod
-    def state_descriptor_limits(self) -> tuple[jax.Array, jax.Array]:
-        """Lower and upper limits, (nd,) each."""
-
-    @property
-    def descriptor_length(self) -> int:
-        """Length of an episode's descriptor."""
-        return self.state_descriptor_length
-
-    @property
-    def descriptor_limits(self) -> tuple[jax.Array, jax.Array]:
-        """Lower and upper limits of an episode's descriptor, (nd,) each."""
-        return self.state_descriptor_limits
-
-    behavior_descriptor_length = descriptor_length
-    behavior_descriptor_limits = descriptor_limits
+_RENAMED = {
+    "_observe": "observe",
+    "_outcome": "outcome",
+    "_control": "control",
+    "_place": "reset_pose",
+}
 
 
 class PhysicsEnv(Env):
-    """A simulated robot: reset noise, checks of the input, containment of faults.
+    """A simulated robot; the base class for environments of one's own.
 
-    A subclass gives the observation and the outcome of a step. A world that meets a
-    value that is not finite, or a speed beyond 1,000 m/s or rad/s, is frozen where it
-    was: ``info["fault"]`` becomes 1 and stays until a reset, reward and metrics are 0,
-    done is 1, and no gradient passes. Other worlds do not notice.
+    A subclass overrides ``outcome``, which rewards a step, and what it wants to have
+    otherwise of ``observe``, ``reset_pose`` and ``control``. These are functions of one
+    world, traced by JAX: they use ``jax.numpy`` and change nothing in place.
+    ``joint`` and ``kinematics`` help to read a state.
+
+    A world that meets a value that is not finite, or a speed beyond 1,000 m/s or rad/s,
+    is frozen where it was: ``info["fault"]`` becomes 1 and stays until a reset, reward
+    and metrics are 0, done is 1, and no gradient passes. Other worlds do not notice.
+
+    Attributes:
+        robot: Spec of the robot.
+        system: The robot as the physics knows it.
     """
 
     forward_reward_name: str | None = None
     """Metric that is the forward part of the reward; ``None``: there is none."""
     reads_bodies: bool = False
-    """Whether a step is to report where the bodies are, for ``seen_bodies``."""
+    """Whether a step is to report where the bodies are: ``kinematics`` costs less."""
 
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Lets methods that are overridden by their old names work."""
+        super().__init_subclass__(**options)
+        for old, new in _RENAMED.items():
+            if old in vars(cls):
+                warnings.warn(
+                    f"{cls.__name__}.{old} is now {new}",
+                    DeprecationWarning,
+                    stacklevel=3,
+                )
+                setattr(cls, new, vars(cls)[old])
+            elif new in vars(cls):
+                setattr(cls, old, vars(cls)[new])
+
+    @checked_options
     def __init__(
         self,
         robot: RobotSpec,
         *,
-        reset_noise_scale: float,
+        reset_noise_scale: float = 0.1,
         reset_velocity_noise_scale: float | None = None,
         dtype: str = "float32",
         scene: Scene | None = None,
@@ -201,6 +88,12 @@ class PhysicsEnv(Env):
             reset_velocity_noise_scale: That of the velocities, where it differs.
             dtype: ``"float32"``, or ``"float64"`` with JAX x64 on.
             scene: What stands on the ground; ``None``: nothing.
+
+        Raises:
+            TypeError: An argument is of another type.
+            ValueError: The robot or the scene cannot be built, has no actuators, or a
+                method returns another shape than it may; names it.
+            FileNotFoundError: A URDF file is missing.
         """
         self.robot = robot
         self._dtype = float_type(dtype)
@@ -226,13 +119,19 @@ class PhysicsEnv(Env):
         action = jax.ShapeDtypeStruct((self.action_size,), self._dtype)
         self._layout: tuple[tuple[str, int], ...] = ()
         jax.eval_shape(self._record_layout, rest, action)
-        self._metrics = tuple(jax.eval_shape(self._outcome, rest, rest, action)[2])
+        found = jax.eval_shape(self.outcome, rest, rest, action)
+        self._metrics = inputs.checked_outcome(type(self).__name__, found)
 
     def with_scene(self, scene: Scene | None) -> PhysicsEnv:
         """Returns the same environment in another scene; this one stays as it is.
 
         Args:
             scene: What stands on the ground; ``None``: nothing.
+
+        Raises:
+            TypeError: ``scene`` is no scene.
+            ValueError: The scene cannot be built; names its file and line.
+            FileNotFoundError: Its URDF file is missing.
         """
         moved = copy.copy(self)
         moved._load(scene)
@@ -260,35 +159,108 @@ class PhysicsEnv(Env):
         changed._load(self.system.scene)
         return changed
 
-    @abc.abstractmethod
-    def _observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
-        """Returns the named blocks (n,) of the observation, in order.
+    def observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
+        """What a policy sees; the default is every coordinate and velocity.
 
-        The action is the one that led to the state; zero after a reset.
+        Args:
+            state: Where the world is.
+            action: (nu,) the action that led there; zero after a reset.
+
+        Returns:
+            The blocks (n,) of the observation by name, such as "root height [m]". They
+            follow one another in this order, converted to the environment's dtype.
         """
+        del action
+        return {
+            "coordinates [m or rad]": state.q,
+            "velocities [m/s or rad/s]": state.v,
+        }
 
     @abc.abstractmethod
-    def _outcome(
+    def outcome(
         self, before: PhysicsState, after: PhysicsState, action: Action
     ) -> tuple[jax.Array, jax.Array, Metrics]:
-        """Returns reward (), done () and metrics () of a step."""
+        """What a step is worth, and whether the episode ends with it.
 
-    def _control(self, state: PhysicsState, action: Action) -> jax.Array:
-        """Returns what drives the actuators (nu,) in a step: the action."""
+        Args:
+            before: Where the world was.
+            after: Where it is ``dt`` later.
+            action: (nu,) the action.
+
+        Returns:
+            Reward (), done () as a boolean or 0 and 1, and metrics () by name.
+        """
+
+    def control(self, state: PhysicsState, action: Action) -> jax.Array:
+        """What drives the actuators in a step; the default is the action.
+
+        Args:
+            state: Where the step begins.
+            action: (nu,) the action.
+
+        Returns:
+            (nu,) control: times the gear of each actuator it is a torque [N m] or a
+            force [N]; of a servo it is the target [rad or m].
+        """
         del state
         return action
 
-    def _place(self, rng: RNGKey, q: jax.Array) -> jax.Array:
-        """Returns the coordinates (nq,) of a reset with random roots: none here."""
+    def reset_pose(self, rng: RNGKey, q: jax.Array) -> jax.Array:
+        """Where an episode begins, before noise on the joints; the default pose.
+
+        Args:
+            rng: One key.
+            q: (nq,) coordinates of the default pose [m or rad].
+
+        Returns:
+            (nq,) coordinates [m or rad]. A robot whose spec has no ``rest_height`` is
+            raised or lowered afterwards until its lowest contact is on the ground.
+        """
         del rng
         return q
+
+    def joint(self, name: str) -> tuple[slice, slice]:
+        """Returns where a joint is in the coordinates and in the velocities.
+
+        Args:
+            name: Joint of the URDF file.
+
+        Returns:
+            Its part of ``state.q`` [m or rad] and of ``state.v`` [m/s or rad/s].
+
+        Raises:
+            ValueError: The robot has no such joint.
+        """
+        system = self.system
+        if not name or name not in system.joint_names:
+            known = ", ".join(known for known in system.joint_names if known)
+            raise ValueError(
+                f"name={name!r}: no joint of {self.name}; allowed: {known}"
+            )
+        body = system.joint_names.index(name)
+        parts = []
+        for starts, size in ((system.q_start, system.nq), (system.v_start, system.nv)):
+            later = [int(start) for start in starts if start > starts[body]]
+            parts.append(slice(int(starts[body]), min([*later, size])))
+        return parts[0], parts[1]
+
+    def kinematics(self, state: PhysicsState) -> Kinematics:
+        """Returns where the bodies of a state are, and how they move.
+
+        The rows are those of ``system.body_names``. Set ``reads_bodies = True`` in the
+        class where every step needs it.
+
+        Args:
+            state: State of one world.
+        """
+        return physics.seen_bodies(self.system, state)
 
     def reset(self, rng: RNGKey) -> State:
         """Begins an episode in the default pose with noise on the joints."""
         inputs.require_precision(self._dtype)
         root_key, angle_key, velocity_key = jax.random.split(rng, 3)
         rest = self._rest()
-        q = self._place(root_key, rest.q)
+        q = self.reset_pose(root_key, rest.q)
         q = q.at[self._joint_q].add(self._noise(angle_key, self._angle_noise))
         if self._grounding is not None:
             coordinate, sign = self._grounding
@@ -312,14 +284,16 @@ class PhysicsEnv(Env):
         # instead, so that its zero gradient is not 0 * nan (double where).
         start: PhysicsState = state.pipeline_state
         sound = jnp.all(jnp.isfinite(action)) & (state.info["fault"] == 0)
-        control = self._control(start, action)
+        control = self.control(start, action)
         control = jnp.where(sound, control, jnp.full_like(control, jnp.nan))
         after, fault = physics.step(self.system, start, control, params)
         fault = jnp.maximum(state.info["fault"], fault)
         faulty = fault != 0
         action = jnp.where(faulty, jnp.zeros_like(action), action)
         before = select(faulty, after, start)
-        reward, done, metrics = self._outcome(before, after, action)
+        reward, done, metrics = jax.tree.map(
+            self._number, self.outcome(before, after, action)
+        )
         reward, metrics = select(
             faulty, jax.tree.map(jnp.zeros_like, (reward, metrics)), (reward, metrics)
         )
@@ -376,15 +350,19 @@ class PhysicsEnv(Env):
 
     def _record_layout(self, state: PhysicsState, action: Action) -> None:
         # not a result of eval_shape: it would sort the names
-        blocks = self._observe(state, action).items()
-        self._layout = tuple((name, block.shape[0]) for name, block in blocks)
+        blocks = self.observe(state, action)
+        self._layout = inputs.checked_layout(type(self).__name__, blocks)
+
+    def _number(self, value: jax.Array) -> jax.Array:
+        return jnp.asarray(value, self._dtype)
 
     def _noise(self, rng: RNGKey, scale: float) -> jax.Array:
         shape = self._joint_q.shape
         return jax.random.uniform(rng, shape, self._dtype, -scale, scale)
 
     def _observation(self, state: PhysicsState, action: Action) -> Observation:
-        return jnp.concatenate(list(self._observe(state, action).values()))
+        blocks = self.observe(state, action).values()
+        return jnp.concatenate([self._number(block) for block in blocks])
 
     def _first_state(self, state: PhysicsState) -> State:
         action = jnp.zeros((self.action_size,), self._dtype)

@@ -55,7 +55,7 @@ class HalfCheetah(PhysicsEnv):
         self._omit_x = exclude_current_positions_from_observation
         super().__init__(HALFCHEETAH, reset_noise_scale=reset_noise_scale, dtype=dtype)
 
-    def _observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
+    def observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
         """Returns the blocks of the observation."""
         del action
         half = state.q[planar.PITCH] / 2
@@ -63,7 +63,7 @@ class HalfCheetah(PhysicsEnv):
         orientation = {"torso orientation w y": turned}
         return planar.blocks(state, orientation, omit_x=self._omit_x)
 
-    def _outcome(
+    def outcome(
         self, before: PhysicsState, after: PhysicsState, action: Action
     ) -> tuple[jax.Array, jax.Array, Metrics]:
         """Returns reward, done and metrics of a step."""

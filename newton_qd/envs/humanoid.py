@@ -85,7 +85,7 @@ class Humanoid(PhysicsEnv):
         self._omit_xy = exclude_current_positions_from_observation
         super().__init__(self._spec, reset_noise_scale=reset_noise_scale, dtype=dtype)
 
-    def _observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
+    def observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
         """Returns the blocks of the observation."""
         q, v, system = state.q, state.v, self.system
         joints = np.array([system.joint_names.index(name) for name in _OBSERVED])
@@ -146,7 +146,7 @@ class Humanoid(PhysicsEnv):
         total = own + rounded(added)
         return total[:, :, None] * jnp.eye(3, dtype=self.dtype)
 
-    def _outcome(
+    def outcome(
         self, before: PhysicsState, after: PhysicsState, action: Action
     ) -> tuple[jax.Array, jax.Array, Metrics]:
         """Returns reward, done and metrics of a step."""

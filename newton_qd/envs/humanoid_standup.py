@@ -46,7 +46,7 @@ class HumanoidStandup(Humanoid):
             ctrl_cost_weight=0.01, reset_noise_scale=reset_noise_scale, dtype=dtype
         )
 
-    def _outcome(
+    def outcome(
         self, before: PhysicsState, after: PhysicsState, action: Action
     ) -> tuple[jax.Array, jax.Array, Metrics]:
         """Returns reward, done and metrics of a step."""

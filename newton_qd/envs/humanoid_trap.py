@@ -74,13 +74,13 @@ class HumanoidTrap(Humanoid):
         """Name of the robot in this task."""
         return "humanoid_w_trap"
 
-    def _observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
+    def observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
         """Returns the blocks of the observation."""
         bodies = self._bodies
         linear = linear_changes(self.system, state, bodies)
         angular = angular_changes(self.system, state, bodies, "contact changes")
         names = ", ".join(("bodies", "ground", *self.system.scene_links))
-        return super()._observe(state, action) | {
+        return super().observe(state, action) | {
             f"contact velocity changes, {names} [m/s]": self._rows(linear),
             f"contact angular velocity changes, {names} [rad/s]": self._rows(angular),
         }
@@ -97,11 +97,11 @@ class HumanoidTrap(Humanoid):
         products = mass[:, :, None] * arm[:, :, None] * arm[:, None, :]
         return self._rotational(mass * square) - rounded(products)
 
-    def _outcome(
+    def outcome(
         self, before: PhysicsState, after: PhysicsState, action: Action
     ) -> tuple[jax.Array, jax.Array, Metrics]:
         """Returns reward, done and metrics of a step."""
-        reward, done, found = super()._outcome(before, after, action)
+        reward, done, found = super().outcome(before, after, action)
         metrics = {
             "reward_linvel": found["reward_linvel"],
             # a cost, with its sign as in the original

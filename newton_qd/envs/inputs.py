@@ -1,4 +1,4 @@
-"""What a step refuses: the same words in every environment."""
+"""What environments refuse: the same words in every one of them."""
 
 from __future__ import annotations
 
@@ -99,3 +99,56 @@ def checked_action(action: Action, size: int, dtype: np.dtype) -> Action:
             "jax.vmap or create(..., batch_size=...))"
         )
     return values.astype(dtype)
+
+
+def checked_layout(env: str, blocks: object) -> tuple[tuple[str, int], ...]:
+    """Returns name and size of each block of an observation, or raises what is wrong.
+
+    Args:
+        env: Name of the class that observes.
+        blocks: What its ``observe`` returned.
+
+    Raises:
+        TypeError: They are no dictionary with at least one block.
+        ValueError: A block has not one axis.
+    """
+    if not isinstance(blocks, dict) or not blocks:
+        raise TypeError(
+            f"{env}.observe: returned {blocks!r}; allowed: a dictionary of arrays (n,)"
+        )
+    for name, block in blocks.items():
+        if jnp.ndim(block) != 1:
+            raise ValueError(
+                f"{env}.observe: {name!r} has shape {jnp.shape(block)}; allowed: (n,), "
+                "such as state.q[2:3] for one number"
+            )
+    return tuple((name, block.shape[0]) for name, block in blocks.items())
+
+
+def checked_outcome(env: str, found: object) -> tuple[str, ...]:
+    """Returns the names of the metrics, or raises what is wrong with an outcome.
+
+    Args:
+        env: Name of the class that rewards.
+        found: Shapes of what its ``outcome`` returned.
+
+    Raises:
+        TypeError: It is not a tuple of reward, done and metrics.
+        ValueError: A number is not of shape ().
+    """
+    if (
+        not isinstance(found, tuple)
+        or len(found) != 3
+        or not isinstance(found[2], dict)
+    ):
+        raise TypeError(
+            f"{env}.outcome: returned {found!r}; allowed: reward, done and a "
+            "dictionary of metrics"
+        )
+    reward, done, metrics = found
+    for name, value in {"reward": reward, "done": done, **metrics}.items():
+        if jnp.shape(value) != ():
+            raise ValueError(
+                f"{env}.outcome: {name!r} has shape {jnp.shape(value)}; allowed: ()"
+            )
+    return tuple(metrics)

@@ -42,7 +42,7 @@ class InvertedPendulum(PhysicsEnv):
             INVERTED_PENDULUM, reset_noise_scale=reset_noise_scale, dtype=dtype
         )
 
-    def _observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
+    def observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
         """Returns the blocks of the observation."""
         del action
         q, v = state.q, state.v
@@ -53,7 +53,7 @@ class InvertedPendulum(PhysicsEnv):
             "pole angular velocity [rad/s]": v[1:],
         }
 
-    def _outcome(
+    def outcome(
         self, before: PhysicsState, after: PhysicsState, action: Action
     ) -> tuple[jax.Array, jax.Array, Metrics]:
         """Returns reward, done and metrics of a step."""
@@ -85,7 +85,7 @@ class InvertedDoublePendulum(PhysicsEnv):
             INVERTED_DOUBLE_PENDULUM, reset_noise_scale=reset_noise_scale, dtype=dtype
         )
 
-    def _observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
+    def observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
         """Returns the blocks of the observation."""
         del action
         q, v = state.q, state.v
@@ -97,7 +97,7 @@ class InvertedDoublePendulum(PhysicsEnv):
             "joint velocities [rad/s]": v[1:],
         }
 
-    def _outcome(
+    def outcome(
         self, before: PhysicsState, after: PhysicsState, action: Action
     ) -> tuple[jax.Array, jax.Array, Metrics]:
         """Returns reward, done and metrics of a step."""

@@ -21,7 +21,7 @@ class Locomotion(PhysicsEnv):
 
     Reward: weighted velocity of the root along x, plus a bonus for being healthy, minus
     a cost of control. Done when the root leaves the healthy heights. A subclass with
-    another ``_outcome`` has other rewards.
+    another ``outcome`` has other rewards.
     """
 
     forward_reward_name = "reward_forward"
@@ -69,7 +69,7 @@ class Locomotion(PhysicsEnv):
                 "allowed: a robot whose root link moves freely"
             )
 
-    def _observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
+    def observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
         """Returns the blocks of the observation."""
         del action
         q, v = state.q, state.v
@@ -82,7 +82,7 @@ class Locomotion(PhysicsEnv):
             "joint velocities [rad/s]": v[_ROOT_V:],
         }
 
-    def _outcome(
+    def outcome(
         self, before: PhysicsState, after: PhysicsState, action: Action
     ) -> tuple[jax.Array, jax.Array, Metrics]:
         """Returns reward, done and metrics of a step."""

@@ -60,7 +60,7 @@ class Pusher(PhysicsEnv):
             dtype=dtype,
         )
 
-    def _place(self, rng: RNGKey, q: jax.Array) -> jax.Array:
+    def reset_pose(self, rng: RNGKey, q: jax.Array) -> jax.Array:
         """Returns the coordinates (nq,) with the object somewhere near the origin."""
         low, high = (jnp.asarray(ends, self.dtype) for ends in (_LOWEST, _HIGHEST))
         drawn = jax.random.uniform(rng, (2,), self.dtype, low, high)
@@ -70,7 +70,7 @@ class Pusher(PhysicsEnv):
         joints = np.array([names.index(name) for name in ("object_x", "object_y")])
         return q.at[self.system.q_start[joints]].set(drawn_in)
 
-    def _observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
+    def observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
         """Returns the blocks of the observation."""
         del action
         hand, pushed, goal = self._places(state)
@@ -93,7 +93,7 @@ class Pusher(PhysicsEnv):
         )
         return hand, pushed, jnp.asarray(goal, self.dtype)
 
-    def _outcome(
+    def outcome(
         self, before: PhysicsState, after: PhysicsState, action: Action
     ) -> tuple[jax.Array, jax.Array, Metrics]:
         """Returns reward, done and metrics of a step."""

@@ -57,7 +57,7 @@ class Reacher(PhysicsEnv):
             dtype=dtype,
         )
 
-    def _place(self, rng: RNGKey, q: jax.Array) -> jax.Array:
+    def reset_pose(self, rng: RNGKey, q: jax.Array) -> jax.Array:
         """Returns the coordinates (nq,) with the target somewhere within reach."""
         share, turn = jax.random.uniform(rng, (2,), self.dtype)
         angle = np.asarray(2 * np.pi, self.dtype) * turn
@@ -77,7 +77,7 @@ class Reacher(PhysicsEnv):
         joints = np.array([names.index(name) for name in ("target_x", "target_y")])
         return self.system.q_start[joints].astype(np.int32)
 
-    def _observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
+    def observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
         """Returns the blocks of the observation."""
         del action
         seen = physics.forward_kinematics(self.system, state.q, state.v)
@@ -105,7 +105,7 @@ class Reacher(PhysicsEnv):
             self._miss(physics.forward_kinematics(self.system, state.q, state.v))
         )
 
-    def _outcome(
+    def outcome(
         self, before: PhysicsState, after: PhysicsState, action: Action
     ) -> tuple[jax.Array, jax.Array, Metrics]:
         """Returns reward, done and metrics of a step."""
@@ -133,7 +133,7 @@ class ReacherAngle(Reacher):
         """Returns how far out () a target is: uniform over the disk."""
         return jnp.sqrt(share)
 
-    def _control(self, state: PhysicsState, action: Action) -> jax.Array:
+    def control(self, state: PhysicsState, action: Action) -> jax.Array:
         """Returns the angles that the joints are driven to (nu,) [rad]."""
         del state
         dofs = self.system.control_dof
@@ -141,7 +141,7 @@ class ReacherAngle(Reacher):
         high = jnp.asarray(self.system.limit_upper[dofs], self.dtype)
         return low + (high - low) * (jnp.clip(action, -1, 1) + 1) / 2
 
-    def _outcome(
+    def outcome(
         self, before: PhysicsState, after: PhysicsState, action: Action
     ) -> tuple[jax.Array, jax.Array, Metrics]:
         """Returns reward, done and metrics of a step."""

@@ -83,7 +83,7 @@ class Swimmer(PhysicsEnv):
         """Length of an action: the drag of the water is none."""
         return self.system.nu - _JOINTS
 
-    def _observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
+    def observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
         """Returns the blocks of the observation."""
         del action
         q, v = state.q, state.v
@@ -96,7 +96,7 @@ class Swimmer(PhysicsEnv):
             "joint velocities [rad/s]": v[_JOINTS:],
         }
 
-    def _control(self, state: PhysicsState, action: Action) -> jax.Array:
+    def control(self, state: PhysicsState, action: Action) -> jax.Array:
         """Returns the torques of the action and the drag, on every coordinate (5,)."""
         finite = jnp.all(jnp.isfinite(state.q)) & jnp.all(jnp.isfinite(state.v))
         state = select(finite, state, self._rest())  # its gradient too
@@ -133,7 +133,7 @@ class Swimmer(PhysicsEnv):
             force = force - rounded(square[:, None] * axis)
         return force
 
-    def _outcome(
+    def outcome(
         self, before: PhysicsState, after: PhysicsState, action: Action
     ) -> tuple[jax.Array, jax.Array, Metrics]:
         """Returns reward, done and metrics of a step."""

@@ -70,14 +70,14 @@ class Walker2d(PhysicsEnv):
         self._omit_x = exclude_current_positions_from_observation
         super().__init__(WALKER2D, reset_noise_scale=reset_noise_scale, dtype=dtype)
 
-    def _observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
+    def observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
         """Returns the blocks of the observation."""
         del action
         pitch = planar.euler_pitch(state.q[planar.PITCH])
         orientation = {"torso pitch [rad]": pitch[None]}
         return planar.blocks(state, orientation, omit_x=self._omit_x)
 
-    def _outcome(
+    def outcome(
         self, before: PhysicsState, after: PhysicsState, action: Action
     ) -> tuple[jax.Array, jax.Array, Metrics]:
         """Returns reward, done and metrics of a step."""

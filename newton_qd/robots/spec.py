@@ -90,12 +90,12 @@ class RobotSpec:
     name: str
     urdf: str
     torso: str
-    feet: tuple[str, ...]
-    actuators: tuple[tuple[str, float], ...]
-    contacts: tuple[Contact, ...]
-    rest_pose: tuple[tuple[str, float], ...]
-    dt: float
-    substeps: int
+    feet: tuple[str, ...] = ()
+    actuators: tuple[tuple[str, float], ...] = ()
+    contacts: tuple[Contact, ...] = ()
+    rest_pose: tuple[tuple[str, float], ...] = ()
+    dt: float = 0.05
+    substeps: int = 5
     rest_height: float | None = None
     rest_rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)
     servos: tuple[str, ...] = ()

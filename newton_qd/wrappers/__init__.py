@@ -7,6 +7,7 @@ from newton_qd.wrappers.completed_eval import (
     CompletedEvalMetrics,
     CompletedEvalWrapper,
 )
+from newton_qd.wrappers.descriptor import DescriptorWrapper
 from newton_qd.wrappers.episode import EpisodeWrapper
 from newton_qd.wrappers.evaluation import EvalMetrics, EvalWrapper
 from newton_qd.wrappers.feet_contact import FeetContactWrapper
@@ -25,6 +26,7 @@ __all__ = [
     "ClipRewardWrapper",
     "CompletedEvalMetrics",
     "CompletedEvalWrapper",
+    "DescriptorWrapper",
     "EpisodeWrapper",
     "EvalMetrics",
     "EvalWrapper",

@@ -5,20 +5,23 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from newton_qd.envs.base import Env, PhysicsEnv, QDEnv
+from newton_qd.envs.base import Env, PhysicsEnv
 from newton_qd.envs.options import check_positive
 from newton_qd.envs.state import State
+from newton_qd.extractors import get_feet_contact_proportion
 from newton_qd.physics.system import PhysicsState
-from newton_qd.types import Action, Descriptor, Params, RNGKey
-from newton_qd.wrappers.base import Wrapper
+from newton_qd.types import Descriptor
+from newton_qd.wrappers.descriptor import DescriptorWrapper
 
 
-class FeetContactWrapper(Wrapper, QDEnv):
+class FeetContactWrapper(DescriptorWrapper):
     """Writes which feet touched the ground into ``info["state_descriptor"]``.
 
     Contacts are impulses over a control step, so after a reset no foot touches.
     With repeated actions the last repetition counts.
     """
+
+    descriptor_extractor = staticmethod(get_feet_contact_proportion)
 
     def __init__(
         self,
@@ -57,24 +60,12 @@ class FeetContactWrapper(Wrapper, QDEnv):
             )
         if smooth_width is not None:
             env = env.with_base(lambda base: _with_feet_width(base, smooth_width))
-        super().__init__(env)
+        super().__init__(env, env_name)
         self._smooth = smooth_width is not None
         self._straight_through = straight_through
 
-    def reset(self, rng: RNGKey) -> State:
-        """Begins an episode."""
-        return self._described(self.env.reset(rng))
-
-    def step(self, state: State, action: Action, params: Params = None) -> State:
-        """Advances by one step."""
-        return self._described(self.env.step(state, action, params))
-
-    def _described(self, state: State) -> State:
-        # a buffer that is in a state twice could not be donated
-        descriptor = jnp.copy(self._read(state))
-        return state.replace(info={**state.info, "state_descriptor": descriptor})
-
-    def _read(self, state: State) -> Descriptor:
+    def describe(self, state: State) -> Descriptor:
+        """Returns which feet touched the ground (nf,): 0 or 1, or between them."""
         physics: PhysicsState = state.pipeline_state
         if not self._smooth:
             return physics.feet_contact

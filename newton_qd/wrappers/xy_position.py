@@ -8,15 +8,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from newton_qd.envs.base import Env, PhysicsEnv, QDEnv
+from newton_qd.envs.base import Env, PhysicsEnv
 from newton_qd.envs.state import State
-from newton_qd.types import Action, Params, RNGKey
-from newton_qd.wrappers.base import Wrapper
+from newton_qd.extractors import get_final_xy_position
+from newton_qd.types import Descriptor
+from newton_qd.wrappers.descriptor import DescriptorWrapper
 
 Limits = Sequence[float] | np.ndarray | jax.Array
 
 
-class XYPositionWrapper(Wrapper, QDEnv):
+class XYPositionWrapper(DescriptorWrapper):
     """Writes where the torso is into ``info["state_descriptor"]``.
 
     The state descriptor is kept within the limits; ``info["xy_position"]`` is the
@@ -24,6 +25,8 @@ class XYPositionWrapper(Wrapper, QDEnv):
     robot's first link where its spec names no other: of an arm it sits on its pivot,
     and its position tells nothing.
     """
+
+    descriptor_extractor = staticmethod(get_final_xy_position)
 
     def __init__(
         self,
@@ -39,13 +42,18 @@ class XYPositionWrapper(Wrapper, QDEnv):
             env_name: Its name, for the error.
             minval: Lowest x and y of a state descriptor [m]; ``None``: no limit.
             maxval: Highest x and y, above ``minval`` [m]; ``None``: no limit.
+
+        Raises:
+            NotImplementedError: The environment is not a simulated robot.
+            ValueError: A limit is not two finite numbers, or the lowest value is not
+                below the highest.
         """
         if not isinstance(env.unwrapped, PhysicsEnv):
             raise NotImplementedError(
                 f"This wrapper does not support {env_name} yet. Given: "
                 f"{type(env.unwrapped).__name__}; allowed: simulated robots"
             )
-        super().__init__(env)
+        super().__init__(env, env_name)
         self._low = _limit("minval", minval, -np.inf)
         self._high = _limit("maxval", maxval, np.inf)
         if not np.all(self._low < self._high):
@@ -54,23 +62,16 @@ class XYPositionWrapper(Wrapper, QDEnv):
                 "in x and in y"
             )
 
-    def reset(self, rng: RNGKey) -> State:
-        """Begins an episode."""
-        return self._described(self.env.reset(rng))
-
-    def step(self, state: State, action: Action, params: Params = None) -> State:
-        """Advances by one step."""
-        return self._described(self.env.step(state, action, params))
+    def describe(self, state: State) -> Descriptor:
+        """Returns the position (2,) of the torso within the limits [m]."""
+        low, high = self.state_descriptor_limits
+        return jnp.clip(state.pipeline_state.torso_xy, low, high)
 
     def _described(self, state: State) -> State:
-        position = state.pipeline_state.torso_xy
-        low, high = self.state_descriptor_limits
-        described = {
-            "state_descriptor": jnp.clip(position, low, high),
-            # a buffer that is in a state twice could not be donated
-            "xy_position": jnp.copy(position),
-        }
-        return state.replace(info={**state.info, **described})
+        # a buffer that is in a state twice could not be donated
+        position = jnp.copy(state.pipeline_state.torso_xy)
+        state = super()._described(state)
+        return state.replace(info={**state.info, "xy_position": position})
 
     @property
     def state_descriptor_length(self) -> int:

@@ -1,0 +1,80 @@
+"""Everything for an environment of one's own, in one import.
+
+    import newton_qd.authoring as nq
+
+- ``PhysicsEnv``: the base class; ``Locomotion``: running forward, for any robot
+- ``RobotSpec``, ``Contact``, ``Material``: what a robot's URDF file does not say
+- ``Scene``: obstacles from a URDF file
+- ``DescriptorWrapper``: the base class for descriptors; ``FeetContactWrapper`` and
+  ``XYPositionWrapper``: those of the suite; ``Wrapper``: any other change
+- ``WrapperSpec``: a wrapper with its options
+- ``get_feet_contact_proportion``, ``get_final_xy_position``,
+  ``get_mean_state_descriptor``: descriptors of episodes
+- ``register``, ``create``: the name, and the environment
+- ``length``, ``ordered_sum``, ``wrapped``: arithmetic with finite gradients that does
+  not depend on the size of a batch
+- ``Env``, ``QDEnv``, ``State``, ``PhysicsState``, ``Kinematics``: the types
+
+``docs/own_environment.md`` shows how they go together.
+"""
+
+from newton_qd.envs.base import Env, PhysicsEnv, QDEnv
+from newton_qd.envs.locomotion import Locomotion
+from newton_qd.envs.options import checked_options
+from newton_qd.envs.state import State, check
+from newton_qd.envs.vectors import length, ordered_sum, wrapped
+from newton_qd.extractors import (
+    get_feet_contact_proportion,
+    get_final_xy_position,
+    get_mean_state_descriptor,
+)
+from newton_qd.physics.system import Kinematics, PhysicsState
+from newton_qd.registry import create, create_fn, register, registered_envs
+from newton_qd.robots import Contact, Material, RobotSpec
+from newton_qd.scenes import Scene
+from newton_qd.tasks import WrapperSpec
+from newton_qd.types import Action, Metrics, Observation, Params, RNGKey
+from newton_qd.wrappers import (
+    DescriptorWrapper,
+    FeetContactWrapper,
+    NoForwardRewardWrapper,
+    Wrapper,
+    XYPositionWrapper,
+)
+
+__all__ = [
+    "Action",
+    "Contact",
+    "DescriptorWrapper",
+    "Env",
+    "FeetContactWrapper",
+    "Kinematics",
+    "Locomotion",
+    "Material",
+    "Metrics",
+    "NoForwardRewardWrapper",
+    "Observation",
+    "Params",
+    "PhysicsEnv",
+    "PhysicsState",
+    "QDEnv",
+    "RNGKey",
+    "RobotSpec",
+    "Scene",
+    "State",
+    "Wrapper",
+    "WrapperSpec",
+    "XYPositionWrapper",
+    "check",
+    "checked_options",
+    "create",
+    "create_fn",
+    "get_feet_contact_proportion",
+    "get_final_xy_position",
+    "get_mean_state_descriptor",
+    "length",
+    "ordered_sum",
+    "register",
+    "registered_envs",
+    "wrapped",
+]

@@ -1,0 +1,161 @@
+"""What an environment is."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import jax
+import numpy as np
+
+from newton_qd.envs.state import State, no_brax_view
+from newton_qd.robots import Material
+from newton_qd.scenes import Scene
+from newton_qd.types import Action, Params, RNGKey
+
+
+class Env(abc.ABC):
+    """An environment: two pure functions and their sizes.
+
+    Environments are immutable, compare and hash by identity, and may be static
+    arguments of jitted functions.
+    """
+
+    @abc.abstractmethod
+    def reset(self, rng: RNGKey) -> State:
+        """Begins an episode.
+
+        Args:
+            rng: One key, ``jax.random.key(0)`` or ``jax.random.PRNGKey(0)``.
+        """
+
+    @abc.abstractmethod
+    def step(self, state: State, action: Action, params: Params = None) -> State:
+        """Advances by one control step of ``dt``.
+
+        Args:
+            state: Where to start; it is not changed and may be stepped again.
+            action: (nu,) array of the environment's dtype, meant for -1 to 1.
+            params: Physical parameters of the world, as ``default_params`` with fields
+                replaced; ``None``: as in its files.
+        """
+
+    @property
+    @abc.abstractmethod
+    def observation_size(self) -> int:
+        """Length of an observation."""
+
+    @property
+    @abc.abstractmethod
+    def action_size(self) -> int:
+        """Length of an action."""
+
+    @property
+    @abc.abstractmethod
+    def dtype(self) -> np.dtype:
+        """Type of every floating-point array of a state, and of the actions."""
+
+    @property
+    @abc.abstractmethod
+    def dt(self) -> float:
+        """Duration of a step [s]."""
+
+    @property
+    @abc.abstractmethod
+    def name(self) -> str:
+        """Name of the robot or of the task."""
+
+    @property
+    def default_params(self) -> Params:
+        """What a step takes for ``params``: as in the files, ``None`` without any.
+
+        In a batch every parameter has the batch axis in front.
+        """
+        return None
+
+    @property
+    def unwrapped(self) -> Env:
+        """The environment inside all wrappers."""
+        return self
+
+    def with_base(self, change: Callable[[Env], Env]) -> Env:
+        """Returns the same wrappers around another environment.
+
+        Args:
+            change: Makes the new inside from ``unwrapped``; this environment and its
+                wrappers stay as they are.
+        """
+        return change(self)
+
+    def with_scene(self, scene: Scene | None) -> Env:
+        """Returns the same wrappers around the same robot in another scene.
+
+        Args:
+            scene: What stands on the ground; ``None``: nothing. This environment and
+                its wrappers stay as they are.
+
+        Raises:
+            NotImplementedError: The environment inside is not a simulated robot.
+        """
+        raise NotImplementedError(
+            f"scene={scene!r}: {self.name} is not a simulated robot; allowed: "
+            "environments whose unwrapped is a PhysicsEnv"
+        )
+
+    def with_material(self, material: Material) -> Env:
+        """Returns the same wrappers around the same robot with other softness.
+
+        Args:
+            material: Softness of contacts and joint limits. This environment and its
+                wrappers stay as they are.
+
+        Raises:
+            NotImplementedError: The environment inside is not a simulated robot.
+        """
+        raise NotImplementedError(
+            f"material={material!r}: {self.name} is not a simulated robot; allowed: "
+            "environments whose unwrapped is a PhysicsEnv"
+        )
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            """Says where views of brax v1 are."""
+            raise AttributeError(no_brax_view(self, name, ("sys",)))
+
+
+class QDEnv(Env):
+    """An environment that writes ``info["state_descriptor"]``.
+
+    The descriptor of an episode has the length and limits of the state descriptor,
+    under both names that QDax has used for them.
+    """
+
+    @property
+    @abc.abstractmethod
+    def state_descriptor_length(self) -> int:
+        """Length of a state descriptor."""
+
+    @property
+    @abc.abstractmethod
+    def state_descriptor_name(self) -> str:
+        """What a state descriptor measures."""
+
+    @property
+    @abc.abstractmethod
+    def state_descriptor_limits(self) -> tuple[jax.Array, jax.Array]:
+        """Lower and upper limits, (nd,) each."""
+
+    @property
+    def descriptor_length(self) -> int:
+        """Length of an episode's descriptor."""
+        return self.state_descriptor_length
+
+    @property
+    def descriptor_limits(self) -> tuple[jax.Array, jax.Array]:
+        """Lower and upper limits of an episode's descriptor, (nd,) each."""
+        return self.state_descriptor_limits
+
+    behavior_descriptor_length = descriptor_length
+    behavior_descriptor_limits = descriptor_limits

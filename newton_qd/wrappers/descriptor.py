@@ -1,0 +1,98 @@
+"""State descriptors: the base class of wrappers that write one."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Sequence
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+
+from newton_qd.envs.base import Env, QDEnv
+from newton_qd.envs.state import State
+from newton_qd.extractors import Extractor, get_mean_state_descriptor
+from newton_qd.types import Action, Descriptor, Params, RNGKey
+from newton_qd.wrappers.base import Wrapper
+
+
+class DescriptorWrapper(Wrapper, QDEnv):
+    """Writes ``info["state_descriptor"]``; the base class for descriptors of one's own.
+
+    A subclass overrides ``describe`` and ``limits``, and where it wants to
+    ``descriptor_extractor``.
+    """
+
+    limits: ClassVar[tuple[Sequence[float], Sequence[float]]]
+    """Lowest and highest value of each of the nd components; what is beyond them is in
+    the outermost cells of an archive."""
+    descriptor_extractor: Extractor = staticmethod(get_mean_state_descriptor)
+    """Makes the descriptors of episodes from their state descriptors: the mean."""
+
+    def __init__(self, env: Env, env_name: str) -> None:
+        """Wraps an environment.
+
+        Args:
+            env: The environment.
+            env_name: Its name, for errors.
+        """
+        super().__init__(env)
+
+    @abc.abstractmethod
+    def describe(self, state: State) -> Descriptor:
+        """What describes a state.
+
+        Args:
+            state: State of one world after a reset or a step; ``pipeline_state`` is the
+                ``PhysicsState`` of a simulated robot.
+
+        Returns:
+            (nd,) state descriptor.
+        """
+
+    def reset(self, rng: RNGKey) -> State:
+        """Begins an episode."""
+        return self._described(self.env.reset(rng))
+
+    def step(self, state: State, action: Action, params: Params = None) -> State:
+        """Advances by one step.
+
+        Raises:
+            TypeError: The state or the action is of another type.
+            ValueError: The state or the action is of another environment.
+        """
+        return self._described(self.env.step(state, action, params))
+
+    def _described(self, state: State) -> State:
+        describe = self._checked
+        for _ in range(jnp.ndim(state.done)):
+            describe = jax.vmap(describe)
+        # a buffer that is in a state twice could not be donated
+        described = jnp.copy(describe(state))
+        return state.replace(info={**state.info, "state_descriptor": described})
+
+    def _checked(self, state: State) -> Descriptor:
+        """Returns what describes a state of one world, or raises for its shape."""
+        described = jnp.asarray(self.describe(state), self.dtype)
+        if described.shape != (self.state_descriptor_length,):
+            raise ValueError(
+                f"{type(self).__name__}.describe: returned shape {described.shape}; "
+                f"allowed: {(self.state_descriptor_length,)}, as its limits"
+            )
+        return described
+
+    @property
+    def state_descriptor_length(self) -> int:
+        """Length of a state descriptor."""
+        return len(self.limits[0])
+
+    @property
+    def state_descriptor_name(self) -> str:
+        """What a state descriptor measures: the name of the class."""
+        return type(self).__name__
+
+    @property
+    def state_descriptor_limits(self) -> tuple[jax.Array, jax.Array]:
+        """Lower and upper limits, (nd,) each."""
+        low, high = self.limits
+        return jnp.asarray(low, self.dtype), jnp.asarray(high, self.dtype)

@@ -1,0 +1,255 @@
+"""Environments of one's own: the page that shows how, and what the methods may do."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import newton_qd
+import newton_qd.authoring as nq
+from newton_qd import tasks
+from newton_qd.physics.system import PhysicsState
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "own_environment.md"
+
+
+def blocks(language: str) -> list[str]:
+    """Code blocks of the page in one language."""
+    text = PAGE.read_text(encoding="utf-8")
+    return re.findall(rf"^```{language}\n(.*?)^```$", text, re.M | re.S)
+
+
+@pytest.fixture
+def page(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[dict[str, Any]]:
+    """What the page's two files define, in an empty folder."""
+    monkeypatch.setattr(tasks, "ENVIRONMENTS", dict(tasks.ENVIRONMENTS))
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "crawler.urdf").write_text(blocks("xml")[0], encoding="utf-8")
+    names: dict[str, Any] = {"__name__": "crawler"}
+    exec(compile(blocks("python")[0], "crawler.py", "exec"), names)
+    yield names
+
+
+def test_the_page_keeps_its_promise() -> None:
+    """Twenty lines of Python beside two imports."""
+    source = blocks("python")[0]
+    lines = [line for line in source.splitlines() if line.strip()]
+    imports = [line for line in lines if line.startswith(("import ", "from "))]
+    assert len(imports) == 2 and len(lines) - len(imports) <= 20
+    used = {
+        node.attr
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, ast.Attribute) and getattr(node.value, "id", "") == "nq"
+    }
+    assert used <= set(nq.__all__)
+
+
+def test_the_page_runs(page: dict[str, Any]) -> None:
+    env = page["env"]
+    assert env.observation_layout == (
+        ("arm angles [rad]", 2),
+        ("velocities [m/s, rad/s]", 8),
+    )
+    start = jax.jit(env.reset)(jax.random.key(0))
+
+    def body(state: Any, action: jax.Array) -> tuple[Any, Any]:
+        following = env.step(state, action)
+        return following, (state.pipeline_state.q, following)
+
+    def rollout(actions: jax.Array) -> tuple[jax.Array, Any]:
+        last, seen = jax.lax.scan(body, start, actions)
+        return last.reward, seen
+
+    actions = jax.random.uniform(jax.random.key(1), (6, 2), minval=-1.0)
+    run = jax.jit(jax.value_and_grad(rollout, has_aux=True))
+    (reward, (before, after)), gradient = run(actions)
+    newton_qd.check(jax.tree.map(lambda leaf: leaf[-1], after))
+    velocity = (after.pipeline_state.q[:, 0] - before[:, 0]) / env.dt
+    np.testing.assert_allclose(after.metrics["velocity [m/s]"], velocity, rtol=1e-5)
+    cost = 0.1 * np.sum(np.square(actions), axis=1)
+    np.testing.assert_allclose(after.reward, velocity - cost, rtol=1e-5, atol=1e-6)
+    assert reward == after.reward[-1] and after.done.dtype == np.float32
+    angles = after.pipeline_state.q[:, 7:]
+    assert np.array_equal(after.info["state_descriptor"], angles)
+    assert np.isfinite(gradient).all() and np.abs(gradient).max() > 0
+
+
+def test_the_name_is_in_the_tables(page: dict[str, Any]) -> None:
+    env = page["env"]
+    low, high = env.state_descriptor_limits
+    assert low.tolist() == [-0.5, -0.5] and high.tolist() == [1.0, 1.0]
+    assert env.state_descriptor_name == "ArmAngles"
+    extract = newton_qd.tables.descriptor_extractor["crawler"]
+    assert extract is nq.get_mean_state_descriptor
+    assert newton_qd.tables.reward_offset["crawler"] == 2.0
+    assert newton_qd.tables.COG_NAMES["crawler"] == "body"
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_the_page_evolves(page: dict[str, Any], tmp_path: Path) -> None:
+    del page  # the name is registered
+    pytest.importorskip("qdax")
+    exec(compile(blocks("python")[1], "evolve.py", "exec"), {})
+    assert (tmp_path / "results" / "crawler" / "archive.npz").is_file()
+
+
+def test_joints_of_a_robot(page: dict[str, Any]) -> None:
+    env = page["Crawler"](page["ROBOT"])
+    assert env.joint("left") == (slice(7, 8), slice(6, 7))
+    assert env.joint("right") == (slice(8, 9), slice(7, 8))
+    with pytest.raises(ValueError, match=r"name='up': no joint of crawler; .*left"):
+        env.joint("up")
+    seen = env.kinematics(env.fixed_state().pipeline_state)
+    assert seen.position.shape == (3, 3)
+
+
+class Still(nq.PhysicsEnv):
+    """The least that an environment says."""
+
+    def outcome(self, before: Any, after: PhysicsState, action: Any) -> Any:
+        return 1, after.q[2] > 1.0, {"height": after.q[2]}
+
+
+def test_defaults_of_the_methods(page: dict[str, Any]) -> None:
+    env = Still(page["ROBOT"])
+    assert env.observation_size == 9 + 8
+    state = env.reset(jax.random.key(0))
+    physics = state.pipeline_state
+    assert np.array_equal(state.obs, np.concatenate([physics.q, physics.v]))
+    after = env.step(state, jnp.zeros(2))
+    assert after.reward == 1 and after.reward.dtype == after.done.dtype == np.float32
+
+
+def test_a_pose_of_ones_own(page: dict[str, Any]) -> None:
+    class Turned(Still):
+        def reset_pose(self, rng: jax.Array, q: jax.Array) -> jax.Array:
+            return q.at[0].set(jax.random.uniform(rng, (), q.dtype, 5.0, 6.0))
+
+    q = Turned(page["ROBOT"]).reset(jax.random.key(0)).pipeline_state.q
+    assert 5.0 <= q[0] <= 6.0 and q[1] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("method", "returned", "error", "message"),
+    [
+        (
+            "observe",
+            {},
+            TypeError,
+            r"Bad.observe: returned \{\}; allowed: a dictionary",
+        ),
+        (
+            "observe",
+            {"x": jnp.zeros(())},
+            ValueError,
+            r"'x' has shape \(\); allowed: \(n",
+        ),
+        (
+            "outcome",
+            jnp.zeros(()),
+            TypeError,
+            r"Bad.outcome: returned .*; allowed: rew",
+        ),
+        (
+            "outcome",
+            (jnp.zeros(1), False, {}),
+            ValueError,
+            r"Bad.outcome: 'reward' has shape \(1,\); allowed: \(\)",
+        ),
+        (
+            "outcome",
+            (0.0, False, {"lean": jnp.zeros(2)}),
+            ValueError,
+            r"Bad.outcome: 'lean' has shape \(2,\); allowed: \(\)",
+        ),
+    ],
+)
+def test_what_methods_may_return(
+    method: str,
+    returned: Any,
+    error: type[Exception],
+    message: str,
+    page: dict[str, Any],
+) -> None:
+    bad = type("Bad", (Still,), {method: lambda self, *given: returned})
+    with pytest.raises(error, match=message):
+        bad(page["ROBOT"])
+
+
+def test_descriptors_have_the_length_of_their_limits(page: dict[str, Any]) -> None:
+    class Wide(nq.DescriptorWrapper):
+        limits = (0.0,), (1.0,)
+
+        def describe(self, state: nq.State) -> jax.Array:
+            return state.pipeline_state.q
+
+    env = Wide(page["Crawler"](page["ROBOT"]), "crawler")
+    with pytest.raises(ValueError, match=r"Wide.describe: .*\(9,\); allowed: \(1,\)"):
+        env.reset(jax.random.key(0))
+
+
+def test_descriptors_around_a_batch(page: dict[str, Any]) -> None:
+    inside = nq.create("crawler", batch_size=3)
+    state = page["ArmAngles"](inside, "crawler").reset(jax.random.key(0))
+    assert state.info["state_descriptor"].shape == (3, 2)
+
+
+def test_old_names_of_the_methods() -> None:
+    with pytest.warns(
+        DeprecationWarning, match="^Old._outcome is now outcome$"
+    ) as seen:
+
+        class Old(nq.Locomotion):
+            def _outcome(self, before: Any, after: Any, action: Any) -> Any:
+                reward, done, metrics = super()._outcome(before, after, action)
+                return 2 * reward, done, metrics
+
+    assert seen[0].filename == __file__
+    assert Old.outcome is vars(Old)["_outcome"]
+    assert vars(nq.Locomotion)["_outcome"] is nq.Locomotion.outcome
+
+
+@pytest.fixture
+def names(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Registrations that the test makes are forgotten after it."""
+    monkeypatch.setattr(tasks, "ENVIRONMENTS", dict(tasks.ENVIRONMENTS))
+
+
+def test_register_gives_the_robot_and_options(names: None) -> None:
+    robot = newton_qd.create("ant").unwrapped.robot  # pyright: ignore
+    limits = {"minval": (-1, -1), "maxval": (1, 1)}
+    nq.register(
+        "mine",
+        nq.Locomotion,
+        robot=robot,
+        descriptor=nq.WrapperSpec(nq.XYPositionWrapper, limits),
+        healthy_reward=3.0,
+    )
+    spec = tasks.ENVIRONMENTS["mine"]
+    assert spec.descriptor_extractor is nq.get_final_xy_position
+    assert spec.forward_reward == "reward_forward" and spec.torso == "torso"
+    env: Any = nq.create("mine")
+    assert env.unwrapped._healthy_reward == 3.0
+    assert env.state_descriptor_limits[1].tolist() == [1, 1]
+    env = nq.create("mine", healthy_reward=4.0)
+    assert env.unwrapped._healthy_reward == 4.0
+    with pytest.raises(TypeError, match=r"heatlhy=1: not an argument of 'other'; allo"):
+        nq.register("other", nq.Locomotion, robot=robot, heatlhy=1)
+    with pytest.raises(TypeError, match="descriptor=3: allowed: None, a class such as"):
+        nq.register("other", nq.Locomotion, descriptor=3)  # pyright: ignore
+    assert "other" not in nq.registered_envs()
+
+
+def test_everything_is_in_one_module() -> None:
+    assert newton_qd.authoring is nq
+    for name in nq.__all__:
+        assert getattr(nq, name) is not None
