@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from throughput import seconds
 
-from newton_qd.gradients.factories import make_episode
+from newton_qd.gradients import Episode
 from newton_qd.physics.launch import Launcher
 from newton_qd.qd.config import EvolveConfig
 from newton_qd.qd.scoring.sharding import device_mesh, shard_scoring
@@ -67,9 +67,7 @@ def perceptron(env: Any) -> tuple[int, Callable[[Any, jax.Array], jax.Array]]:
 
 def scoring(task: Task, act: Any, length: int) -> Any:
     """Scores of a batch of weights, or of actions where there is no policy."""
-    episode = make_episode(
-        task.env, act, task.descriptor_extractor, episode_length=length
-    )
+    episode = Episode(task.env, act, task.descriptor_extractor, episode_length=length)
 
     def score(genotypes: jax.Array, key: jax.Array) -> Any:
         outcome = jax.vmap(episode, in_axes=(0, None))(genotypes, key)

@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from newton_qd.gradients.factories import make_episode
+from newton_qd.gradients import Episode
 from newton_qd.qd.config import EvolveConfig
 from newton_qd.qd.run.search import Search
 from newton_qd.qd.scoring.rollout import make_policy, make_scoring_function
@@ -64,9 +64,7 @@ def measure(config: EvolveConfig, repetitions: int) -> dict[str, np.ndarray]:
     watch = jax.jit(make_scoring_function(task, policy, length, transitions=True))
     fitnesses, _, extra = watch(genotypes, key)
     actions = extra["transitions"]["actions"]
-    episode = make_episode(
-        task.env, None, task.descriptor_extractor, episode_length=length
-    )
+    episode = Episode(task.env, None, task.descriptor_extractor, episode_length=length)
     replay = jax.jit(jax.vmap(episode, in_axes=(0, None)))
     if not jnp.array_equal(replay(actions, key).fitness, fitnesses):
         raise RuntimeError("the replayed actions gave other returns")

@@ -12,7 +12,7 @@ import optax
 from jax.flatten_util import ravel_pytree
 from optimize_problems import STEPS, Cautious, Problem, make_network
 
-from newton_qd.gradients import GradientOptions, make_episode_gradient
+from newton_qd.gradients import Episode, GradientOptions
 from newton_qd.qd.emitters.actor_critic_learner import ActorCritic, ActorCriticSettings
 
 
@@ -91,16 +91,14 @@ class GradientPlan:
     def update(self, carry: Any) -> Any:
         """One step of Adam."""
         plans, optimizer, reset_key, key, count = carry
-        gradient = make_episode_gradient(
+        episode = Episode(
             Cautious(self.problem.env, self.caution),
-            None,
-            None,
             episode_length=STEPS,
             unravel=jnp.tanh,
             options=self.options,
         )
         key, renewal_key = jax.random.split(key)
-        found = gradient(plans, reset_key)
+        found = episode.gradient(plans, reset_key)
         downhill = -found.gradients[:, 0]
         # Adam forgets the size; what one plan's gradient has lost must not come back
         size = jnp.sqrt(jnp.sum(jnp.square(downhill), axis=(1, 2), keepdims=True))

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import newton_qd
-from newton_qd.gradients import make_episode
+from newton_qd.gradients import Episode
 from newton_qd.types import Action, Params
 from newton_qd.wrappers import Wrapper
 
@@ -73,10 +73,9 @@ class Problem:
 
     def returns(self, solutions: Any, keys: jax.Array) -> jax.Array:
         """Returns (n, resets) of n solutions from all of the resets."""
-        episode = make_episode(
+        episode = Episode(
             self.env,
             self.policy,
-            None,
             episode_length=STEPS,
             unravel=jnp.tanh if self.policy is None else lambda x: x,
         )

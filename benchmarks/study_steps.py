@@ -23,8 +23,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from newton_qd.gradients import (
+    Episode,
     GradientOptions,
-    make_directional_gradient,
     with_smooth_descriptor,
 )
 from newton_qd.qd import EvolveConfig, make_policy, make_scoring_function, make_task
@@ -129,16 +129,15 @@ def main() -> None:
     show("random", jax.random.normal(keys[2], weights.shape))
     env = with_smooth_descriptor(task.env, SMOOTH_WIDTH, straight_through=True)
     for text in args.flows:
-        gradient = jax.jit(
-            make_directional_gradient(
-                env,
-                policy.apply,
-                task.descriptor_extractor,
-                episode_length=args.steps,
-                unravel=policy.unravel,
-                options=flow(text),
-            )
+        episode = Episode(
+            env,
+            policy.apply,
+            task.descriptor_extractor,
+            episode_length=args.steps,
+            options=flow(text),
+            unravel=policy.unravel,
         )
+        gradient = jax.jit(episode.directional)
         ways = gradient(weights, directions[:, None], start).gradients[:, 0]
         show(text, ways)
         cost = seconds(gradient, weights, directions[:, None], start) / plain

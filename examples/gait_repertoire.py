@@ -35,30 +35,29 @@ def main() -> None:
     options = parser.parse_args()
 
     env: Any = newton_qd.create(options.env, auto_reset=False)
-    task = None, newton_qd.tables.descriptor_extractor[options.env]  # without a policy
-    common: Any = {"episode_length": options.steps, "unravel": jnp.tanh}
-    episode = gradients.make_episode(env, *task, **common)
-    gradient = gradients.make_directional_gradient(
+    episode = gradients.Episode(
         gradients.with_smooth_descriptor(env, 0.1, straight_through=True),
-        *task,
+        None,  # no policy: the genotypes are the actions
+        newton_qd.tables.descriptor_extractor[options.env],
+        episode_length=options.steps,
         options=gradients.GradientOptions(clip=10.0),
-        **common,
+        unravel=jnp.tanh,
     )
+    score = episode.scoring()
     start, key = jax.random.split(jax.random.key(0))
-
-    def score(plans: Any, _: Any) -> tuple[Any, Any, dict]:
-        found = jax.vmap(episode, in_axes=(0, None))(plans, start)
-        return jnp.where(found.faulty, -jnp.inf, found.fitness), found.descriptor, {}
-
     line = GradientLineEmitter(
-        lambda plans, ways, _: gradient(plans, ways, start),
+        lambda plans, ways, _: episode.directional(plans, ways, start),
         parents=options.batch_size // 8,
         **{"branches": 4, "shortest": 0.05, "longest": 5.0},
     )
     variation = functools.partial(isoline_variation, iso_sigma=0.05, line_sigma=0.2)
     parts: Any = (lambda x, _: x, variation, 1.0, options.batch_size // 2)
     metrics = functools.partial(default_qd_metrics, qd_offset=0.0)
-    search = MAPElites(score, MultiEmitter((line, MixingEmitter(*parts))), metrics)
+    search = MAPElites(
+        lambda plans, _: score(plans, start),
+        MultiEmitter((line, MixingEmitter(*parts))),
+        metrics,
+    )
     shape = options.batch_size, options.steps * env.action_size
     plans = jax.random.normal(key, shape, jnp.float32)
     low, high = (limit.tolist() for limit in env.descriptor_limits)

@@ -16,9 +16,9 @@ import jax.numpy as jnp
 
 import newton_qd
 from newton_qd.gradients import (
+    Episode,
     EpisodeGradients,
     GradientOptions,
-    make_episode_gradient,
     with_smooth_descriptor,
 )
 
@@ -31,7 +31,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     arguments = parser.parse_args(argv)
 
     env = newton_qd.create("ant_uni", auto_reset=False)
-    gradient = make_episode_gradient(
+    episode = Episode(
         with_smooth_descriptor(env),
         None,  # no policy: the genotypes are the actions
         newton_qd.tables.descriptor_extractor["ant_uni"],
@@ -45,7 +45,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
     @jax.jit
     def climb(plans):
-        result = gradient(plans, start)
+        result = episode.gradient(plans, start)
         uphill = result.gradients[:, 0]
         size = jnp.sqrt(jnp.sum(jnp.square(uphill), axis=(1, 2), keepdims=True))
         return jnp.clip(plans + 0.3 * uphill / (size + 1e-6), -1.0, 1.0), result

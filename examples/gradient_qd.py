@@ -15,13 +15,7 @@ from qdax.core.map_elites import MAPElites
 from qdax.utils.metrics import default_qd_metrics
 
 from newton_qd.gradients import GradientOptions
-from newton_qd.qd import (
-    EvolveConfig,
-    make_gradient_scoring_function,
-    make_policy,
-    make_scoring_function,
-    make_task,
-)
+from newton_qd.qd import EvolveConfig, episode_of, make_policy, make_task
 from newton_qd.qd.emitters import CMAMEGAEmitter
 
 
@@ -39,10 +33,11 @@ def main() -> None:
     policy = make_policy(task.env, (32,))
     start, key = jax.random.key(0), jax.random.key(1)
     # The loop evaluates all offspring without gradients, the emitter four points with.
-    plain: Any = make_scoring_function(task, policy, config.episode_length)
-    exact = make_gradient_scoring_function(
-        task, policy, config.episode_length, GradientOptions(clip=10.0)
+    episode = episode_of(
+        task, policy, config.episode_length, options=GradientOptions(clip=10.0)
     )
+    plain: Any = episode.scoring()
+    exact = episode.scoring(episode.gradient)
     emitter = CMAMEGAEmitter(
         lambda genotypes, _: exact(genotypes, start),
         sigma_g=0.5,

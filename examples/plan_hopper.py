@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import optax
 
 import newton_qd
-from newton_qd.gradients import GradientOptions, make_episode, make_episode_gradient
+from newton_qd.gradients import Episode, GradientOptions
 from newton_qd.wrappers import Wrapper
 
 
@@ -43,17 +43,15 @@ def main(argv: Sequence[str] | None = None) -> None:
     arguments = parser.parse_args(argv)
 
     env = newton_qd.create("hopper", episode_length=None, auto_reset=False)
+    # no policy: the genotypes are the actions
     settings = {"episode_length": arguments.steps, "unravel": jnp.tanh}
-    gradient = make_episode_gradient(
+    cautious = Episode(
         Cautious(env),
-        None,  # no policy: the genotypes are the actions
-        None,  # no descriptor
         # a step back takes off what a step adds to the gradient's size, and more
         options=GradientOptions(window=100, discount=0.97, clip=100.0),
         **settings,
     )
-    episode = make_episode(env, None, None, **settings)
-    returns = jax.jit(jax.vmap(episode, (0, None)))
+    returns = jax.jit(jax.vmap(Episode(env, **settings), (0, None)))
     key, optimizer = jax.random.key(0), optax.adam(0.05)
     shape = (arguments.plans, arguments.steps, env.action_size)
     plans = 0.1 * jax.random.normal(jax.random.key(1), shape, env.dtype)
@@ -61,7 +59,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
     @jax.jit
     def climb(plans, moments):
-        uphill = gradient(plans, key).gradients[:, 0]
+        uphill = cautious.gradient(plans, key).gradients[:, 0]
         size = jnp.sqrt(jnp.sum(jnp.square(uphill), axis=(1, 2), keepdims=True))
         change, moments = optimizer.update(-uphill / (size + 1e-6), moments)
         return plans + change, moments

@@ -13,10 +13,9 @@ from ribs.schedulers import Scheduler
 from newton_qd.gradients import GradientOptions
 from newton_qd.qd import (
     EvolveConfig,
-    make_gradient_scoring_function,
+    episode_of,
     make_policy,
     make_ribs_evaluation,
-    make_scoring_function,
     make_task,
 )
 
@@ -34,11 +33,13 @@ def main() -> None:
     policy = make_policy(task.env, (16,))
     worst = -task.reward_offset * config.episode_length
     common = {"key": jax.random.key(1), "limits": task.limits, "worst": worst}
-    plain = make_scoring_function(task, policy, config.episode_length)
-    flow = GradientOptions(clip=10.0)
-    exact = make_gradient_scoring_function(task, policy, config.episode_length, flow)
-    evaluate = make_ribs_evaluation(plain, **common)
-    differentiate = make_ribs_evaluation(exact, jacobian=True, **common)
+    episode = episode_of(
+        task, policy, config.episode_length, options=GradientOptions(clip=10.0)
+    )
+    evaluate = make_ribs_evaluation(episode.scoring(), **common)
+    differentiate = make_ribs_evaluation(
+        episode.scoring(episode.gradient), jacobian=True, **common
+    )
 
     grid = {
         "solution_dim": policy.size,

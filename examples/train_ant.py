@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import optax
 
 import newton_qd
-from newton_qd.gradients import GradientOptions, make_episode
+from newton_qd.gradients import Episode, GradientOptions
 
 HIDDEN = 32
 
@@ -37,10 +37,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     env = newton_qd.create(
         "ant", episode_length=None, auto_reset=False, use_contact_forces=False
     )
-    episode = make_episode(
+    episode = Episode(
         env,
         policy,
-        None,  # no descriptor
         episode_length=arguments.steps,
         options=GradientOptions(window=16, clip=1.0),
     )

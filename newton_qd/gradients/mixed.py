@@ -53,7 +53,7 @@ class MixedGradients(EpisodeGradients):
     bias: jax.Array
 
 
-def check_mixture(samples: int, sigma: float, tolerance: float) -> None:
+def check_mixture(samples: int, sigma: float, tolerance: float = math.inf) -> None:
     """Checks the settings of a mixed gradient.
 
     Raises:

@@ -6,8 +6,9 @@
 - ``load_archive(folder)``, ``plot_archive(...)``: what a run has found
 - ``make_task``, ``make_policy``, ``make_scoring_function``: the parts, for other
   algorithms of QDax
-- ``make_gradient_scoring_function``: scores with the gradients of fitness and
-  descriptor
+- ``episode_of(task, policy, length)``: the same as a ``newton_qd.Episode``, whose
+  ``scoring(episode.gradient)`` has gradients (``make_gradient_scoring_function`` is
+  deprecated)
 - ``device_mesh``, ``shard_scoring``: evaluation split over several devices
 - ``make_ribs_evaluation``, ``to_ribs``, ``from_ribs``: pyribs on these tasks
 
@@ -31,7 +32,12 @@ if TYPE_CHECKING:
     from newton_qd.qd.run.search import SearchError
     from newton_qd.qd.scoring.gradient_scoring import make_gradient_scoring_function
     from newton_qd.qd.scoring.ribs import from_ribs, make_ribs_evaluation, to_ribs
-    from newton_qd.qd.scoring.rollout import Policy, make_policy, make_scoring_function
+    from newton_qd.qd.scoring.rollout import (
+        Policy,
+        episode_of,
+        make_policy,
+        make_scoring_function,
+    )
     from newton_qd.qd.scoring.sharding import device_mesh, shard_scoring
     from newton_qd.qd.scoring.task import Task, make_task
 
@@ -47,6 +53,7 @@ __all__ = [
     "SearchError",
     "Task",
     "device_mesh",
+    "episode_of",
     "evolve",
     "from_ribs",
     "load_archive",
@@ -72,6 +79,7 @@ _HOME = {
     "SearchError": "run.search",
     "Task": "scoring.task",
     "device_mesh": "scoring.sharding",
+    "episode_of": "scoring.rollout",
     "evolve": "run.evolution",
     "from_ribs": "scoring.ribs",
     "load_archive": "run.archive",

@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING, Any
 from newton_qd.qd.algorithms.options import Options
 
 if TYPE_CHECKING:  # importing the options imports no JAX
-    from newton_qd.gradients import GradientOptions
+    from newton_qd.gradients import Episode, GradientOptions
+    from newton_qd.gradients.exact import EpisodeGradient
     from newton_qd.qd.config import EvolveConfig
-    from newton_qd.qd.scoring.rollout import Policy, ScoringFunction
+    from newton_qd.qd.scoring.rollout import Policy
     from newton_qd.qd.scoring.task import Task
+    from newton_qd.types import ScoringFunction
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -82,16 +84,19 @@ class MixedOptions(FlowOptions):
     samples: int = 0
     noise: float = 0.02
 
-    @property
-    def estimator(self) -> Any:
-        """Builds the gradient, as ``make_gradient_scoring_function`` wants it."""
-        from newton_qd.gradients import make_episode_gradient, make_mixed_gradient
+    def gradient(self, episode: Episode) -> EpisodeGradient:
+        """The gradient of an episode: exact, or mixed with the zeroth order.
 
+        Raises:
+            TypeError: ``noise`` is no number.
+            ValueError: ``samples`` or ``noise`` is out of its range.
+        """
         if not self.samples:
-            return make_episode_gradient
-        return functools.partial(
-            make_mixed_gradient, samples=self.samples, sigma=self.noise
-        )
+            return episode.gradient
+        from newton_qd.gradients.mixed import check_mixture
+
+        check_mixture(self.samples, self.noise)
+        return functools.partial(episode.mixed, samples=self.samples, sigma=self.noise)
 
     @property
     def episodes(self) -> int:
@@ -127,15 +132,12 @@ def gradient_scoring(
     config: EvolveConfig, options: MixedOptions, task: Task, policy: Policy
 ) -> ScoringFunction:
     """Scores with the gradients of fitness and descriptor."""
-    from newton_qd.qd.scoring.gradient_scoring import make_gradient_scoring_function
+    from newton_qd.qd.scoring.rollout import episode_of
 
-    return make_gradient_scoring_function(
-        differentiable(task, options.smooth_width),
-        policy,
-        config.episode_length,
-        options.flow(),
-        estimator=options.estimator,
-    )
+    smooth = differentiable(task, options.smooth_width)
+    length = config.episode_length
+    episode = episode_of(smooth, policy, length, options=options.flow())
+    return episode.scoring(options.gradient(episode))
 
 
 def initial_scale(options: DifferentiableOptions) -> float:

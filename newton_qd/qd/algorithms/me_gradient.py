@@ -60,21 +60,15 @@ class MEGradientOptions(FlowOptions):
 
 def _make(context: EmitterContext, options: MEGradientOptions) -> Any:
     """MAP-Elites in which a share of the offspring lies along gradients of elites."""
-    from newton_qd.gradients import make_directional_gradient
     from newton_qd.qd.emitters.gradient_line import GradientLineEmitter
+    from newton_qd.qd.scoring.rollout import episode_of
 
-    config, policy = context.config, context.policy
+    config, key = context.config, context.reset_key
     task = differentiable(context.task, options.smooth_width)
-    gradient = make_directional_gradient(
-        task.env,
-        policy.apply,
-        task.descriptor_extractor,
-        episode_length=config.episode_length,
-        unravel=policy.unravel,
-        options=options.flow(),
-    )
+    length = config.episode_length
+    episode = episode_of(task, context.policy, length, options=options.flow())
     emitter = GradientLineEmitter(
-        lambda genotypes, ways, _: gradient(genotypes, ways, context.reset_key),
+        lambda genotypes, ways, _: episode.directional(genotypes, ways, key),
         parents=options.parents(config),
         branches=options.branches,
         shortest=options.shortest,

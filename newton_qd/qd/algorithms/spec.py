@@ -12,8 +12,9 @@ from newton_qd.qd.config import EvolveConfig
 if TYPE_CHECKING:  # importing a list of algorithms imports no JAX
     import jax
 
-    from newton_qd.qd.scoring.rollout import Policy, ScoringFunction
+    from newton_qd.qd.scoring.rollout import Policy
     from newton_qd.qd.scoring.task import Task
+    from newton_qd.types import ScoringFunction
 
 
 @dataclasses.dataclass(frozen=True)

@@ -29,12 +29,12 @@ from newton_qd.qd.emitters.cma_es import CMAES, CMAESState
 from newton_qd.qd.emitters.restarts import RestartRule
 from newton_qd.qd.scoring.gradient_scores import (
     GradientsError,
-    ScoringFunction,
     check_genotypes,
     finite_scores,
     normalize,
     read_scores,
 )
+from newton_qd.types import ScoringFunction
 
 # Ranks of offspring (pyribs' status); what failed comes last.
 NEW, IMPROVED, WORSE, FAILED = 2, 1, 0, -1

@@ -14,7 +14,8 @@ import jax.numpy as jnp
 from qdax.core.containers.mapelites_repertoire import get_cells_indices
 from qdax.core.emitters.emitter import Emitter, EmitterState
 
-from newton_qd.qd.scoring.gradient_scores import Scores, ScoringFunction, read_scores
+from newton_qd.qd.scoring.gradient_scores import Scores, read_scores
+from newton_qd.types import ScoringFunction
 
 _ROUNDINGS = 16
 

@@ -45,7 +45,7 @@ class GradientLineEmitter(Emitter):
 
         Args:
             gradient: Gradient along directions, as
-                :func:`~newton_qd.gradients.make_directional_gradient` makes it.
+                :meth:`newton_qd.Episode.directional` gives it.
             parents: Parents in one iteration.
             branches: Offspring of each parent.
             shortest: Shortest step, in units of the genotype.

@@ -10,7 +10,8 @@ import numpy as np
 import optax
 
 from newton_qd.qd.emitters.elite_gradients import EliteGradientEmitter, check_steps
-from newton_qd.qd.scoring.gradient_scores import ScoringFunction, normalize, read_scores
+from newton_qd.qd.scoring.gradient_scores import normalize, read_scores
+from newton_qd.types import ScoringFunction
 
 
 class GradientVariationEmitter(EliteGradientEmitter):

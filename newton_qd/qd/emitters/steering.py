@@ -9,7 +9,8 @@ import jax.numpy as jnp
 
 from newton_qd.qd.emitters.cells import empty_targets, nearest_cells
 from newton_qd.qd.emitters.elite_gradients import EliteGradientEmitter, check_steps
-from newton_qd.qd.scoring.gradient_scores import ScoringFunction, read_scores
+from newton_qd.qd.scoring.gradient_scores import read_scores
+from newton_qd.types import ScoringFunction
 
 # Keeps the system regular where no descriptor has a gradient.
 _TINY = 1e-12

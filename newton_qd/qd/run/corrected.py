@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from newton_qd.qd.run.archive import Archive
-from newton_qd.qd.scoring.rollout import ScoringFunction
+from newton_qd.types import ScoringFunction
 
 
 @dataclasses.dataclass(frozen=True)

@@ -21,12 +21,12 @@ from newton_qd.qd.run.checkpoint import Checkpoint, CheckpointError
 from newton_qd.qd.run.corrected import Corrected, correct
 from newton_qd.qd.run.folder import COLUMNS
 from newton_qd.qd.scoring.rollout import (
-    ScoringFunction,
     make_policy,
     make_scoring_function,
 )
 from newton_qd.qd.scoring.sharding import on_mesh, shard_scoring
 from newton_qd.qd.scoring.task import Task
+from newton_qd.types import ScoringFunction
 
 
 class SearchError(RuntimeError):

@@ -8,22 +8,22 @@ A scoring function maps genotypes (N, size) and a key to fitnesses (N,), descrip
 the gradients with respect to the genotype, laid out as QDax's emitters want them:
 column 0 is that of the fitness, column 1 + j that of descriptor j, in their own units
 (emitters normalize where their paper does). An individual that could not be evaluated
-has fitness ``-inf``. ``make_gradient_scoring_function`` makes such functions.
+has fitness ``-inf``. ``Episode.scoring`` makes such functions.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Mapping
 from typing import Any
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 
+from newton_qd.types import Genotype
+
 GRADIENTS = "gradients"
 """Key of the gradients in ``extra_scores``."""
-
-ScoringFunction = Callable[[Any, jax.Array], tuple[jax.Array, jax.Array, Any]]
 
 # pyribs' epsilon: a gradient shorter than this stays shorter than one.
 _EPSILON = 1e-8
@@ -52,7 +52,10 @@ class Scores(flax.struct.PyTreeNode):
 
 
 def read_scores(
-    genotypes: Any, fitnesses: jax.Array, descriptors: jax.Array, extra_scores: Any
+    genotypes: Genotype,
+    fitnesses: jax.Array,
+    descriptors: jax.Array,
+    extra_scores: Mapping[str, Any] | None,
 ) -> Scores:
     """Checks what a scoring function returned and sets aside what is not finite.
 
@@ -96,7 +99,7 @@ def read_scores(
     )
 
 
-def check_genotypes(genotypes: Any) -> jax.Array:
+def check_genotypes(genotypes: Genotype) -> jax.Array:
     """Returns genotypes that are one array (N, size).
 
     Raises:

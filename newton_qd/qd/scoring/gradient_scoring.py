@@ -3,27 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
-import jax.numpy as jnp
 
-from newton_qd.gradients.exact import EpisodeGradient, EpisodeGradients
+from newton_qd import types
+from newton_qd.gradients.exact import EpisodeGradient
 from newton_qd.gradients.factories import make_episode_gradient
-from newton_qd.gradients.flow import GradientOptions, tree_largest, tree_norm
-from newton_qd.qd.scoring.rollout import Policy, ScoringFunction
+from newton_qd.gradients.flow import GradientOptions
+from newton_qd.gradients.scores import gradient_scores
+from newton_qd.qd.scoring.rollout import Policy
 from newton_qd.qd.scoring.task import Task
+from newton_qd.types import ExtraScores, Genotype, RNGKey, ScoringFunction
 
 
 def make_gradient_scoring_function(
     task: Task,
-    policy: Policy | Callable[[Any, jax.Array], jax.Array] | None,
+    policy: Policy | types.Policy | None,
     episode_length: int,
     options: GradientOptions | None = None,
     *,
     estimator: Callable[..., EpisodeGradient] = make_episode_gradient,
 ) -> ScoringFunction:
     """Builds the function that evaluates a batch of individuals with gradients.
+
+    Deprecated: use ``episode.scoring(episode.gradient)`` of an
+    :class:`~newton_qd.gradients.Episode`.
 
     :func:`~newton_qd.qd.make_scoring_function` with gradients, laid out for QDax's
     emitters: their last axis has the fitness first, then each descriptor component.
@@ -47,6 +51,10 @@ def make_gradient_scoring_function(
         (N, 1 + D), whose gradients were set to 0. The fitness of a faulty individual
         is ``-inf``. With a :class:`~newton_qd.qd.Policy` it raises ``ValueError`` for
         genotypes that are not weights of it.
+
+    Raises:
+        TypeError: The environment, the policy or the options are of another type.
+        ValueError: ``episode_length`` is not an integer from 1.
     """
     flat = isinstance(policy, Policy)
     unravel = {"unravel": policy.unravel} if flat else {}
@@ -60,36 +68,10 @@ def make_gradient_scoring_function(
     )
 
     def score(
-        genotypes: Any, key: jax.Array
-    ) -> tuple[jax.Array, jax.Array, dict[str, Any]]:
+        genotypes: Genotype, key: RNGKey
+    ) -> tuple[jax.Array, jax.Array, ExtraScores]:
         if isinstance(policy, Policy):
             genotypes = policy.weights(genotypes)
-        result: EpisodeGradients = gradient(genotypes, key)
-        return result.fitnesses, result.descriptors, _extra_scores(result)
+        return gradient_scores(gradient(genotypes, key))
 
     return score
-
-
-def _extra_scores(result: EpisodeGradients) -> dict[str, Any]:
-    """Returns gradients in QDax's layout, and what befell them."""
-    unit = jax.vmap(jax.vmap(_unit))(result.gradients)
-    return {
-        "gradients": _rows_last(result.gradients),
-        "normalized_grads": _rows_last(unit),
-        "faulty": result.faulty,
-        "overflowed": result.overflowed,
-    }
-
-
-def _unit(gradient: Any) -> Any:
-    """Returns a gradient of norm 1, or 0 where it is 0."""
-    # twice: the norm of large numbers may be beyond the numbers
-    for norm in (tree_largest, tree_norm):
-        size = norm(gradient)
-        divisor = jnp.where(size == 0, jnp.ones_like(size), size)
-        gradient = jax.tree.map(lambda x, d=divisor: x / d, gradient)
-    return gradient
-
-
-def _rows_last(gradients: Any) -> Any:
-    return jax.tree.map(lambda x: jnp.moveaxis(x, 1, -1), gradients)

@@ -11,7 +11,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from newton_qd.qd.extras import require_extra
-from newton_qd.qd.scoring.rollout import ScoringFunction
+from newton_qd.types import ScoringFunction
 
 Limits = tuple[np.ndarray, np.ndarray]
 
@@ -33,7 +33,7 @@ def make_ribs_evaluation(
     Args:
         score: As made by ``make_scoring_function``; with ``jacobian`` its third
             result holds ``"gradients"`` (N, size, 1 + D): of the fitness, then of
-            each descriptor, not normalized; ``make_gradient_scoring_function``. An
+            each descriptor, not normalized; ``Episode.scoring``. An
             individual with anything that is not finite counts as faulty.
         key: Key for the resets.
         limits: Lowest and highest descriptor, (D,) each, as in ``Task.limits``.

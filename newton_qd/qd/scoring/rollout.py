@@ -11,13 +11,19 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from newton_qd.gradients.factories import make_episode
+from newton_qd.gradients.episode import Episode
+from newton_qd.gradients.flow import EXACT, GradientOptions
 from newton_qd.qd.extras import require_extra
 from newton_qd.qd.scoring.task import Task
-
-ScoringFunction = Callable[
-    [jax.Array, jax.Array], tuple[jax.Array, jax.Array, dict[str, Any]]
-]
+from newton_qd.types import (
+    Environment,
+    ExtraScores,
+    Genotype,
+    Observation,
+    PyTree,
+    RNGKey,
+    ScoringFunction,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,13 +41,13 @@ class Policy:
     """
 
     size: int
-    init: Callable[[jax.Array], jax.Array]
-    unravel: Callable[[jax.Array], Any]
-    apply: Callable[[Any, jax.Array], jax.Array]
-    ravel: Callable[[Any], jax.Array]
+    init: Callable[[RNGKey], jax.Array]
+    unravel: Callable[[jax.Array], PyTree]
+    apply: Callable[[PyTree, Observation], jax.Array]
+    ravel: Callable[[PyTree], jax.Array]
     network: Any
 
-    def weights(self, genotypes: Any) -> jax.Array:
+    def weights(self, genotypes: Genotype) -> jax.Array:
         """Genotypes (N, size) as floating-point numbers.
 
         Raises:
@@ -57,7 +63,7 @@ class Policy:
         return array.astype(jnp.float32) if whole else array
 
 
-def make_policy(env: Any, hidden: tuple[int, ...]) -> Policy:
+def make_policy(env: Environment, hidden: tuple[int, ...]) -> Policy:
     """Builds QDax's perceptron for an environment.
 
     Args:
@@ -80,10 +86,10 @@ def make_policy(env: Any, hidden: tuple[int, ...]) -> Policy:
     zeros = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), example)
     flat, unravel = ravel_pytree(zeros)
 
-    def init(key: jax.Array) -> jax.Array:
+    def init(key: RNGKey) -> jax.Array:
         return ravel_pytree(network.init(key, dummy))[0]
 
-    def apply(parameters: Any, observation: jax.Array) -> jax.Array:
+    def apply(parameters: PyTree, observation: Observation) -> jax.Array:
         return jnp.asarray(network.apply(parameters, observation))
 
     return Policy(
@@ -93,6 +99,37 @@ def make_policy(env: Any, hidden: tuple[int, ...]) -> Policy:
         apply=apply,
         ravel=lambda parameters: ravel_pytree(parameters)[0],
         network=network,
+    )
+
+
+def episode_of(
+    task: Task,
+    policy: Policy,
+    episode_length: int,
+    *,
+    options: GradientOptions = EXACT,
+    transitions: bool = False,
+) -> Episode:
+    """Makes the episode of a task in which individuals are weights of a policy.
+
+    Args:
+        task: Environment and descriptor.
+        policy: Policy whose weights are the genotypes.
+        episode_length: Control steps.
+        options: Windows, clipping, discounting and memory of its gradients.
+        transitions: Whether it returns its steps.
+
+    Raises:
+        ValueError: ``episode_length`` is not an integer from 1.
+    """
+    return Episode(
+        task.env,
+        policy.apply,
+        task.descriptor_extractor,
+        episode_length=episode_length,
+        options=options,
+        unravel=policy.unravel,
+        transitions=transitions,
     )
 
 
@@ -119,23 +156,16 @@ def make_scoring_function(
         whose world was faulty or whose result is not finite has fitness ``-inf``:
         archives do not take it. It raises ``ValueError`` for genotypes that are not
         weights of this policy.
+
+    Raises:
+        ValueError: ``episode_length`` is not an integer from 1.
     """
-    episode = make_episode(
-        task.env,
-        policy.apply,
-        task.descriptor_extractor,
-        episode_length=episode_length,
-        unravel=policy.unravel,
-        transitions=transitions,
-    )
+    episode = episode_of(task, policy, episode_length, transitions=transitions)
+    evaluate = episode.scoring()
 
     def score(
-        genotypes: jax.Array, key: jax.Array
-    ) -> tuple[jax.Array, jax.Array, dict[str, Any]]:
-        weights = policy.weights(genotypes)
-        outcome = jax.vmap(episode, in_axes=(0, None))(weights, key)
-        fitness = jnp.where(outcome.faulty, -jnp.inf, outcome.fitness)
-        extra = {"transitions": outcome.transitions} if transitions else {}
-        return fitness, outcome.descriptor, extra
+        genotypes: Genotype, key: RNGKey
+    ) -> tuple[jax.Array, jax.Array, ExtraScores]:
+        return evaluate(policy.weights(genotypes), key)
 
     return score

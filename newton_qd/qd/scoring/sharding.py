@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from newton_qd.qd.scoring.rollout import ScoringFunction
+from newton_qd.types import ScoringFunction
 
 AXIS = "individuals"
 
