@@ -23,7 +23,7 @@ def functions() -> dict[str, Any]:
     """Every overload that has an adjoint, by its name and argument types."""
     package = build_kernels(Variant("float64", WIDTH)).package.__name__
     found = {}
-    for part in ("algebra", "numbers", "smooth"):
+    for part in ("operators", "algebra", "numbers", "smooth"):
         module = importlib.import_module(f"{package}.cpp.{part}")
         for name, value in vars(module).items():
             for signature, overload in getattr(value, "user_overloads", {}).items():

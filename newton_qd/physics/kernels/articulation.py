@@ -12,23 +12,20 @@ import warp as wp
 
 from . import mat33, real, scalar, stage, vec3
 from .cpp.algebra import (
-    add,
     add_diagonal,
     component,
     cross,
-    div,
     dot,
     inverse,
-    mul,
     outer,
     skew,
-    sub,
     translation,
     transpose,
     vector,
 )
 from .cpp.memory import constant, load, store
 from .cpp.numbers import uniform
+from .cpp.operators import add, div, mul, sub  # noqa: F401
 from .cpp.smooth import gate, penetration
 from .parameters import body_mass, joint_damping
 from .structs import Model, Offsets, Scratch

@@ -9,8 +9,9 @@ at most, and the middle of the box, where no face is the nearest, is as smooth.
 import warp as wp
 
 from . import real, scalar, vec3
-from .cpp.algebra import add, component, div, dot, mul, neg, sub, vector
+from .cpp.algebra import component, dot, vector
 from .cpp.numbers import clamp, uniform
+from .cpp.operators import add, div, mul, neg, sub  # noqa: F401
 from .cpp.smooth import finite_length, gate, penetration
 from .structs import Model
 

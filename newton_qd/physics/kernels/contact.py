@@ -11,18 +11,10 @@ stays close to its cone.
 import warp as wp
 
 from . import real, scalar, stage, vec3
-from .cpp.algebra import (
-    add,
-    cross,
-    div,
-    dot,
-    mul,
-    neg,
-    sub,
-    transform_point,
-)
+from .cpp.algebra import cross, dot, transform_point
 from .cpp.memory import constant, load, store
 from .cpp.numbers import sqrt, uniform
+from .cpp.operators import add, div, mul, neg, sub  # noqa: F401
 from .cpp.smooth import gate, penetration
 from .nearest import touch_obstacle
 from .pair import touch_partner

@@ -9,6 +9,9 @@ import warp as wp
 
 from .rows import Inputs, Outputs
 
+# Warp declares no shape for arrays of kernels.
+# pyright: reportAttributeAccessIssue=false
+
 
 @wp.kernel
 def write_rows(

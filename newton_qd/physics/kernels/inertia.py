@@ -2,19 +2,17 @@
 
 from . import stage
 from .cpp.algebra import (
-    add,
     add_diagonal,
     cross,
     dot,
     matrix,
-    mul,
     outer,
     rotation,
-    sub,
     transform_point,
     transpose,
 )
 from .cpp.memory import constant, load, store
+from .cpp.operators import add, mul, sub  # noqa: F401
 from .parameters import body_inertia, body_mass
 from .structs import Model, Offsets, Scratch
 

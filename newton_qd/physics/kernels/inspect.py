@@ -9,18 +9,10 @@ import warp as wp
 from newton_qd.physics.kinds import JointKind
 
 from . import mat33, real, scalar, sync, vec3
-from .cpp.algebra import (
-    add,
-    add_diagonal,
-    cross,
-    dot,
-    mul,
-    skew,
-    translation,
-    vector,
-)
+from .cpp.algebra import add_diagonal, cross, dot, skew, translation, vector
 from .cpp.memory import constant, load, read_input, store, write_output
 from .cpp.numbers import uniform
+from .cpp.operators import add, mul  # noqa: F401
 from .inertia import rigid_inertia
 from .readings import body_reading, seed_bodies, store_bodies
 from .simulate import kinematics

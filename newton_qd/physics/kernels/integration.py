@@ -3,8 +3,9 @@
 from newton_qd.physics.kinds import JointKind
 
 from . import scalar, stage
-from .cpp.algebra import add, component, mul, normalize, quaternion, vector
+from .cpp.algebra import component, normalize, quaternion, vector
 from .cpp.memory import load, store
+from .cpp.operators import add, mul  # noqa: F401
 from .cpp.smooth import turn_by
 from .structs import Model, Offsets, Scratch
 

@@ -11,20 +11,10 @@ import warp as wp
 from newton_qd.physics.kinds import JointKind
 
 from . import real, scalar, stage, vec3
-from .cpp.algebra import (
-    add,
-    cross,
-    mul,
-    neg,
-    quaternion,
-    rigid,
-    rotate,
-    rotation,
-    translation,
-    vector,
-)
+from .cpp.algebra import cross, quaternion, rigid, rotate, rotation, translation, vector
 from .cpp.memory import constant, load, store
 from .cpp.numbers import uniform
+from .cpp.operators import add, mul, neg  # noqa: F401
 from .cpp.smooth import turn_about
 from .parameters import gravity
 from .structs import Model, Offsets, Scratch

@@ -15,22 +15,18 @@ from newton_qd.physics.kinds import ObstacleKind
 from . import boxes, real, scalar, vec3
 from .box import box_distance, box_normal, box_share
 from .cpp.algebra import (
-    add,
     component,
-    div,
     dot,
-    mul,
-    neg,
     rotate,
     rotate_back,
     rotation,
-    sub,
     transform_point,
     translation,
     vector,
 )
 from .cpp.memory import constant, load
 from .cpp.numbers import uniform
+from .cpp.operators import add, div, mul, neg, sub  # noqa: F401
 from .cpp.smooth import bounded, finite_length
 from .structs import Model, Offsets, Scratch
 

@@ -8,9 +8,10 @@ and opposite to the last digit.
 import warp as wp
 
 from . import scalar
-from .cpp.algebra import add, div, dot, mul, neg, rotate, rotation, sub, transform_point
+from .cpp.algebra import dot, rotate, rotation, transform_point
 from .cpp.memory import constant, load
 from .cpp.numbers import uniform
+from .cpp.operators import add, div, mul, neg, sub  # noqa: F401
 from .cpp.smooth import bounded, finite_length
 from .nearest import segment_share
 from .structs import Model, Offsets, Scratch

@@ -10,9 +10,9 @@ Otherwise nothing of this is compiled: the functions below are the model's const
 import warp as wp
 
 from . import parametric, real, scalar, sync
-from .cpp.algebra import add, mul, sub
 from .cpp.memory import constant, load, read_input, store, write_output
 from .cpp.numbers import choose, uniform
+from .cpp.operators import add, mul, sub  # noqa: F401
 from .structs import Model, Offsets, Scratch
 
 PARAMETRIC = wp.constant(parametric)

@@ -8,20 +8,17 @@ import warp as wp
 
 from . import real, scalar, stage, vec3
 from .cpp.algebra import (
-    add,
     component,
     cross,
-    div,
-    mul,
     quaternion,
     rigid,
-    sub,
     transform_point,
     translation,
     vector,
 )
 from .cpp.memory import constant, load, read_input, store, write_output
 from .cpp.numbers import above, choose, uniform
+from .cpp.operators import add, div, mul, sub  # noqa: F401
 from .cpp.smooth import logistic
 from .rows import Bodies
 from .structs import Model, Offsets, Scratch, offsets_at

@@ -6,9 +6,10 @@ The arrays hold one contiguous row per world: its fields are in :mod:`.rows`.
 import warp as wp
 
 from . import real, scalar, stage, sync, width
-from .cpp.algebra import add, component, mul
+from .cpp.algebra import component
 from .cpp.memory import constant, load, read_input, store, write_output
 from .cpp.numbers import beyond, choose
+from .cpp.operators import add, mul  # noqa: F401
 from .parameters import PARAMETRIC, load_parameters, return_parameters
 from .readings import seed, seed_bodies, seed_vector, store_bodies
 from .structs import Model, Offsets, Scratch, offsets_at

@@ -23,9 +23,10 @@ them. Warp's Python does not know ``Real``. There, a number is a Warp vector of 
 - :mod:`.native` declares the C++ types and turns a C++ expression and its adjoint into
   a function for ``wp.func_native``.
 - :mod:`.memory` reads and writes elements of arrays without strides.
-- :mod:`.algebra` has sums, products, vectors, matrices, quaternions and transforms.
-  Warp finds the functions ``add``, ``sub``, ``mul``, ``div`` and ``neg`` by these names
-  where a kernel's module imports them, and calls them for the operators.
+- :mod:`.operators` has sums, differences, products and quotients. Where a file imports
+  ``add``, ``sub``, ``mul``, ``div`` or ``neg``, Warp calls them for the operators.
+  Python itself never does, so their import looks unused.
+- :mod:`.algebra` has the rest of vectors, matrices, quaternions and transforms.
 - :mod:`.numbers` has functions of one number: roots, clamps, choices.
 - :mod:`.smooth` has the smooth one-sided functions and those of rotations.
 

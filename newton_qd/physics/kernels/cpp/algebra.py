@@ -1,125 +1,10 @@
-"""Algebra on packs of worlds.
-
-Warp calls ``add``, ``sub``, ``mul`` and ``div`` for the operators of a module that
-imports them, and its own where none of these fits.
-"""
+"""Algebra on packs of worlds: what has no operator."""
 
 import warp as wp
 
-from .. import mat33, quat, real, scalar, transform, vec3
-from .native import native
+from .. import mat33, quat, real, transform, vec3
+from .native import EACH, native
 from .numbers import ROOT
-
-_EACH = """
-auto each = [](auto x, auto y, auto function) {
-    for (int i = 0; i < sizeof(x) / sizeof(Real); ++i)
-        ((Real*)&x)[i] = function(((Real*)&x)[i], ((Real*)&y)[i]);
-    return x;
-};
-auto plus = [](Real x, Real y) { return x + y; };
-auto minus = [](Real x, Real y) { return x - y; };
-"""
-# Sums and products.
-
-for _type in (real, vec3, mat33):
-
-    @wp.func_native(
-        *native(
-            "each(A, B, plus)",
-            "adj_A = each(adj_A, adj_RET, plus); adj_B = each(adj_B, adj_RET, plus);",
-            _EACH,
-        )
-    )
-    def add(a: _type, b: _type) -> _type:
-        """Sum."""
-        ...
-
-    @wp.func_native(
-        *native(
-            "each(A, B, minus)",
-            "adj_A = each(adj_A, adj_RET, plus); adj_B = each(adj_B, adj_RET, minus);",
-            _EACH,
-        )
-    )
-    def sub(a: _type, b: _type) -> _type:
-        """Difference."""
-        ...
-
-    @wp.func_native(
-        *native(
-            "each(A, A, [](Real x, Real) { return -x; })",
-            "adj_A = each(adj_A, adj_RET, minus);",
-            _EACH,
-        )
-    )
-    def neg(a: _type) -> _type:
-        """Negative."""
-        ...
-
-    # the number of all worlds has no adjoint: it comes from the model
-    @wp.func_native(
-        *native(
-            "each(A, A, [s](Real x, Real) { return Real(s) * x; })",
-            "adj_A = each(adj_A, adj_RET, "
-            "[s](Real x, Real y) { return x + Real(s) * y; });",
-            _EACH,
-        )
-    )
-    def mul(s: scalar, a: _type) -> _type:
-        """Product with one number for all worlds."""
-        ...
-
-
-for _type in (vec3, mat33):
-
-    @wp.func_native(
-        *native(
-            "each(A, A, [&](Real x, Real) { return B * x; })",
-            "each(A, adj_RET, [&](Real x, Real y) { adj_B += x * y; return x; });"
-            "adj_A = each(adj_A, adj_RET, [&](Real x, Real y) { return x + B * y; });",
-            _EACH,
-        )
-    )
-    def mul(b: real, a: _type) -> _type:
-        """Product with a number."""
-        ...
-
-
-@wp.func_native(*native("A * B", "adj_A += B * adj_RET; adj_B += A * adj_RET;"))
-def mul(a: real, b: real) -> real:
-    """Product."""
-    ...
-
-
-@wp.func_native(*native("A / B", "Real x = adj_RET / B; adj_A += x; adj_B -= x * RET;"))
-def div(a: real, b: real) -> real:
-    """Quotient."""
-    ...
-
-
-@wp.func_native(*native("Real(s) / A", "adj_A -= adj_RET / A * RET;"))
-def div(s: scalar, a: real) -> real:
-    """Quotient of one number for all worlds."""
-    ...
-
-
-@wp.func_native(*native("Real(s) + A", "adj_A += adj_RET;"))
-def add(s: scalar, a: real) -> real:
-    """Sum with one number for all worlds."""
-    ...
-
-
-@wp.func_native(*native("A - Real(s)", "adj_A += adj_RET;"))
-def sub(a: real, s: scalar) -> real:
-    """Difference from one number for all worlds."""
-    ...
-
-
-@wp.func_native(*native("Real(s) - A", "adj_A -= adj_RET;"))
-def sub(s: scalar, a: real) -> real:
-    """Difference of one number for all worlds."""
-    ...
-
 
 # Vectors.
 
@@ -178,7 +63,7 @@ for _type in (vec3, quat):
             "auto across = "
             "each(adj_RET, RET, [&](Real x, Real y) { return x - along * y; });"
             "adj_A = each(adj_A, across, [d](Real x, Real y) { return x + d * y; });",
-            _EACH + ROOT + "Real d = Real(1) / root(wp::dot(A, A));",
+            EACH + ROOT + "Real d = Real(1) / root(wp::dot(A, A));",
         )
     )
     def normalize(a: _type) -> _type:
@@ -187,24 +72,6 @@ for _type in (vec3, quat):
 
 
 # 3 x 3 matrices.
-
-
-@wp.func_native(*native("wp::mul(A, B)", "wp::adj_mul(A, B, adj_A, adj_B, adj_RET);"))
-def mul(a: mat33, b: vec3) -> vec3:
-    """Product of a matrix and a vector."""
-    ...
-
-
-@wp.func_native(*native("wp::mul(A, B)", "wp::adj_mul(A, B, adj_A, adj_B, adj_RET);"))
-def mul(a: mat33, b: mat33) -> mat33:
-    """Product of two matrices."""
-    ...
-
-
-@wp.func_native(*native("wp::mul(A, B)", "wp::adj_mul(A, B, adj_A, adj_B, adj_RET);"))
-def mul(a: vec3, b: mat33) -> vec3:
-    """Product of a row vector and a matrix: of its transpose and the vector."""
-    ...
 
 
 @wp.func_native(
@@ -298,12 +165,6 @@ def quaternion(a: real, b: real, c: real, d: real) -> quat:
     ...
 
 
-@wp.func_native(*native("wp::mul(A, B)", "wp::adj_mul(A, B, adj_A, adj_B, adj_RET);"))
-def mul(a: quat, b: quat) -> quat:
-    """The rotation ``b``, then ``a``."""
-    ...
-
-
 @wp.func_native(
     *native(
         "wp::quat_rotate(A, B)",
@@ -354,17 +215,6 @@ def translation(a: transform) -> vec3:
 @wp.func_native(*native("A.q", "adj_A.q = wp::add(adj_A.q, adj_RET);"))
 def rotation(a: transform) -> quat:
     """Rotation of a transform."""
-    ...
-
-
-@wp.func_native(
-    *native(
-        "wp::transform_multiply(A, B)",
-        "wp::adj_transform_multiply(A, B, adj_A, adj_B, adj_RET);",
-    )
-)
-def mul(a: transform, b: transform) -> transform:
-    """The transform ``b``, then ``a``."""
     ...
 
 

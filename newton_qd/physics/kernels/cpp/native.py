@@ -74,6 +74,16 @@ PRELUDE = (
     + "".join(_conversion(*entry) for entry in CPP.values())
     + "\n};\n"
 )
+# Before C++ that computes element by element.
+EACH = """
+auto each = [](auto x, auto y, auto function) {
+    for (int i = 0; i < sizeof(x) / sizeof(Real); ++i)
+        ((Real*)&x)[i] = function(((Real*)&x)[i], ((Real*)&y)[i]);
+    return x;
+};
+auto plus = [](Real x, Real y) { return x + y; };
+auto minus = [](Real x, Real y) { return x - y; };
+"""
 
 
 def native(forward: str, adjoint: str = "", before: str = "") -> tuple[str, str]:

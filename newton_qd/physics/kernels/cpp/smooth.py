@@ -7,9 +7,10 @@ of its angle squared.
 import warp as wp
 
 from .. import quat, real, scalar, vec3
-from .algebra import add, dot, mul, sub
+from .algebra import dot
 from .native import native
 from .numbers import sqrt
+from .operators import add, mul, sub  # noqa: F401
 
 # Distances are of vectors no shorter than this [m]: a direction is always finite.
 SHORTEST = wp.constant(scalar(1.0e-5))
