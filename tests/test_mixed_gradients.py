@@ -152,5 +152,5 @@ def test_noise_whose_square_is_no_number(sigma: float) -> None:
     ],
 )
 def test_bad_settings(name: str, value: Any) -> None:
-    with pytest.raises(ValueError, match=f"{name}={value}: allowed"):
+    with pytest.raises(ValueError, match=f"{name}: got {value}; allowed"):
         estimate(lambda a: a[0], np.zeros((1, 1, 3)), **{name: value})

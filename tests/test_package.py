@@ -28,6 +28,7 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 # A module may import those of its own name and those before it.
 LAYERS = (
+    "checks",
     "errors",
     "files",
     "moved",

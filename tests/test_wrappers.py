@@ -171,11 +171,11 @@ def test_steps_stand_still_at_a_fault() -> None:
 
 @pytest.mark.parametrize("value", [0, -1, 2.5, None, True])
 def test_counts_must_be_positive_integers(value: int) -> None:
-    with pytest.raises(ValueError, match=r"episode_length=.*integers from 1"):
+    with pytest.raises(ValueError, match=r"episode_length: got .*integers from 1"):
         EpisodeWrapper(Line(), value, 1)
-    with pytest.raises(ValueError, match=r"action_repeat=.*integers from 1"):
+    with pytest.raises(ValueError, match=r"action_repeat: got .*integers from 1"):
         EpisodeWrapper(Line(), 5, value)
-    with pytest.raises(ValueError, match=r"batch_size=.*integers from 1"):
+    with pytest.raises(ValueError, match=r"batch_size: got .*integers from 1"):
         VectorWrapper(Line(), value)
 
 
@@ -335,12 +335,16 @@ def test_feet_contact_can_be_smooth() -> None:
     np.testing.assert_allclose(
         state.info["state_descriptor"], 1 / (1 + np.exp(0.1)), rtol=1e-6
     )
-    with pytest.raises(ValueError, match=r"smooth_width=0.*above 0"):
+    with pytest.raises(ValueError, match=r"smooth_width: got 0.*above 0"):
         FeetContactWrapper(Ant(), "ant", smooth_width=0.0)
-    with pytest.raises(ValueError, match=r"smooth_width=inf: allowed: None, or a fin"):
+    with pytest.raises(
+        ValueError, match=r"smooth_width: got inf; allowed: None, or fin"
+    ):
         FeetContactWrapper(Ant(), "ant", smooth_width=np.inf)
     width: Any = "wide"
-    with pytest.raises(TypeError, match=r"smooth_width='wide': allowed: None, or a f"):
+    with pytest.raises(
+        TypeError, match=r"smooth_width: got 'wide'; allowed: None, or f"
+    ):
         FeetContactWrapper(Ant(), "ant", smooth_width=width)
     with pytest.raises(ValueError, match=r"feet_width=-1.*above 0"):
         Ant().with_feet_width(-1.0)

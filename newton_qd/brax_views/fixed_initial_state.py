@@ -7,10 +7,13 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
+from newton_qd import checks
 from newton_qd.brax_views.views import QP, Info, SystemView, qp_view
+from newton_qd.checks import message
 from newton_qd.envs.base import Env, PhysicsEnv
 from newton_qd.envs.state import State
 from newton_qd.wrappers import fixed_initial_state
+from newton_qd.wrappers.base import unsupported
 
 ObservationFunction = Callable[[QP, Info, jax.Array], jax.Array]
 
@@ -42,16 +45,11 @@ class FixedInitialStateWrapper(fixed_initial_state.FixedInitialStateWrapper):
                 for ``get_obs_fn``.
         """
         base = env.unwrapped
-        if get_obs_fn is not None and not callable(get_obs_fn):
-            raise TypeError(
-                f"get_obs_fn={get_obs_fn!r}: allowed: None, or a function of (qp, "
-                "info, action)"
-            )
+        allowed = "a function of (qp, info, action)"
+        checks.function("get_obs_fn", get_obs_fn, allowed, optional=True)
         if get_obs_fn is not None and not isinstance(base, PhysicsEnv):
-            raise NotImplementedError(
-                f"This wrapper does not support {base_env_name or base.name} yet. "
-                f"get_obs_fn={get_obs_fn!r} with {type(base).__name__}; allowed: None"
-            )
+            allowed = "simulated robots, or get_obs_fn=None"
+            raise unsupported(env, base_env_name or base.name, allowed)
         self._get_obs_fn = get_obs_fn
         super().__init__(env, base_env_name)
 
@@ -73,8 +71,6 @@ class FixedInitialStateWrapper(fixed_initial_state.FixedInitialStateWrapper):
         info = SystemView(base.system).info(qp)
         obs = jnp.asarray(self._get_obs_fn(qp, info, action))
         if obs.shape != state.obs.shape:
-            raise ValueError(
-                f"get_obs_fn: returned shape {obs.shape}; allowed: {state.obs.shape}, "
-                "as the observations of the steps"
-            )
+            allowed = f"shape {state.obs.shape}, as the observations of the steps"
+            raise ValueError(message("get_obs_fn", obs, allowed))
         return state.replace(obs=obs.astype(self.dtype))

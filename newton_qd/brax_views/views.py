@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from newton_qd import physics
+from newton_qd.checks import Fact, message
 from newton_qd.envs.joints import joint_chains, joint_indices, solid_bodies
 from newton_qd.physics.model.rest import grounding_coordinate
 from newton_qd.physics.system import PhysicsState, System
@@ -258,9 +259,8 @@ def _checked(
     name: str, values: jax.Array, indices: np.ndarray, dtype: jnp.dtype
 ) -> jax.Array:
     if jnp.shape(values) != indices.shape:
-        raise ValueError(
-            f"{name}: shape {jnp.shape(values)} given; allowed: {indices.shape}"
-        )
+        given = Fact(f"shape {jnp.shape(values)}")
+        raise ValueError(message(name, given, f"shape {indices.shape}"))
     return jnp.asarray(values, dtype)
 
 

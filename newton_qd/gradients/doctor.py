@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import jax
 import numpy as np
 
+from newton_qd import checks
+from newton_qd.checks import message
 from newton_qd.envs.base import Env
-from newton_qd.envs.options import check_count, check_positive
 from newton_qd.errors import FaultError
 from newton_qd.gradients.doctor_input import (
     checked_genotypes,
@@ -73,11 +74,11 @@ def diagnose_gradients(
         ValueError: A setting is out of its range, or the environment in float32.
         FaultError: A world is at fault, or too many of its noisy samples are.
     """
-    check_count("worlds", worlds)
-    check_count("directions", directions)
-    check_count("samples", samples, 2)
-    check_count("seed", seed, 0, 2**32 - 1)
-    check_positive("sigma", sigma)
+    checks.integer("worlds", worlds)
+    checks.integer("directions", directions)
+    checks.integer("samples", samples, least=2)
+    checks.integer("seed", seed, least=0, most=2**32 - 1)
+    checks.number("sigma", sigma, above=0)
     horizons = checked_horizons(horizons)
     with jax.enable_x64(True):
         made = made_env(env)
@@ -111,8 +112,12 @@ def _report(
     mixed, slopes, sound = take_samples(subject, genotypes, centre, noise, sigma, ends)
     if (sound < 2).any():
         raise FaultError(
-            f"sigma={sigma!r}: fewer than two pairs of noisy samples of a world stay "
-            "sound; allowed: less noise, or more samples"
+            message(
+                "sigma",
+                sigma,
+                "less noise, or more samples",
+                why="fewer than two pairs of noisy samples of a world stay sound",
+            )
         )
     return GradientReport(
         name=name,

@@ -9,8 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from newton_qd import checks
+from newton_qd.checks import Fact, message
 from newton_qd.envs.base import Env
-from newton_qd.envs.options import check_count
 from newton_qd.errors import FaultError
 from newton_qd.registry import create
 from newton_qd.types import Genotype, Policy
@@ -25,11 +26,15 @@ def refuse_faults(faulty: np.ndarray) -> None:
     worlds = faulty.any(axis=1)
     if worlds.any():
         step = int(faulty.any(axis=0).argmax()) + 1
-        raise FaultError(
-            f"genotypes: {np.sum(worlds)} of {np.size(worlds)} worlds are at fault, "
-            f"the first one in control step {step}; allowed: those that stay sound "
-            "over the longest horizon (newton_qd.check says what went wrong)"
+        given = Fact(
+            f"{np.sum(worlds)} of {np.size(worlds)} worlds at fault, the first one in "
+            f"control step {step}"
         )
+        allowed = (
+            "those that stay sound over the longest horizon (newton_qd.check says what "
+            "went wrong)"
+        )
+        raise FaultError(message("genotypes", given, allowed))
 
 
 def checked_horizons(horizons: Sequence[int] | np.ndarray) -> tuple[int, ...]:
@@ -39,14 +44,14 @@ def checked_horizons(horizons: Sequence[int] | np.ndarray) -> tuple[int, ...]:
         TypeError: They are no sequence.
         ValueError: They are no ascending integers.
     """
-    allowed = f"horizons={horizons!r}: allowed: ascending integers from 1"
+    refusal = message("horizons", horizons, "ascending integers from 1")
     if isinstance(horizons, str) or not isinstance(horizons, (Sequence, np.ndarray)):
-        raise TypeError(allowed)
-    for steps in horizons:
-        check_count("every one of horizons", steps)
+        raise TypeError(refusal)
+    for index, steps in enumerate(horizons):
+        checks.integer(f"horizons[{index}]", steps)
     found = tuple(int(steps) for steps in horizons)
     if not found or not all(a < b for a, b in itertools.pairwise(found)):
-        raise ValueError(allowed)
+        raise ValueError(refusal)
     return found
 
 
@@ -60,31 +65,27 @@ def checked_genotypes(
             are no actions (worlds, steps, nu) for all steps.
     """
     if genotypes is None:
-        raise ValueError("genotypes=None: allowed with a policy: what it acts by")
+        raise ValueError(message("genotypes", None, "with a policy: what it acts by"))
     dtype = env.dtype
     arrays = jax.tree.map(np.asarray, genotypes)
     genotypes = jax.tree.map(
         lambda x: jnp.asarray(x, dtype if x.dtype.kind == "f" else None), arrays
     )
     shapes = [np.shape(x) for x in jax.tree.leaves(genotypes)]
+    given = Fact(f"leaves of shapes {shapes}")
     worlds = {shape[:1] for shape in shapes}
     if len(worlds) != 1 or worlds & {(), (0,)}:
-        raise ValueError(
-            f"genotypes: leaves of shapes {shapes} given; allowed: (worlds, ...) each"
-        )
+        raise ValueError(message("genotypes", given, "(worlds, ...) each"))
     if policy is not None:
         return genotypes
     plan = (length, env.action_size)
     if len(shapes) > 1 or len(shapes[0]) != 3 or shapes[0][2] != plan[1]:
-        raise ValueError(
-            f"genotypes: leaves of shapes {shapes} given without a policy; allowed: "
-            f"actions (worlds, steps, {plan[1]})"
-        )
+        allowed = f"without a policy: actions (worlds, steps, {plan[1]})"
+        raise ValueError(message("genotypes", given, allowed))
     if shapes[0][1] < plan[0]:
-        raise ValueError(
-            f"genotypes: plans of {shapes[0][1]} steps given; allowed: at least "
-            f"{plan[0]}, the longest of horizons"
-        )
+        given = Fact(f"plans of {shapes[0][1]} steps")
+        allowed = f"at least {plan[0]}, the longest of horizons"
+        raise ValueError(message("genotypes", given, allowed))
     return jax.tree.map(lambda x: jnp.asarray(x[:, : plan[0]], dtype), genotypes)
 
 
@@ -98,10 +99,11 @@ def made_env(env: Env | str) -> Env:
     if isinstance(env, str):
         return create(env, episode_length=None, auto_reset=False, dtype="float64")
     if not hasattr(env, "step"):
-        raise TypeError(f"env={env!r}: allowed: a name, or an environment")
+        raise TypeError(message("env", env, "a name, or an environment"))
     if env.dtype != np.float64:
-        raise ValueError(
-            f"env: in {env.dtype}; allowed: float64, as create({env.name!r}, "
-            "dtype='float64', auto_reset=False) under jax.enable_x64(True)"
+        allowed = (
+            f"float64, as create({env.name!r}, dtype='float64', auto_reset=False) "
+            "under jax.enable_x64(True)"
         )
+        raise ValueError(message("env", Fact(f"dtype {env.dtype}"), allowed))
     return env

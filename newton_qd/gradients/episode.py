@@ -12,7 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from newton_qd.envs.options import check_count, check_flag
+from newton_qd import checks
+from newton_qd.checks import Fact, message
 from newton_qd.envs.state import select
 from newton_qd.extractors import Trajectories
 from newton_qd.gradients.exact import EpisodeGradient, EpisodeGradients, differentiate
@@ -116,23 +117,17 @@ class Episode:
 
     def __post_init__(self) -> None:
         """Checks every value."""
-        check_count("episode_length", self.episode_length)
-        if not hasattr(self.env, "step"):
-            raise TypeError(
-                f"env={self.env!r}: allowed: an environment, as create() makes it"
-            )
+        checks.integer("episode_length", self.episode_length)
+        checks.environment(self.env)
         for name, needed in (
-            ("policy", "None, or a function of parameters and an observation"),
-            ("descriptor_extractor", "None, or a function of transitions and a mask"),
+            ("policy", "a function of parameters and an observation"),
+            ("descriptor_extractor", "a function of transitions and a mask"),
             ("unravel", "a function of a genotype"),
         ):
-            value = getattr(self, name)
-            optional = name != "unravel" and value is None
-            if not (optional or callable(value)):
-                raise TypeError(f"{name}: got {value!r}; allowed: {needed}")
-        if not isinstance(self.options, GradientOptions):
-            raise TypeError(f"options={self.options!r}: allowed: GradientOptions")
-        check_flag("transitions", self.transitions)
+            optional = name != "unravel"
+            checks.function(name, getattr(self, name), needed, optional=optional)
+        checks.instance("options", self.options, GradientOptions, "GradientOptions")
+        checks.flag("transitions", self.transitions)
 
     def __call__(
         self, genotype: Genotype, start: Start, params: Params = None, /
@@ -313,30 +308,27 @@ class Episode:
     def _check_first(self, first: Any) -> None:
         """Raises for what no episode can begin from."""
         if not hasattr(first, "reward"):
-            raise TypeError(
-                f"start: {type(first).__name__} given; allowed: a key of jax.random, "
-                "or a state of the environment"
-            )
+            allowed = "a key of jax.random, or a state of the environment"
+            raise TypeError(message("start", first, allowed))
         if jnp.ndim(first.reward):
-            raise ValueError(
-                f"start: a state of a batch of shape {jnp.shape(first.reward)} given; "
-                "allowed: of one world, under jax.vmap for more"
-            )
+            given = Fact(f"a state of a batch of shape {jnp.shape(first.reward)}")
+            allowed = "of one world, under jax.vmap for more"
+            raise ValueError(message("start", given, allowed))
         described = self.descriptor_extractor is not None or self.transitions
         if described and "state_descriptor" not in first.info:
-            raise ValueError(
-                "env: its states have no state descriptor; allowed: QD tasks, as "
-                "ant_uni, or descriptor_extractor=None without transitions"
+            given = Fact("states with no state descriptor")
+            allowed = (
+                "QD tasks, as ant_uni, or descriptor_extractor=None without transitions"
             )
+            raise ValueError(message("env", given, allowed))
 
     def _plan(self, parameters: PyTree) -> jax.Array:
         """Open-loop actions (episode_length, nu)."""
         shape = (self.episode_length, self.env.action_size)
         if np.size(parameters) != math.prod(shape):
-            raise ValueError(
-                f"genotype: shape {np.shape(parameters)} given; allowed: actions of "
-                f"shape {shape} for each world"
-            )
+            given = Fact(f"shape {np.shape(parameters)}")
+            allowed = f"actions of shape {shape} for each world"
+            raise ValueError(message("genotype", given, allowed))
         return jnp.asarray(parameters).reshape(shape)
 
     def _advance(

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from newton_qd.envs.options import check_positive, is_number
+from newton_qd import checks
 from newton_qd.types import PyTree
 
 Tree = TypeVar("Tree")
@@ -54,15 +54,9 @@ class GradientOptions:
     def __post_init__(self) -> None:
         """Checks every value."""
         for name in ("window", "checkpoint_every"):
-            value = getattr(self, name)
-            whole = isinstance(value, int) and not isinstance(value, bool)
-            if value is not None and not (whole and value >= 1):
-                raise ValueError(f"{name}={value!r}: allowed: None, integers from 1")
-        check_positive("clip", self.clip, optional=True)
-        if not is_number(self.discount):
-            raise TypeError(f"discount={self.discount!r}: allowed: 0 to 1")
-        if not 0 <= self.discount <= 1:
-            raise ValueError(f"discount={self.discount!r}: allowed: 0 to 1")
+            checks.integer(name, getattr(self, name), most=None, optional=True)
+        checks.number("clip", self.clip, above=0, optional=True)
+        checks.number("discount", self.discount, least=0, most=1)
 
     @property
     def exact(self) -> bool:

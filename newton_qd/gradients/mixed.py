@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from newton_qd.envs.options import check_count, check_positive
+from newton_qd import checks
 from newton_qd.envs.state import select
 from newton_qd.gradients.exact import EpisodeGradients, finite_rows
 from newton_qd.gradients.outcome import Outcome
@@ -60,9 +60,9 @@ def check_mixture(samples: int, sigma: float, tolerance: float = math.inf) -> No
         TypeError: A setting is no number.
         ValueError: It is out of its range.
     """
-    check_count("samples", samples, 2)
-    check_positive("sigma", sigma)
-    check_positive("tolerance", tolerance, endless=True)
+    checks.integer("samples", samples, least=2)
+    checks.number("sigma", sigma, above=0)
+    checks.number("tolerance", tolerance, above=0, endless=True)
 
 
 def mixed_gradients(

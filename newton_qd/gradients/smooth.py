@@ -5,8 +5,8 @@ from __future__ import annotations
 import copy
 from typing import Any
 
+from newton_qd import checks
 from newton_qd.envs.base import Env
-from newton_qd.envs.options import check_flag, check_positive
 from newton_qd.wrappers import FeetContactWrapper
 from newton_qd.wrappers.base import Wrapper
 
@@ -33,10 +33,9 @@ def with_smooth_descriptor(
             ``straight_through`` neither true nor false.
         ValueError: ``width`` is not finite and above 0.
     """
-    if not hasattr(env, "step"):
-        raise TypeError(f"env={env!r}: allowed: an environment, as create() makes it")
-    check_positive("width", width)
-    check_flag("straight_through", straight_through)
+    checks.environment(env)
+    checks.number("width", width, above=0)
+    checks.flag("straight_through", straight_through)
     if not isinstance(env, Wrapper):
         return env
     if isinstance(env, FeetContactWrapper):

@@ -6,8 +6,9 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
+from newton_qd import checks
+from newton_qd.checks import Fact, message
 from newton_qd.envs.base import Env, PhysicsEnv
-from newton_qd.envs.options import check_positive
 from newton_qd.robots import Material
 
 _LENGTHS = ("static_penetration", "smoothing", "slip_velocity")
@@ -29,9 +30,8 @@ def softened(material: Material, factor: float) -> Material:
         TypeError: ``factor`` is no number, or ``material`` no material.
         ValueError: ``factor`` is not finite and above 0.
     """
-    check_positive("factor", factor)
-    if not isinstance(material, Material):
-        raise TypeError(f"material={material!r}: allowed: newton_qd.robots.Material")
+    checks.number("factor", factor, above=0)
+    checks.instance("material", material, Material, "newton_qd.robots.Material")
     changes = {name: factor * getattr(material, name) for name in _LENGTHS + _ANGLES}
     return dataclasses.replace(material, **changes)
 
@@ -51,15 +51,18 @@ def soft_to_stiff(env: Env, factors: Sequence[float] = (4, 2, 1)) -> tuple[Any, 
         ValueError: A factor is not finite and above 0.
         NotImplementedError: The environment inside is not a simulated robot.
     """
-    if not hasattr(env, "unwrapped"):
-        raise TypeError(f"env={env!r}: allowed: an environment, as create() makes it")
+    checks.environment(env, needs="unwrapped")
     if not isinstance(factors, Sequence) or isinstance(factors, str):
-        raise TypeError(f"factors={factors!r}: allowed: a sequence of numbers above 0")
+        raise TypeError(message("factors", factors, "a sequence of numbers above 0"))
     base = env.unwrapped
     if not isinstance(base, PhysicsEnv):
         raise NotImplementedError(
-            f"env: {env.name} is not a simulated robot; allowed: environments whose "
-            "unwrapped is a PhysicsEnv"
+            message(
+                "env",
+                Fact(env.name),
+                "environments whose unwrapped is a PhysicsEnv",
+                why="not a simulated robot",
+            )
         )
     material = base.robot.material
     return tuple(env.with_material(softened(material, factor)) for factor in factors)

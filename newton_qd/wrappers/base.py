@@ -8,11 +8,26 @@ from typing import Any
 
 import numpy as np
 
+from newton_qd.checks import Fact, message
 from newton_qd.envs.base import Env
 from newton_qd.envs.state import State
 from newton_qd.robots import Material
 from newton_qd.scenes import Scene
 from newton_qd.types import Action, Params, RNGKey
+
+
+def unsupported(env: Env, env_name: str, allowed: str) -> NotImplementedError:
+    """Returns the error of a wrapper that an environment does not fit into.
+
+    Args:
+        env: The environment.
+        env_name: Its name.
+        allowed: What does fit.
+    """
+    refusal = message("env", Fact(type(env.unwrapped).__name__), allowed)
+    return NotImplementedError(
+        f"This wrapper does not support {env_name} yet. {refusal}"
+    )
 
 
 class Wrapper(Env):

@@ -6,8 +6,9 @@ import math
 
 import jax.numpy as jnp
 
+from newton_qd import checks
+from newton_qd.checks import message
 from newton_qd.envs.base import Env
-from newton_qd.envs.options import is_number
 from newton_qd.envs.state import State
 from newton_qd.types import Action, Params, RNGKey
 from newton_qd.wrappers.base import Wrapper
@@ -30,12 +31,11 @@ class ClipRewardWrapper(Wrapper):
             clip_max: Highest reward, not below ``clip_min``; ``None``: no limit.
         """
         for name, value in (("clip_min", clip_min), ("clip_max", clip_max)):
-            if value is not None and (not is_number(value) or math.isnan(value)):
-                raise ValueError(f"{name}={value!r}: allowed: None, or a number")
+            checks.number(name, value, endless=True, optional=True, error=ValueError)
         if clip_min is not None and clip_max is not None and clip_min > clip_max:
+            allowed = "clip_min not above clip_max"
             raise ValueError(
-                f"clip_min={clip_min!r}, clip_max={clip_max!r}: allowed: clip_min not "
-                "above clip_max"
+                message("clip_min, clip_max", (clip_min, clip_max), allowed)
             )
         super().__init__(env)
         self._low = -math.inf if clip_min is None else float(clip_min)

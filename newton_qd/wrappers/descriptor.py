@@ -9,6 +9,7 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
+from newton_qd.checks import message
 from newton_qd.envs.base import Env, QDEnv
 from newton_qd.envs.state import State
 from newton_qd.extractors import Extractor, get_mean_state_descriptor
@@ -75,9 +76,9 @@ class DescriptorWrapper(Wrapper, QDEnv):
         """Returns what describes a state of one world, or raises for its shape."""
         described = jnp.asarray(self.describe(state), self.dtype)
         if described.shape != (self.state_descriptor_length,):
+            allowed = f"shape {(self.state_descriptor_length,)}, as its limits"
             raise ValueError(
-                f"{type(self).__name__}.describe: returned shape {described.shape}; "
-                f"allowed: {(self.state_descriptor_length,)}, as its limits"
+                message(f"{type(self).__name__}.describe", described, allowed)
             )
         return described
 

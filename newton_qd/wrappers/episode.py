@@ -5,9 +5,9 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from newton_qd import checks
 from newton_qd.envs.base import Env
 from newton_qd.envs.inputs import require_state
-from newton_qd.envs.options import check_count
 from newton_qd.envs.state import State
 from newton_qd.types import Action, Params, RNGKey
 from newton_qd.wrappers.base import Wrapper
@@ -26,11 +26,8 @@ class EpisodeWrapper(Wrapper):
     """
 
     def __init__(self, env: Env, episode_length: int, action_repeat: int) -> None:
-        for name, value in (
-            ("episode_length", episode_length),
-            ("action_repeat", action_repeat),
-        ):
-            check_count(name, value)
+        checks.integer("episode_length", episode_length)
+        checks.integer("action_repeat", action_repeat)
         super().__init__(env)
         self.episode_length = int(episode_length)
         self.action_repeat = int(action_repeat)

@@ -7,6 +7,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
+from newton_qd.checks import Fact, message
 from newton_qd.envs.state import State
 from newton_qd.types import Action, Metrics, Params, RNGKey
 from newton_qd.wrappers.base import Wrapper
@@ -74,7 +75,9 @@ def with_reward_metric(state: State) -> State:
 def require_steps(state: State, wrapper: str) -> None:
     """Raises where no ``EpisodeWrapper`` counts steps."""
     if "steps" not in state.info:
-        raise ValueError(
-            f"info['steps'] is missing: {wrapper} needs an EpisodeWrapper inside "
-            "(episode_length given to create)"
+        given = Fact("a state without info['steps']")
+        allowed = (
+            f"an environment with an EpisodeWrapper inside {wrapper} (episode_length "
+            "given to create)"
         )
+        raise ValueError(message("env", given, allowed))

@@ -5,12 +5,14 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from newton_qd import checks
+from newton_qd.checks import message
 from newton_qd.envs.base import Env, PhysicsEnv
-from newton_qd.envs.options import check_positive
 from newton_qd.envs.state import State
 from newton_qd.extractors import get_feet_contact_proportion
 from newton_qd.physics.system import PhysicsState
 from newton_qd.types import Descriptor
+from newton_qd.wrappers.base import unsupported
 from newton_qd.wrappers.descriptor import DescriptorWrapper
 
 
@@ -48,16 +50,14 @@ class FeetContactWrapper(DescriptorWrapper):
         """
         robot = env.unwrapped
         if not isinstance(robot, PhysicsEnv) or not len(robot.system.feet):
-            raise NotImplementedError(
-                f"This wrapper does not support {env_name} yet. Allowed: simulated "
-                "robots with feet"
-            )
-        check_positive("smooth_width", smooth_width, optional=True)
+            raise unsupported(env, env_name, "simulated robots with feet")
+        checks.number("smooth_width", smooth_width, above=0, optional=True)
         if straight_through and smooth_width is None:
-            raise ValueError(
-                "straight_through=True, smooth_width=None: allowed: a width above 0, "
-                "over which the gradient is smooth"
+            allowed = (
+                "a width above 0 with straight_through=True, over which the gradient "
+                "is smooth"
             )
+            raise ValueError(message("smooth_width", None, allowed))
         if smooth_width is not None:
             env = env.with_base(lambda base: _with_feet_width(base, smooth_width))
         super().__init__(env, env_name)

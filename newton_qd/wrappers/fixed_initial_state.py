@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
+from newton_qd.checks import message
 from newton_qd.envs.base import Env
 from newton_qd.envs.state import State
 from newton_qd.types import RNGKey
-from newton_qd.wrappers.base import Wrapper
+from newton_qd.wrappers.base import Wrapper, unsupported
 
 
 class FixedInitialStateWrapper(Wrapper):
@@ -34,16 +35,14 @@ class FixedInitialStateWrapper(Wrapper):
         """
         base = env.unwrapped
         if get_obs_fn is not None:
-            raise TypeError(
-                f"get_obs_fn={get_obs_fn!r}: allowed: None; a function of (qp, info, "
-                "action) goes to newton_qd.brax_views.FixedInitialStateWrapper"
+            allowed = (
+                "None; a function of (qp, info, action) goes to "
+                "newton_qd.brax_views.FixedInitialStateWrapper"
             )
+            raise TypeError(message("get_obs_fn", get_obs_fn, allowed))
         if not callable(getattr(base, "fixed_state", None)):
-            raise NotImplementedError(
-                f"This wrapper does not support {base_env_name or base.name} yet. "
-                f"Given: {type(base).__name__}; allowed: environments with a method "
-                "fixed_state(), as every PhysicsEnv"
-            )
+            allowed = "environments with a method fixed_state(), as every PhysicsEnv"
+            raise unsupported(env, base_env_name or base.name, allowed)
         self._env_name = base_env_name
         self._effective = env is base
         super().__init__(env if self._effective else env.with_base(self._around))

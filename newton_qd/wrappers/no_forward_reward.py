@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from newton_qd.checks import Fact, message
 from newton_qd.envs.base import Env, PhysicsEnv
 from newton_qd.envs.state import State
 from newton_qd.types import Action, Params
-from newton_qd.wrappers.base import Wrapper
+from newton_qd.wrappers.base import Wrapper, unsupported
 
 
 class NoForwardRewardWrapper(Wrapper):
@@ -22,18 +23,19 @@ class NoForwardRewardWrapper(Wrapper):
         base = env.unwrapped
         name = base.forward_reward_name if isinstance(base, PhysicsEnv) else None
         if name is None:
-            raise NotImplementedError(
-                f"This wrapper does not support {env_name} yet. Given: "
-                f"{type(base).__name__}; allowed: simulated robots whose class names "
-                "the metric of its forward reward as forward_reward_name"
+            allowed = (
+                "simulated robots whose class names the metric of its forward reward "
+                "as forward_reward_name"
             )
+            raise unsupported(env, env_name, allowed)
         repeat = getattr(env, "action_repeat", 1)
         if repeat != 1:
-            raise ValueError(
-                f"env: repeats actions {repeat} times, and its metrics are of the last "
-                "repetition alone; allowed: an environment that does not, around which "
-                "EpisodeWrapper may go"
+            given = Fact(f"an environment that repeats actions {repeat} times")
+            allowed = (
+                "one that does not, as metrics are of the last repetition alone; "
+                "EpisodeWrapper may go around it"
             )
+            raise ValueError(message("env", given, allowed))
         super().__init__(env)
         self._forward_reward = name
 

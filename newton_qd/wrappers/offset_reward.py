@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from newton_qd import checks
 from newton_qd.envs.base import Env
-from newton_qd.envs.options import check_number
 from newton_qd.envs.state import State
 from newton_qd.types import Action, Params, RNGKey
 from newton_qd.wrappers.base import Wrapper
@@ -19,7 +19,7 @@ class OffsetRewardWrapper(Wrapper):
             env: The environment; an action that it repeats gets the offset once.
             offset: What is added, as ``newton_qd.tables.reward_offset[name]``.
         """
-        check_number("offset", offset)
+        checks.number("offset", offset)
         super().__init__(env)
         self._offset = float(offset)
 

@@ -8,12 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from newton_qd.checks import Fact, message
 from newton_qd.envs.base import Env, PhysicsEnv
 from newton_qd.envs.state import State
 from newton_qd.physics.system import JointKind, System
 from newton_qd.scenes import Scene
 from newton_qd.types import Action, Params, RNGKey
-from newton_qd.wrappers.base import Wrapper
+from newton_qd.wrappers.base import Wrapper, unsupported
 
 
 class SceneTaskWrapper(Wrapper):
@@ -43,15 +44,10 @@ class SceneTaskWrapper(Wrapper):
         """
         base = env.unwrapped
         if not isinstance(base, PhysicsEnv) or not _floats(base.system):
-            raise NotImplementedError(
-                f"This wrapper does not support {env_name} yet. Given: "
-                f"{type(base).__name__}; allowed: simulated robots whose torso floats"
-            )
+            raise unsupported(env, env_name, "simulated robots whose torso floats")
         if base.system.scene is not None:
-            raise ValueError(
-                f"env: {env_name}, whose robot stands in the scene "
-                f"{base.system.scene.name!r} already; allowed: robots without a scene"
-            )
+            given = Fact(f"{env_name} in the scene {base.system.scene.name!r}")
+            raise ValueError(message("env", given, "robots without a scene"))
         self._effective = env is base
         if self._effective:
             env = base.with_scene(self.scene)

@@ -6,8 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from newton_qd import checks
+from newton_qd.checks import Fact, message
 from newton_qd.envs.base import Env
-from newton_qd.envs.options import check_count
 from newton_qd.envs.state import State
 from newton_qd.types import Action, Params, RNGKey
 from newton_qd.wrappers.base import Wrapper
@@ -21,14 +22,13 @@ class VectorWrapper(Wrapper):
     """
 
     def __init__(self, env: Env, batch_size: int) -> None:
-        check_count("batch_size", batch_size)
+        checks.integer("batch_size", batch_size)
         inside = env
         while isinstance(inside, Wrapper):
             if isinstance(inside, VectorWrapper):
-                raise ValueError(
-                    f"env: {inside.batch_size} worlds already; allowed: environments "
-                    "of one world (jax.vmap makes batches of batches)"
-                )
+                given = Fact(f"{inside.batch_size} worlds")
+                allowed = "environments of one world (jax.vmap nests batches)"
+                raise ValueError(message("env", given, allowed))
             inside = inside.env
         super().__init__(env)
         self.batch_size = int(batch_size)
@@ -47,21 +47,20 @@ class VectorWrapper(Wrapper):
         """
         batch = jnp.shape(state.done)
         if len(batch) != 1:
-            raise ValueError(
-                f"state: done has shape {batch}; allowed: (batch,), as after a reset "
-                "of this environment"
-            )
-        allowed = f"allowed: an array of shape {(*batch, self.action_size)}"
-        if not isinstance(action, (jax.Array, np.ndarray)):
-            raise TypeError(f"action: type {type(action).__name__} given; {allowed}")
-        if action.shape != (*batch, self.action_size):
-            raise ValueError(f"action: shape {action.shape} given; {allowed}")
+            allowed = "(batch,), as after a reset of this environment"
+            raise ValueError(message("state: shape of done", batch, allowed))
+        shape = (*batch, self.action_size)
+        allowed = f"an array of shape {shape}"
+        checks.instance("action", action, (jax.Array, np.ndarray), allowed)
+        if action.shape != shape:
+            raise ValueError(message("action", action, allowed))
         for leaf in jax.tree.leaves(params):
             if jnp.shape(leaf)[:1] != batch:
-                raise ValueError(
-                    f"params: an array of shape {jnp.shape(leaf)} given; allowed: the "
-                    f"batch axis {batch} in front of every one, as in default_params"
+                allowed = (
+                    f"the batch axis {batch} in front of every array, as in "
+                    "default_params"
                 )
+                raise ValueError(message("params", leaf, allowed))
         return jax.vmap(self.env.step)(state, action, params)
 
     @property

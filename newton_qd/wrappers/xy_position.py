@@ -8,10 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from newton_qd.checks import message
 from newton_qd.envs.base import Env, PhysicsEnv
 from newton_qd.envs.state import State
 from newton_qd.extractors import get_final_xy_position
 from newton_qd.types import Descriptor
+from newton_qd.wrappers.base import unsupported
 from newton_qd.wrappers.descriptor import DescriptorWrapper
 
 Limits = Sequence[float] | np.ndarray | jax.Array
@@ -49,18 +51,13 @@ class XYPositionWrapper(DescriptorWrapper):
                 below the highest.
         """
         if not isinstance(env.unwrapped, PhysicsEnv):
-            raise NotImplementedError(
-                f"This wrapper does not support {env_name} yet. Given: "
-                f"{type(env.unwrapped).__name__}; allowed: simulated robots"
-            )
+            raise unsupported(env, env_name, "simulated robots")
         super().__init__(env, env_name)
         self._low = _limit("minval", minval, -np.inf)
         self._high = _limit("maxval", maxval, np.inf)
         if not np.all(self._low < self._high):
-            raise ValueError(
-                f"minval={minval!r}, maxval={maxval!r}: allowed: minval below maxval "
-                "in x and in y"
-            )
+            allowed = "minval below maxval in x and in y"
+            raise ValueError(message("minval, maxval", (minval, maxval), allowed))
 
     def describe(self, state: State) -> Descriptor:
         """Returns the position (2,) of the torso within the limits [m]."""
@@ -93,11 +90,11 @@ def _limit(name: str, given: Limits | None, unlimited: float) -> np.ndarray:
     """Returns a limit as (2,) numbers, or raises what is wrong with it."""
     if given is None:
         return np.full(2, unlimited)
-    allowed = "allowed: None, or two finite numbers"
+    refusal = message(name, given, "None, or two finite numbers")
     try:
         limit = np.asarray(given, np.float64)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{name}={given!r}: {allowed}") from error
+        raise ValueError(refusal) from error
     if limit.shape != (2,) or not np.all(np.isfinite(limit)):
-        raise ValueError(f"{name}={given!r}: {allowed}")
+        raise ValueError(refusal)
     return limit

@@ -1,0 +1,375 @@
+"""Checks of arguments, and the one grammar of errors: NAME: got VALUE; allowed: WHAT.
+
+Every check returns ``None`` for a value that is allowed. It raises ``TypeError`` for a
+wrong type and ``ValueError`` for a wrong value, or ``error`` for both where a caller
+gives that class.
+"""
+
+from __future__ import annotations
+
+import math
+import numbers
+import sys
+from collections.abc import Collection
+from typing import Any, TypeVar
+
+import numpy as np
+
+_LONGEST = 100  # characters of a value in an error
+_MOST = 2**31 - 1  # JAX counts in 32 bits
+_FLOATS = ("float32", "float64")
+
+Error = type[Exception]
+Value = TypeVar("Value")
+
+
+class Fact(str):
+    """Words that stand for a value in an error, such as ``"3 entries"``."""
+
+    __slots__ = ()
+    __repr__ = str.__str__
+
+
+def message(name: str, value: Any, allowed: str, *, why: str = "") -> str:
+    """Returns the text of an error about an argument.
+
+    Args:
+        name: What is wrong, as the caller knows it: an argument, or a part of one.
+        value: What was given, or a :class:`Fact` that describes it.
+        allowed: What may be given.
+        why: What is wrong with the value, where ``allowed`` does not say it.
+    """
+    got = f"{shown(value)}, {why}" if why else shown(value)
+    return f"{name}: got {got}; allowed: {allowed}"
+
+
+def shown(value: Any) -> str:
+    """Returns a value as an error shows it: an array by its shape, long text cut."""
+    if isinstance(value, Fact):
+        return value
+    if is_array(value):
+        return f"an array of shape {tuple(value.shape)}, {value.dtype}"
+    text = repr(value)
+    if len(text) <= _LONGEST and "\n" not in text:
+        return text
+    text = " ".join(text.split())
+    cut = f"{text[: _LONGEST - 3]}..." if len(text) > _LONGEST else text
+    return f"{cut} ({type(value).__name__})"
+
+
+def listed(names: Collection[Any], otherwise: str = "none") -> str:
+    """Returns names as an error lists them, or other words where there are none."""
+    return ", ".join(str(name) for name in names) or otherwise
+
+
+def is_array(value: Any) -> bool:
+    """Returns whether a value is an array of NumPy or JAX, traced ones included."""
+    if isinstance(value, (type, np.generic)):
+        return False
+    return hasattr(value, "shape") and hasattr(value, "dtype")
+
+
+def is_number(value: Any) -> bool:
+    """Returns whether a value is a real number; ``True`` and ``False`` are none."""
+    return isinstance(value, numbers.Real) and not isinstance(value, bool)
+
+
+def is_integer(value: Any) -> bool:
+    """Returns whether a value is of an integer type; ``True`` and ``False`` are not."""
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+
+
+def number(
+    name: str,
+    value: Any,
+    *,
+    least: float | None = None,
+    above: float | None = None,
+    most: float | None = None,
+    below: float | None = None,
+    endless: bool = False,
+    optional: bool = False,
+    error: Error | None = None,
+) -> None:
+    """Refuses what is not a real number within bounds.
+
+    Args:
+        name: Name of the argument.
+        value: What was given.
+        least: Smallest number that is allowed.
+        above: Bound that is not allowed itself.
+        most: Largest number that is allowed.
+        below: Bound that is not allowed itself.
+        endless: Whether it may be infinite.
+        optional: Whether it may be ``None``.
+        error: Class to raise instead of both.
+
+    Raises:
+        TypeError: It is no number.
+        ValueError: It is NaN, infinite or out of bounds.
+    """
+    if optional and value is None:
+        return
+    numeric = is_number(value)
+    if (
+        numeric
+        and (abs(value) <= sys.float_info.max or (endless and not math.isnan(value)))
+        and (least is None or value >= least)
+        and (above is None or value > above)
+        and (most is None or value <= most)
+        and (below is None or value < below)
+    ):
+        return
+    bounded = (least, above) != (None, None) and (most, below) != (None, None)
+    kind = "numbers" if endless or bounded else "finite numbers"
+    allowed = _none(optional) + kind + _bounds(least, above, most, below)
+    raise (error or (ValueError if numeric else TypeError))(
+        message(name, value, allowed)
+    )
+
+
+def integer(
+    name: str,
+    value: Any,
+    *,
+    least: int | None = 1,
+    most: int | None = _MOST,
+    optional: bool = False,
+    error: Error = ValueError,
+) -> None:
+    """Refuses what is not an integer within bounds.
+
+    ``2.0`` and ``"2"`` are wrong values as ``0`` is, so all raise the same.
+
+    Args:
+        name: Name of the argument.
+        value: What was given.
+        least: Smallest integer that is allowed; ``None``: no bound.
+        most: Largest; by default what JAX counts with. ``None``: no bound.
+        optional: Whether it may be ``None``.
+        error: Class to raise.
+
+    Raises:
+        ValueError: It is no integer, or out of bounds.
+    """
+    if optional and value is None:
+        return
+    if (
+        is_integer(value)
+        and (least is None or value >= least)
+        and (most is None or value <= most)
+    ):
+        return
+    allowed = _none(optional) + "integers" + _bounds(least, None, most, None)
+    raise error(message(name, value, allowed))
+
+
+def integers(
+    name: str,
+    values: Any,
+    *,
+    least: int | None = 1,
+    most: int | None = _MOST,
+    error: Error | None = None,
+) -> None:
+    """Refuses what is not a tuple or list of integers within bounds.
+
+    Raises:
+        TypeError: It is no tuple and no list.
+        ValueError: An entry is no integer, or out of bounds.
+    """
+    instance(name, values, (tuple, list), "a tuple of integers", error=error)
+    for index, value in enumerate(values):
+        integer(
+            f"{name}[{index}]",
+            value,
+            least=least,
+            most=most,
+            error=error or ValueError,
+        )
+
+
+def interval(name: str, value: Any, *, error: Error | None = None) -> None:
+    """Refuses what is not two numbers, the lowest below the highest.
+
+    Raises:
+        TypeError: They are not two, or no numbers.
+        ValueError: The first is not below the second.
+    """
+    pair = isinstance(value, (tuple, list, np.ndarray)) and len(value) == 2
+    numeric = pair and all(is_number(end) for end in value)
+    if not numeric or not value[0] < value[1]:
+        raise (error or (ValueError if numeric else TypeError))(
+            message(name, value, "two numbers, lowest below highest")
+        )
+
+
+def flag(name: str, value: Any, *, error: Error = TypeError) -> None:
+    """Refuses what is neither ``True`` nor ``False``, nor 1 or 0.
+
+    Raises:
+        TypeError: It is something else.
+    """
+    if not isinstance(value, (bool, np.bool_, int, np.integer)) or value not in (0, 1):
+        raise error(message(name, value, "True, False"))
+
+
+def text(
+    name: str, value: Any, *, optional: bool = False, error: Error = ValueError
+) -> None:
+    """Refuses what is not text, or is empty.
+
+    Raises:
+        ValueError: It is something else, or empty.
+    """
+    if not (optional and value is None) and not (isinstance(value, str) and value):
+        raise error(message(name, value, f"{_none(optional)}text that is not empty"))
+
+
+def choice(
+    name: str, value: Any, allowed: Collection[Any], *, error: Error = ValueError
+) -> None:
+    """Refuses what is not one of some values.
+
+    Raises:
+        ValueError: It is something else.
+    """
+    if is_array(value) or value not in allowed:
+        raise error(message(name, value, listed(allowed)))
+
+
+def instance(
+    name: str,
+    value: Any,
+    kinds: type | tuple[type, ...],
+    allowed: str,
+    *,
+    optional: bool = False,
+    error: Error | None = None,
+) -> None:
+    """Refuses what is not of a class.
+
+    Args:
+        name: Name of the argument.
+        value: What was given.
+        kinds: Classes that are allowed.
+        allowed: They in words.
+        optional: Whether it may be ``None``.
+        error: Class to raise instead.
+
+    Raises:
+        TypeError: It is of another class.
+    """
+    if not (optional and value is None) and not isinstance(value, kinds):
+        raise (error or TypeError)(message(name, value, _none(optional) + allowed))
+
+
+def function(name: str, value: Any, allowed: str, *, optional: bool = False) -> None:
+    """Refuses what cannot be called.
+
+    Raises:
+        TypeError: It cannot.
+    """
+    if not (optional and value is None) and not callable(value):
+        raise TypeError(message(name, value, _none(optional) + allowed))
+
+
+def environment(value: Any, *, needs: str = "step") -> None:
+    """Refuses an ``env`` that is no environment, known by one of its attributes.
+
+    Raises:
+        TypeError: It has no such attribute.
+    """
+    if not hasattr(value, needs):
+        raise TypeError(message("env", value, "an environment, as create() makes it"))
+
+
+def precision(dtype: Any) -> np.dtype:
+    """Returns the type that a simulation computes in.
+
+    Raises:
+        ValueError: It is neither float32 nor float64, or is float64 while JAX would
+            round it to float32.
+    """
+    try:
+        found = np.dtype(dtype)
+    except TypeError:
+        found = None
+    if found is None or found.name not in _FLOATS:
+        raise ValueError(message("dtype", dtype, listed(_FLOATS)))
+    x64(found)
+    return found
+
+
+def x64(dtype: np.dtype) -> None:
+    """Refuses float64 where JAX would round it to float32 without an error.
+
+    Raises:
+        ValueError: ``dtype`` is float64 and JAX's 64-bit mode is off.
+    """
+    import jax
+
+    if dtype == np.float64 and not jax.config.read("jax_enable_x64"):
+        raise ValueError(
+            message(
+                "dtype",
+                Fact("'float64' while JAX x64 is off"),
+                "'float32', or jax.config.update('jax_enable_x64', True) at the start",
+            )
+        )
+
+
+def array(
+    name: str,
+    value: Value,
+    shape: tuple[int, ...],
+    dtype: Any,
+    *,
+    scalars: bool = False,
+) -> Value:
+    """Returns an array, strongly typed, or refuses it.
+
+    Args:
+        name: Name of the argument.
+        value: What was given.
+        shape: Shape that is allowed.
+        dtype: Type that is allowed; weakly typed numbers are converted to it.
+        scalars: Whether Python's numbers and weakly typed integers are allowed.
+
+    Raises:
+        TypeError: It is no array, or of another type.
+        ValueError: It has another shape.
+    """
+    import jax
+    import jax.numpy as jnp
+
+    dtype = np.dtype(dtype)
+    allowed = f"an array of shape {shape}, {dtype}"
+    kinds = (jax.Array, np.ndarray)
+    instance(
+        name, value, (*kinds, np.generic, int, float) if scalars else kinds, allowed
+    )
+    found: Any = jnp.asarray(value)
+    kind = jnp.number if scalars else jnp.floating
+    weak = found.weak_type and jnp.issubdtype(found.dtype, kind)
+    if found.dtype != dtype and not weak:
+        raise TypeError(message(name, found, allowed))
+    if found.shape != shape:
+        batch = " (for a batch, use jax.vmap or create(..., batch_size=...))"
+        raise ValueError(message(name, found, allowed + batch))
+    return found.astype(dtype)
+
+
+def _none(optional: bool) -> str:
+    return "None, or " if optional else ""
+
+
+def _bounds(least: Any, above: Any, most: Any, below: Any) -> str:
+    """Returns bounds in words, such as ``" from 0, below 1"``."""
+    low = f" from {least}" if least is not None else ""
+    low = f" above {above}" if above is not None else low
+    if most is not None:
+        return f"{low} to {most}" if low.startswith(" from") else f"{low} up to {most}"
+    if below is not None:
+        return f"{low}{',' if low else ''} below {below}"
+    return low
