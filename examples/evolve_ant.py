@@ -1,8 +1,8 @@
-"""Evolve gaits of an ant, look at the archive, and run its best policy.
+"""Evolve gaits of an ant, print the archive, and run its best policy.
 
     python examples/evolve_ant.py
 
-The command ``newton-qd evolve ant_uni`` does the first step, with files.
+The command ``newton-qd evolve ant_uni`` does the first step and writes files.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
-"""Trajectory optimization that ends in a repertoire of different gaits.
+"""Optimize sequences of actions into a repertoire of different gaits.
 
     python examples/gait_repertoire.py
 
-Genotypes are the actions of every control step; half of them lie along gradients.
+A genotype has the actions of every control step. Half of the offspring are steps along
+exact gradients.
 """
 
 from __future__ import annotations

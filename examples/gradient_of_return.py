@@ -1,9 +1,9 @@
-"""Climb the exact gradient of an ant's return, and look at that of its descriptor.
+"""Increase the return of ants by gradient ascent; print a descriptor's gradient.
 
     python examples/gradient_of_return.py
 
-Sixteen ants run open loop, each with actions of its own, and each climbs its own
-gradient: what comes out is sixteen gaits.
+Sixteen ants run without a policy, each with its own sequence of actions. Each follows
+its own gradient, so the result is sixteen gaits.
 """
 
 from __future__ import annotations

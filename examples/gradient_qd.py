@@ -1,4 +1,4 @@
-"""CMA-MEGA, fed with exact gradients through the physics, as an emitter of QDax.
+"""CMA-MEGA as an emitter of QDax, with exact gradients through the physics.
 
 python examples/gradient_qd.py
 """

@@ -1,4 +1,4 @@
-"""Four ants in a plain Newton loop, driven by joint forces.
+"""Simulate four ants in a Newton loop, with joint forces as controls.
 
 python examples/newton_loop.py
 """

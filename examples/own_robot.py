@@ -1,10 +1,10 @@
-"""A robot of one's own as QD tasks: its file, its spec, its names.
+"""Make QD tasks from your own robot: its URDF file, its spec, its names.
 
     python examples/own_robot.py [--env tripod_yard] [--iterations 40]
 
-``tripod.urdf`` has masses, joints and colliders; the spec says what a URDF cannot.
-``yard.urdf`` has the walls of the second task. A reward, an observation or a descriptor
-of one's own: docs/own_environment.md.
+``tripod.urdf`` has masses, joints and colliders. The spec has what a URDF file cannot
+describe. ``yard.urdf`` has the walls of the second task. docs/own_environment.md
+explains how to write your own reward, observation or descriptor.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ nq.register(
     healthy_z_range=(0.21, 1.0),
 )
 
-# The same robot among walls, described by where it comes to.
+# The same robot among walls; the descriptor is its final position.
 YARD = nq.Scene("yard", str(HERE / "yard.urdf"))
 LIMITS = {"minval": (-1.0, -4.0), "maxval": (8.0, 4.0)}
 nq.register(

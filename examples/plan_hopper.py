@@ -1,10 +1,10 @@
-"""Plan two seconds of a hopper's actions by gradient: it learns to run without falling.
+"""Optimize two seconds of a hopper's actions by gradient: it runs without falling.
 
     python examples/plan_hopper.py
 
-No gradient sees the jump at the end of an episode. The plans climb a reward that falls
-before the hopper does; what is printed is the return of the task itself. Needs optax,
-which comes with the extra ``qd``.
+No gradient sees the jump at the end of an episode. The optimized reward therefore
+decreases before the hopper falls. The printed return is that of the task itself. Needs
+optax, which comes with the extra ``qd``.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     settings = {"episode_length": arguments.steps, "unravel": jnp.tanh}
     cautious = Episode(
         Cautious(env),
-        # a step back takes off what a step adds to the gradient's size, and more
+        # the discount shrinks the gradient more than each step backwards grows it
         options=GradientOptions(window=100, discount=0.97, clip=100.0),
         **settings,
     )

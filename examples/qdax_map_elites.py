@@ -1,8 +1,9 @@
-"""MAP-Elites with QDax's own classes, written as for QDax itself.
+"""Run MAP-Elites with QDax's own classes.
 
     python examples/qdax_map_elites.py
 
-The first two lines after the imports are all that a script for QDax needs.
+A script for QDax needs only the two lines after the first imports: the import of
+``newton_qd.compat`` and ``install()``.
 """
 
 # QDax's annotations differ from what its functions take and return.

@@ -1,4 +1,4 @@
-"""PGA-ME (policy gradients of a learned critic) with QDax's own classes.
+"""Run PGA-ME (policy gradients of a learned critic) with QDax's own classes.
 
 python examples/qdax_pga_me.py
 """

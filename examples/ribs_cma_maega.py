@@ -1,4 +1,4 @@
-"""CMA-MAEGA with pyribs, on exact gradients: python examples/ribs_cma_maega.py."""
+"""CMA-MAEGA of pyribs with exact gradients: python examples/ribs_cma_maega.py."""
 
 from __future__ import annotations
 

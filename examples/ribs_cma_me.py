@@ -1,4 +1,4 @@
-"""CMA-ME with pyribs; this library evaluates the batches.
+"""CMA-ME of pyribs; this library evaluates the batches.
 
 python examples/ribs_cma_me.py
 """

@@ -1,8 +1,8 @@
-"""One batch of policies, evaluated by all devices at once.
+"""Evaluate one batch of policies on all devices.
 
     python examples/sharded_evaluation.py
 
-On a machine without GPUs, virtual devices show that it works (not that it is faster):
+On a machine without GPUs, virtual devices show that this works; they are not faster:
 
     XLA_FLAGS=--xla_force_host_platform_device_count=4 python ...
 """

@@ -1,10 +1,10 @@
-"""Train one policy to run as an ant by the gradient of its own return.
+"""Train one policy for an ant by the gradient of its return.
 
     python examples/train_ant.py
 
-Sixteen ants, each from another reset, share the weights of a small network. Their
-gradient is cut into windows of 16 steps and clipped: feedback and contact make a longer
-one grow beyond use. Needs optax, which comes with the extra ``qd``.
+Sixteen ants with different resets share the weights of a small network. The gradient is
+cut into windows of 16 steps and clipped, because feedback and contact make longer
+gradients too large. Needs optax, which comes with the extra ``qd``.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     shapes = {"in": (HIDDEN, env.observation_size), "out": (env.action_size, HIDDEN)}
     weights = {
         "in": 0.2 * jax.random.normal(keys[0], shapes["in"], env.dtype),
-        # small: a policy that hardly reacts has a gradient of a size that can be used
+        # small weights: a policy that reacts little has a gradient of useful size
         "out": 0.01 * jax.random.normal(keys[1], shapes["out"], env.dtype),
     }
     optimizer = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(5e-3))

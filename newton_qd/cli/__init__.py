@@ -1,4 +1,4 @@
-"""The command ``newton-qd``: environments, evolution, and what gradients are worth."""
+"""The command ``newton-qd``: environments, evolution and the gradient doctor."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def main(
         Exit code: 0 success, 1 failure, 2 bad arguments, 130 interrupted and saved.
     """
     parser = argparse.ArgumentParser(
-        prog="newton-qd", description="Quality-Diversity on differentiable physics."
+        prog="newton-qd", description="Quality-Diversity with differentiable physics."
     )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for command in (envs, algorithms, evolve, doctor):

@@ -1,4 +1,4 @@
-"""What the commands share: exit codes, complaints, and lists of integers."""
+"""Shared by the commands: exit codes, error messages, lists of integers."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ OK, FAILED, BAD_ARGUMENTS = 0, 1, 2
 
 
 def complain(arguments: argparse.Namespace, what: object, code: int) -> int:
-    """Prints an error of the command to the terminal and returns its exit code."""
+    """Prints an error of the command to standard error and returns the exit code."""
     print(f"newton-qd {arguments.command}: error: {what}", file=sys.stderr)
     return code
 
 
 def widths(text: str) -> tuple[int, ...]:
-    """Integers between commas; none for the word none."""
+    """Parses integers with commas between them; the word ``none`` is an empty list."""
     return () if text == "none" else integers(text, ",")
 
 
 def integers(text: str, separator: str) -> tuple[int, ...]:
-    """Integers between separators.
+    """Parses integers with separators between them.
 
     Raises:
         argparse.ArgumentTypeError: A part is not an integer.

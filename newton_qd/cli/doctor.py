@@ -1,4 +1,4 @@
-"""``newton-qd doctor``: what gradients are worth on an environment."""
+"""``newton-qd doctor``: where gradients of an environment are useful."""
 
 from __future__ import annotations
 
@@ -11,28 +11,30 @@ from newton_qd.cli.arguments import BAD_ARGUMENTS, OK, complain, widths
 
 def add_parser(commands: Any) -> None:
     """Adds the command to the subparsers of ``newton-qd``."""
-    doctor = commands.add_parser("doctor", help="measure what gradients are worth")
+    doctor = commands.add_parser("doctor", help="measure where gradients are useful")
     ailments = doctor.add_subparsers(dest="ailment", required=True, metavar="WHAT")
     parser = ailments.add_parser(
         "gradients",
-        help="over how many control steps a gradient can be used, and why",
+        help="measure over how many control steps a gradient is useful, and why",
         description="Compares the gradient of the return with central differences "
         "and with an evolution strategy, horizon by horizon.",
     )
     parser.set_defaults(run=run)
-    parser.add_argument("env_name", metavar="ENV", help="environment, as ant_uni")
+    parser.add_argument(
+        "env_name", metavar="ENV", help="environment, for example ant_uni"
+    )
     parser.add_argument(
         "--horizons",
         type=widths,
         default=(1, 2, 4, 8, 16, 32, 64),
         metavar="N,N",
-        help="numbers of control steps (default: 1,2,4,8,16,32,64)",
+        help="horizons in control steps (default: 1,2,4,8,16,32,64)",
     )
     for name, default, text in (
-        ("worlds", 8, "random plans of actions"),
-        ("directions", 8, "directions of the differences, in each world"),
-        ("samples", 16, "pairs of noisy samples, in each world"),
-        ("seed", 0, "seed of every random number"),
+        ("worlds", 8, "number of random action sequences"),
+        ("directions", 8, "directions of central differences in each world"),
+        ("samples", 16, "pairs of noisy samples in each world"),
+        ("seed", 0, "seed of all random numbers"),
     ):
         parser.add_argument(
             f"--{name}",
@@ -57,7 +59,7 @@ def add_parser(commands: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Prints a report, writes it where asked, and returns the exit code."""
+    """Prints a report, writes it with ``--out``, and returns the exit code."""
     import newton_qd
     from newton_qd.physics.precision import quiet
 

@@ -1,4 +1,4 @@
-"""``newton-qd evolve``: an algorithm of MAP-Elites' family on an environment."""
+"""``newton-qd evolve``: a Quality-Diversity algorithm on an environment."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def add_parser(commands: Any) -> None:
     """Adds the command to the subparsers of ``newton-qd``."""
     parser = commands.add_parser(
         "evolve",
-        help="run an algorithm of MAP-Elites' family on an environment",
+        help="run a Quality-Diversity algorithm on an environment",
         description="Evolves an archive of policies and writes a results folder: "
         "archive.npz, archive.png, metrics.csv, corrected.json, config.json and a "
         "checkpoint.",
@@ -46,7 +46,7 @@ def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
         "env_name",
         nargs="?",
         metavar="ENV",
-        help="environment, for example ant_uni (see newton-qd envs)",
+        help="environment, for example ant_uni (newton-qd envs lists them)",
     )
     parser.add_argument(
         "--out",
@@ -57,46 +57,46 @@ def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--resume",
         action="store_true",
-        help="continue the run in the folder, with its settings; starts it if there "
-        "is none yet",
+        help="continue the run in the results folder, with its settings; start it if "
+        "the folder has none",
     )
     parser.add_argument(
         "--config",
         type=Path,
         metavar="FILE",
-        help="take the settings of an earlier run's config.json, or of a TOML file",
+        help="read settings from a TOML file, or from config.json of an earlier run",
     )
     parser.add_argument(
         "--checkpoint-seconds",
         type=float,
         default=5.0,
         metavar="S",
-        help="least time between two checkpoints (default: 5)",
+        help="minimum time between two checkpoints [s] (default: 5)",
     )
     parser.add_argument(
         "--tensorboard",
         action="store_true",
-        help="write the metrics as event files for TensorBoard too",
+        help="also write the metrics as event files for TensorBoard",
     )
     parser.add_argument(
         "--devices",
         type=int,
         metavar="N",
-        help="devices that share each evaluation; does not change the result",
+        help="number of devices for each evaluation; does not change the result",
     )
     parser.add_argument("--quiet", action="store_true", help="show no progress")
 
 
 def _add_setting_arguments(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group("settings (they determine the result)")
+    group = parser.add_argument_group("settings that determine the result")
     for name, kind, text in (
-        ("seed", int, "seed of every random number"),
+        ("seed", int, "seed of all random numbers"),
         ("iterations", int, "generations after the initial population"),
         ("batch_size", int, "individuals evaluated in one generation"),
         ("episode_length", int, "control steps of one evaluation"),
-        ("iso_sigma", float, "isotropic part of the variation"),
-        ("line_sigma", float, "part of the variation towards a second parent"),
-        ("reevaluations", int, "evaluations of each elite for corrected metrics"),
+        ("iso_sigma", float, "standard deviation of the isotropic variation"),
+        ("line_sigma", float, "standard deviation of the step to a second parent"),
+        ("reevaluations", int, "evaluations of each elite at the end; 0: none"),
     ):
         group.add_argument(
             f"--{name.replace('_', '-')}",
@@ -116,14 +116,14 @@ def _add_setting_arguments(parser: argparse.ArgumentParser) -> None:
         type=_option,
         action="append",
         metavar="NAME=VALUE",
-        help="setting that the algorithm alone has, for example discount=0.95; may be "
+        help="option of the algorithm, for example discount=0.95; may be "
         "repeated; 'newton-qd algorithms NAME' lists them",
     )
     group.add_argument(
         "--hidden",
         type=widths,
         metavar="N,N",
-        help="hidden layers of the policy, 'none' for a linear one (default: "
+        help="hidden layers of the policy; none: a linear policy (default: "
         f"{','.join(map(str, _DEFAULTS.hidden))})",
     )
     cells = group.add_mutually_exclusive_group()
@@ -131,13 +131,13 @@ def _add_setting_arguments(parser: argparse.ArgumentParser) -> None:
         "--grid",
         type=_grid,
         metavar="NxN",
-        help="cells along each descriptor dimension (default for four: 5x5x5x5)",
+        help="cells along each descriptor dimension (default with four: 5x5x5x5)",
     )
     cells.add_argument(
         "--centroids",
         type=int,
         metavar="N",
-        help="cells of a centroidal Voronoi tessellation instead of a grid",
+        help="number of cells of a centroidal Voronoi tessellation, instead of a grid",
     )
 
 
@@ -161,7 +161,7 @@ def run(
     arguments: argparse.Namespace,
     task_factory: Callable[[EvolveConfig], Task] | None,
 ) -> int:
-    """Evolves, or goes on, and returns the exit code.
+    """Starts or resumes a run and returns the exit code.
 
     Raises:
         ConfigError: A setting is missing or wrong.
@@ -250,7 +250,7 @@ def _warn_of_changes(facts: dict[str, Any]) -> None:
 
 
 def _report(result: EvolveResult, out: Path) -> None:
-    """Prints what the run has found and how to go on."""
+    """Prints the results of the run and how to resume it."""
     config = result.config
     if result.iteration >= 0:
         first, last = (
