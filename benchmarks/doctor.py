@@ -44,8 +44,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--envs", nargs="+", default=newton_qd.registered_envs())
     print(
-        f"| environment | {HORIZONS[-1]} steps are [s] | alive | norm: median, largest "
-        "| growth | alpha | right | better |\n|---|---|---|---|---|---|---|---|"
+        f"| environment | duration of {HORIZONS[-1]} steps [s] | alive "
+        "| norm: median, largest | growth | alpha | right | better |\n|---|---|---|---|---|---|---|---|"
     )
     for name in parser.parse_args().envs:
         print(row(name), flush=True)
