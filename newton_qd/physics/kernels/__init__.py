@@ -34,6 +34,12 @@ compiled. docs/physics.md says why the files run again.
    follows it.
 4. No atomics and no ``+=`` on arrays: sums have a fixed order.
 5. ``sync`` takes the lane: Warp leaves out the adjoint of a function without arguments.
+6. Lanes share one pack: a store's index varies with the lane, or one lane stores.
+
+Each function says what it reads and writes: ``sc`` is the scratch, ``g`` its adjoint,
+``m`` the model. Arrays that its helpers reach are listed, those of stages are not.
+
+``tests/kernel_lint.py`` checks these rules and lists on the syntax tree.
 """
 
 import warp as wp

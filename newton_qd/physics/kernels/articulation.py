@@ -33,7 +33,10 @@ from .structs import Model, Offsets, Scratch
 
 @wp.func
 def point_weight(m: Model, sc: Scratch, offsets: Offsets, c: int):
-    """3 x 3 weight of a contact: impulse per change of the body's velocity [kg]."""
+    """3 x 3 weight of a contact: impulse per change of the body's velocity [kg].
+
+    Reads: m.contact_split, sc.normal, sc.weight_n, sc.weight_t.
+    """
     n = load(sc.normal, offsets.contact + c)
     split = constant(m.contact_split, c)
     wt = split * load(sc.weight_t, offsets.solve_contact + c)
@@ -46,6 +49,12 @@ def gather_children(m: Model, sc: Scratch, offsets: Offsets, i: int):
     """Inertia and wrench of body ``i``: its own, its contacts', its children's.
 
     With R = [r]x a contact's weight W adds ww = R^T W R, wv = -(W R)^T, vv = W.
+
+    Reads: m.h, m.child_start, m.child, m.contact_start, sc.parameter, sc.inertia,
+        sc.moment, sc.wrench_w, sc.wrench_v, sc.point, sc.normal, sc.push,
+        sc.weight_n, sc.weight_t, sc.passed_ww, sc.passed_wv, sc.passed_vv,
+        sc.passed_w, sc.passed_v.
+    Writes: sc.total_ww, sc.total_wv, sc.total_vv, sc.total_w, sc.total_v.
     """
     ww = mat33()
     wv = mat33()
@@ -81,7 +90,15 @@ def gather_children(m: Model, sc: Scratch, offsets: Offsets, i: int):
 
 @stage
 def eliminate_axis(m: Model, sc: Scratch, offsets: Offsets, i: int):
-    """Take the joint's dof out of body ``i``'s equation; pass the rest on."""
+    """Take the joint's dof out of body ``i``'s equation; pass the rest on.
+
+    Reads: m.h, m.q_start, m.v_start, m.dof_control, m.gear, m.armature,
+        m.stiffness, m.spring_rest, m.limit_lower, m.limit_upper, m.limit_stiffness,
+        m.limit_smoothing, sc.q, sc.v, sc.ctrl, sc.parameter, sc.axis_w, sc.axis_v,
+        sc.total_ww, sc.total_wv, sc.total_vv, sc.total_w, sc.total_v.
+    Writes: sc.passed_ww, sc.passed_wv, sc.passed_vv, sc.passed_w, sc.passed_v,
+        sc.lever_w, sc.lever_v, sc.effort.
+    """
     at = offsets.solve_body + i
     k = load(m.v_start, i)
     h = m.h
@@ -131,14 +148,22 @@ def eliminate_axis(m: Model, sc: Scratch, offsets: Offsets, i: int):
 
 @stage
 def rest_world(sc: Scratch, offsets: Offsets):
-    """The world does not move."""
+    """The world does not move.
+
+    Writes: sc.change_w, sc.change_v.
+    """
     store(sc.change_w, offsets.solve_body, vec3())
     store(sc.change_v, offsets.solve_body, vec3())
 
 
 @stage
 def change_axis(m: Model, sc: Scratch, offsets: Offsets, i: int):
-    """Change of the joint's velocity and of body ``i``'s twist."""
+    """Change of the joint's velocity and of body ``i``'s twist.
+
+    Reads: m.body_parent, m.v_start, sc.axis_w, sc.axis_v, sc.lever_w, sc.lever_v,
+        sc.effort, sc.change_w, sc.change_v.
+    Writes: sc.change_w, sc.change_v, sc.dv.
+    """
     at = offsets.solve_body + i
     up = offsets.solve_body + load(m.body_parent, i)
     k = load(m.v_start, i)
@@ -156,7 +181,12 @@ def change_axis(m: Model, sc: Scratch, offsets: Offsets, i: int):
 
 @stage
 def change_free(m: Model, sc: Scratch, offsets: Offsets, i: int):
-    """Solve a free root's own equation: 6 x 6, by blocks."""
+    """Solve a free root's own equation: 6 x 6, by blocks.
+
+    Reads: m.h, m.v_start, sc.ctrl, sc.pose, sc.total_ww, sc.total_wv, sc.total_vv,
+        sc.total_w, sc.total_v.
+    Writes: sc.change_w, sc.change_v, sc.dv.
+    """
     at = offsets.solve_body + i
     k = load(m.v_start, i)
     p = translation(load(sc.pose, offsets.body + i))
@@ -188,7 +218,10 @@ def change_free(m: Model, sc: Scratch, offsets: Offsets, i: int):
 
 @wp.func
 def free_force(m: Model, sc: Scratch, offsets: Offsets, k: int):
-    """Force on dof ``k`` of a free joint [N or N m]; none unless it is driven."""
+    """Force on dof ``k`` of a free joint [N or N m]; none unless it is driven.
+
+    Reads: m.dof_control, m.gear, sc.ctrl.
+    """
     force = real()
     u = load(m.dof_control, k)
     if u >= 0:

@@ -27,6 +27,9 @@ def step_backward(
     """Launched with ``adjoint=True``: its forward part fills the scratch again.
 
     ``g`` is the adjoint of ``sc``, all zero before and after.
+
+    Reads: x, y_bar.
+    Writes: x_bar.
     """
     tid = wp.tid()
     n = tid // lanes

@@ -64,7 +64,10 @@ def outward(at: vec3, j: int, width: real):
 
 @wp.func
 def box_distance(m: Model, half: vec3, at: vec3):
-    """Signed distance of ``at`` from the surface of a box [m]."""
+    """Signed distance of ``at`` from the surface of a box [m].
+
+    Reads: m.contact_smoothing.
+    """
     w = uniform(m.contact_smoothing)
     x = over_face(at, half, 0, w)
     y = over_face(at, half, 1, w)
@@ -77,7 +80,10 @@ def box_distance(m: Model, half: vec3, at: vec3):
 
 @wp.func
 def box_normal(m: Model, half: vec3, at: vec3):
-    """Direction in which ``box_distance`` grows."""
+    """Direction in which ``box_distance`` grows.
+
+    Reads: m.contact_smoothing.
+    """
     w = uniform(m.contact_smoothing)
     x = over_face(at, half, 0, w)
     y = over_face(at, half, 1, w)
@@ -134,6 +140,8 @@ def box_share(m: Model, half: vec3, k: real, at: vec3, along: vec3):
 
     Minimises |distance|^2 + k s^2. ``pull`` grows with s, so its zero is unique;
     Newton's method from the place found gives its value and its derivative.
+
+    Reads: m.contact_smoothing.
 
     Args:
         m: The model.

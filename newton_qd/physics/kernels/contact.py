@@ -30,7 +30,14 @@ WEIGHT_STEPS = wp.constant(2)
 
 @stage
 def contact_predictor(m: Model, sc: Scratch, offsets: Offsets, c: int):
-    """Geometry, and the contact law linearised about the velocity at the start."""
+    """Geometry, and the contact law linearised about the velocity at the start.
+
+    Reads: m.h, m.com, m.contact_body, m.contact_partner, m.contact_smoothing,
+        m.slip_velocity, m.dissipation, sc.parameter, sc.pose, sc.twist_w,
+        sc.twist_v.
+    Writes: sc.point, sc.arm, sc.normal, sc.velocity, sc.load, sc.push, sc.weight_n,
+        sc.weight_t.
+    """
     i = load(m.contact_body, c)
     x = load(sc.pose, offsets.body + i)
     partner = load(m.contact_partner, c)
@@ -72,7 +79,11 @@ def contact_predictor(m: Model, sc: Scratch, offsets: Offsets, c: int):
 
 @stage
 def contact_slip(m: Model, sc: Scratch, offsets: Offsets, c: int):
-    """Change of a contact point's velocity by this solve; of a pair, relative."""
+    """Change of a contact point's velocity by this solve; of a pair, relative.
+
+    Reads: m.contact_body, m.contact_partner, sc.point, sc.change_w, sc.change_v.
+    Writes: sc.slip.
+    """
     at = offsets.solve_body + load(m.contact_body, c)
     r = load(sc.point, offsets.contact + c)
     dv = load(sc.change_v, at) + cross(load(sc.change_w, at), r)
@@ -85,7 +96,11 @@ def contact_slip(m: Model, sc: Scratch, offsets: Offsets, c: int):
 
 @stage
 def contact_clip(m: Model, sc: Scratch, offsets: Offsets, c: int):
-    """Normal impulse: the one of the predictor, ``offsets.before``, clipped at zero."""
+    """Normal impulse: the one of the predictor, ``offsets.before``, clipped at zero.
+
+    Reads: sc.normal, sc.load, sc.weight_n, sc.slip.
+    Writes: sc.normal_impulse.
+    """
     push = load(sc.load, offsets.contact + c)
     approach = dot(
         load(sc.normal, offsets.contact + c), load(sc.slip, offsets.before + c)
@@ -101,6 +116,10 @@ def contact_corrector(m: Model, sc: Scratch, offsets: Offsets, c: int, p: int):
 
     In the last one a pair's friction is given too, from the slip so far: both sides
     get the same impulse, and momentum is conserved whatever hangs on them.
+
+    Reads: m.solves, m.contact_partner, m.slip_velocity, sc.parameter, sc.normal,
+        sc.velocity, sc.normal_impulse, sc.weight_t, sc.slip.
+    Writes: sc.push, sc.weight_n, sc.weight_t.
     """
     n = load(sc.normal, offsets.contact + c)
     vc = load(sc.velocity, offsets.contact + c)
@@ -168,7 +187,11 @@ def friction_weight(
 
 @stage
 def contact_impulse(sc: Scratch, offsets: Offsets, c: int):
-    """Impulse that the corrector applied, friction at the new velocity included."""
+    """Impulse that the corrector applied, friction at the new velocity included.
+
+    Reads: sc.arm, sc.normal, sc.push, sc.weight_t, sc.slip.
+    Writes: sc.impulse, sc.angular_impulse.
+    """
     n = load(sc.normal, offsets.contact + c)
     dv = load(sc.slip, offsets.solve_contact + c)
     j = load(sc.push, offsets.solve_contact + c) - load(

@@ -26,7 +26,11 @@ def write_rows(
     # out
     x: wp.array2d[float],
 ):
-    """Write coordinates, and velocities and forces moved to the origin of the root."""
+    """Write coordinates, and velocities and forces moved to the origin of the root.
+
+    Reads: q, qd, joint_f.
+    Writes: x.
+    """
     w = wp.tid()
     nq = q.shape[1]
     nv = qd.shape[1]
@@ -61,7 +65,11 @@ def read_rows(
     normal_impulse: wp.array2d[float],
     fault: wp.array[float],
 ):
-    """Read a step's results, with velocities moved to the root's centre of mass."""
+    """Read a step's results, with velocities moved to the root's centre of mass.
+
+    Reads: y.
+    Writes: q, qd, impulse, normal_impulse, fault.
+    """
     w = wp.tid()
     nq = q.shape[1]
     nv = qd.shape[1]

@@ -14,7 +14,11 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.kernel
 def proportion_forward(steps: int, nd: int, x: wp.array[scalar], y: wp.array[scalar]):
-    """Mean over the valid steps: the first entry of each row (steps,) of ``y``."""
+    """Mean over the valid steps: the first entry of each row (steps,) of ``y``.
+
+    Reads: x, y.
+    Writes: y.
+    """
     k = wp.tid()
     w = k // nd
     at = w * steps * (nd + 1)
@@ -44,7 +48,11 @@ def proportion_backward(
     y_bar: wp.array[scalar],
     x_bar: wp.array[scalar],
 ):
-    """Adjoint of the mean with respect to the state descriptors."""
+    """Adjoint of the mean with respect to the state descriptors.
+
+    Reads: x, y_bar.
+    Writes: x_bar.
+    """
     k = wp.tid()
     w = k // nd
     at = w * steps * (nd + 1)
@@ -60,7 +68,10 @@ def proportion_backward(
 
 @wp.func
 def last_valid(steps: int, mask: int, x: wp.array[scalar]):
-    """Last step before the end of the episode; without any, the last of all."""
+    """Last step before the end of the episode; without any, the last of all.
+
+    Reads: x.
+    """
     count = int(0)
     for t in range(steps):
         if x[mask + t] == scalar(0.0):
@@ -72,7 +83,11 @@ def last_valid(steps: int, mask: int, x: wp.array[scalar]):
 
 @wp.kernel
 def final_forward(steps: int, nd: int, x: wp.array[scalar], y: wp.array[scalar]):
-    """State descriptor before the last valid step."""
+    """State descriptor before the last valid step.
+
+    Reads: x.
+    Writes: y.
+    """
     k = wp.tid()
     w = k // nd
     at = w * steps * (nd + 1)
@@ -88,7 +103,11 @@ def final_backward(
     y_bar: wp.array[scalar],
     x_bar: wp.array[scalar],
 ):
-    """Adjoint of the last state descriptor."""
+    """Adjoint of the last state descriptor.
+
+    Reads: x, y_bar.
+    Writes: x_bar.
+    """
     k = wp.tid()
     w = k // nd
     at = w * steps * (nd + 1)

@@ -24,7 +24,11 @@ def step_forward(
     # out
     y: wp.array[scalar],
 ):
-    """One control step of worlds from ``first`` on; thread = pack * lanes + lane."""
+    """One control step of worlds from ``first`` on; thread = pack * lanes + lane.
+
+    Reads: x.
+    Writes: y.
+    """
     tid = wp.tid()
     n = tid // lanes
     lane = tid - n * lanes

@@ -17,7 +17,10 @@ from .world import pack_at
 
 @wp.func
 def gap_of(m: Model, sc: Scratch, offsets: Offsets, c: int):
-    """Gap of contact ``c``; negative where the two are pressed into each other [m]."""
+    """Gap of contact ``c``; negative where the two are pressed into each other [m].
+
+    Reads: m.contact_partner, sc.pose.
+    """
     _point = vec3()
     _normal = vec3()
     gap = real()
@@ -39,7 +42,11 @@ def contact_gaps(
     x: wp.array[scalar],
     y: wp.array[scalar],
 ):
-    """Gaps of all contacts."""
+    """Gaps of all contacts.
+
+    Reads: x.
+    Writes: y.
+    """
     pack = pack_at(wp.tid(), first, worlds, slot_stride)
     offsets = offsets_at(m, pack.slot, 0, 0, 0)
     load_views(m, sc, sc, offsets, x, x, pack)

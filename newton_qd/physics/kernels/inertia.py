@@ -23,6 +23,10 @@ def rigid_inertia(m: Model, sc: Scratch, offsets: Offsets, i: int):
 
     A rigid inertia is (rotational inertia about O, first mass moment, mass); the bias
     wrench is I a + v x* I v (Featherstone 2008, eq. 5.14 and 6.2).
+
+    Reads: m.com, m.isotropic, sc.parameter, sc.pose, sc.twist_w, sc.twist_v,
+        sc.bias_w, sc.bias_v.
+    Writes: sc.inertia, sc.moment, sc.wrench_w, sc.wrench_v.
     """
     x = load(sc.pose, offsets.body + i)
     c = transform_point(x, constant(m.com, i))

@@ -30,7 +30,11 @@ def load_views(
     x_bar: wp.array[scalar],
     pack: Pack,
 ):
-    """Copy coordinates and velocities of a pack into its slot."""
+    """Copy coordinates and velocities of a pack into its slot.
+
+    Reads: m.nq, m.nv, m.coordinates, x.
+    Writes: sc.q, sc.v.
+    """
     size = m.coordinates.size
     q = pack.first * size + m.coordinates.q
     v = pack.first * size + m.coordinates.v
@@ -50,7 +54,11 @@ def adj_load_views(
     x_bar: wp.array[scalar],
     pack: Pack,
 ):
-    """Hand the adjoints of coordinates and velocities to the caller."""
+    """Hand the adjoints of coordinates and velocities to the caller.
+
+    Reads: m.nq, m.nv, m.coordinates, g.q, g.v.
+    Writes: g.q, g.v, x_bar.
+    """
     size = m.coordinates.size
     q = pack.first * size + m.coordinates.q
     v = pack.first * size + m.coordinates.v
@@ -64,7 +72,10 @@ def adj_load_views(
 
 @wp.func
 def read_bodies(m: Model, sc: Scratch, offsets: Offsets):
-    """Kinematics of substep 0 with one lane; replayed by the adjoint kernel."""
+    """Kinematics of substep 0 with one lane; replayed by the adjoint kernel.
+
+    Reads: m.nb.
+    """
     kinematics(m, sc, offsets, 0, 1)
     for i in range(1, m.nb + 1):
         body_reading(m, sc, offsets, i)
@@ -74,7 +85,11 @@ def read_bodies(m: Model, sc: Scratch, offsets: Offsets):
 def seed_views(
     m: Model, g: Scratch, offsets: Offsets, y_bar: wp.array[scalar], pack: Pack
 ):
-    """Start the reverse pass with the caller's adjoints of the bodies."""
+    """Start the reverse pass with the caller's adjoints of the bodies.
+
+    Reads: m.bodies, y_bar.
+    Writes: g.pose, g.twist_w, g.position, g.com, g.com_velocity.
+    """
     size = m.bodies.size
     at = pack.first * size
     seed_bodies(m, g, offsets, real(), y_bar, m.bodies, at, size, pack.count, 0, 1)
@@ -90,7 +105,12 @@ def adj_seed_views(
 
 @wp.func
 def composite(m: Model, sc: Scratch, offsets: Offsets, i: int):
-    """Rigid inertia and bias wrench of body ``i`` and its descendants."""
+    """Rigid inertia and bias wrench of body ``i`` and its descendants.
+
+    Reads: m.mass, m.child_start, m.child, sc.inertia, sc.moment, sc.wrench_w,
+        sc.wrench_v, sc.total_ww, sc.total_wv, sc.total_vv, sc.total_w, sc.total_v.
+    Writes: sc.total_ww, sc.total_wv, sc.total_vv, sc.total_w, sc.total_v.
+    """
     at = offsets.solve_body + i
     body = offsets.body + i
     ww = load(sc.inertia, body)
@@ -114,7 +134,10 @@ def composite(m: Model, sc: Scratch, offsets: Offsets, i: int):
 
 @wp.func
 def dof_count(m: Model, i: int):
-    """Degrees of freedom of joint ``i``."""
+    """Degrees of freedom of joint ``i``.
+
+    Reads: m.joint_kind.
+    """
     count = int(1)
     if load(m.joint_kind, i) == JointKind.FREE:
         count = 6
@@ -123,7 +146,10 @@ def dof_count(m: Model, i: int):
 
 @wp.func
 def dof_axis(m: Model, sc: Scratch, offsets: Offsets, i: int, a: int):
-    """Motion (angular, linear) about O of unit velocity of joint ``i``'s dof ``a``."""
+    """Motion (angular, linear) about O of unit velocity of joint ``i``'s dof ``a``.
+
+    Reads: m.joint_kind, m.v_start, sc.pose, sc.axis_w, sc.axis_v.
+    """
     w = vec3()
     v = vec3()
     if load(m.joint_kind, i) == JointKind.FREE:
@@ -147,7 +173,13 @@ def dof_axis(m: Model, sc: Scratch, offsets: Offsets, i: int, a: int):
 def store_body(
     m: Model, sc: Scratch, offsets: Offsets, y: wp.array[scalar], pack: Pack, i: int
 ):
-    """Rows of joint ``i``: M_kj = S_j . I_c S_k (Featherstone 2008, table 6.2)."""
+    """Rows of joint ``i``: M_kj = S_j . I_c S_k (Featherstone 2008, table 6.2).
+
+    Reads: m.nv, m.body_parent, m.v_start, m.armature, m.dynamics, sc.pose,
+        sc.axis_w, sc.axis_v, sc.total_ww, sc.total_wv, sc.total_vv, sc.total_w,
+        sc.total_v.
+    Writes: y.
+    """
     size = m.dynamics.size
     matrix = pack.first * size + m.dynamics.mass_matrix
     forces = pack.first * size + m.dynamics.bias
@@ -179,7 +211,13 @@ def store_body(
 def store_dynamics(
     m: Model, sc: Scratch, offsets: Offsets, y: wp.array[scalar], pack: Pack
 ):
-    """Write the mass matrix and the bias forces of a pack."""
+    """Write the mass matrix and the bias forces of a pack.
+
+    Reads: m.nb, m.nv, m.dynamics, sc.pose, sc.inertia, sc.moment, sc.wrench_w,
+        sc.wrench_v, sc.axis_w, sc.axis_v, sc.total_ww, sc.total_wv, sc.total_vv,
+        sc.total_w, sc.total_v.
+    Writes: sc.total_ww, sc.total_wv, sc.total_vv, sc.total_w, sc.total_v, y.
+    """
     for i in range(1, m.nb + 1):
         rigid_inertia(m, sc, offsets, i)
     # children come after their parents
@@ -204,7 +242,11 @@ def dynamics_forward(
     x: wp.array[scalar],
     y: wp.array[scalar],
 ):
-    """Mass matrix and bias forces."""
+    """Mass matrix and bias forces.
+
+    Reads: x.
+    Writes: y.
+    """
     pack = pack_at(wp.tid(), first, worlds, slot_stride)
     offsets = offsets_at(m, pack.slot, 0, 0, 0)
     load_views(m, sc, sc, offsets, x, x, pack)
@@ -223,7 +265,11 @@ def kinematics_forward(
     x: wp.array[scalar],
     y: wp.array[scalar],
 ):
-    """Where the bodies are and how they move."""
+    """Where the bodies are and how they move.
+
+    Reads: x.
+    Writes: y.
+    """
     pack = pack_at(wp.tid(), first, worlds, slot_stride)
     offsets = offsets_at(m, pack.slot, 0, 0, 0)
     load_views(m, sc, sc, offsets, x, x, pack)
@@ -246,7 +292,11 @@ def kinematics_backward(
     y_bar: wp.array[scalar],
     x_bar: wp.array[scalar],
 ):
-    """Adjoint of the kinematics; launched with ``adjoint=True``."""
+    """Adjoint of the kinematics; launched with ``adjoint=True``.
+
+    Reads: x, y_bar.
+    Writes: x_bar.
+    """
     pack = pack_at(wp.tid(), first, worlds, slot_stride)
     offsets = offsets_at(m, pack.slot, 1, 0, 0)
     load_views(m, sc, g, offsets, x, x_bar, pack)

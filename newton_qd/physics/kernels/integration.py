@@ -12,14 +12,22 @@ from .structs import Model, Offsets, Scratch
 
 @stage
 def mean_velocity(sc: Scratch, offsets: Offsets, ahead: Offsets, k: int):
-    """Velocity halfway through the substep, where the iteration ``ahead`` takes it."""
+    """Velocity halfway through the substep, where the iteration ``ahead`` takes it.
+
+    Reads: sc.v, sc.dv.
+    Writes: sc.v.
+    """
     change = scalar(0.5) * load(sc.dv, offsets.solve_dof + k)
     store(sc.v, ahead.v_body + k, load(sc.v, offsets.v + k) + change)
 
 
 @stage
 def new_velocity(sc: Scratch, offsets: Offsets, k: int):
-    """Velocity after the corrector solve."""
+    """Velocity after the corrector solve.
+
+    Reads: sc.v, sc.dv.
+    Writes: sc.v.
+    """
     store(
         sc.v,
         offsets.v_next + k,
@@ -29,7 +37,11 @@ def new_velocity(sc: Scratch, offsets: Offsets, k: int):
 
 @stage
 def new_coordinates(m: Model, sc: Scratch, offsets: Offsets, i: int):
-    """Coordinates of joint ``i``; a rotation moves by the exponential map."""
+    """Coordinates of joint ``i``; a rotation moves by the exponential map.
+
+    Reads: m.h, m.joint_kind, m.q_start, m.v_start, sc.q, sc.v.
+    Writes: sc.q.
+    """
     h = m.h
     a = load(m.q_start, i)
     k = load(m.v_start, i)

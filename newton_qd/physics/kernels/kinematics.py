@@ -22,7 +22,11 @@ from .structs import Model, Offsets, Scratch
 
 @stage
 def world_frame(m: Model, sc: Scratch, offsets: Offsets):
-    """Pose of the world frame seen from O."""
+    """Pose of the world frame seen from O.
+
+    Reads: m.nq, m.origin_axis, sc.q, sc.parameter.
+    Writes: sc.pose, sc.twist_w, sc.twist_v, sc.bias_w, sc.bias_v.
+    """
     # a robot with fewer coordinates reads its last one again, times zero
     last = offsets.q + m.nq - 1
     first = load(sc.q, offsets.q) * constant(m.origin_axis, 0)
@@ -43,7 +47,11 @@ def world_frame(m: Model, sc: Scratch, offsets: Offsets):
 
 @stage
 def free_joint(m: Model, sc: Scratch, offsets: Offsets, i: int):
-    """Six dofs: velocity of the body origin, then angular velocity, world axes."""
+    """Six dofs: velocity of the body origin, then angular velocity, world axes.
+
+    Reads: m.body_parent, m.q_start, m.v_start, sc.q, sc.v, sc.pose, sc.bias_v.
+    Writes: sc.pose, sc.twist_w, sc.twist_v, sc.bias_w, sc.bias_v.
+    """
     a = load(m.q_start, i)
     k = load(m.v_start, i)
     p = vector(
@@ -72,7 +80,14 @@ def free_joint(m: Model, sc: Scratch, offsets: Offsets, i: int):
 
 @stage
 def axis_joint(m: Model, sc: Scratch, offsets: Offsets, i: int):
-    """One revolute or prismatic dof about a fixed axis of the joint frame."""
+    """One revolute or prismatic dof about a fixed axis of the joint frame.
+
+    Reads: m.body_parent, m.joint_kind, m.q_start, m.v_start, m.joint_axis,
+        m.parent_frame, m.child_frame_inverse, m.child_moved, sc.q, sc.v, sc.pose,
+        sc.twist_w, sc.twist_v, sc.bias_w, sc.bias_v.
+    Writes: sc.pose, sc.twist_w, sc.twist_v, sc.bias_w, sc.bias_v, sc.axis_w,
+        sc.axis_v.
+    """
     p = load(m.body_parent, i)
     k = load(m.v_start, i)
     qk = load(sc.q, offsets.q + load(m.q_start, i))

@@ -50,6 +50,8 @@ def segment_share(
     Minimises |at + s along - t axis|^2 + k s^2 over |s| <= 1 and |t| <= half: s for an
     endless axis, then t at that s, then s at that t.
 
+    Reads: m.contact_smoothing.
+
     Args:
         m: The model.
         reach: Distance of the two where their surfaces touch [m].
@@ -72,6 +74,8 @@ def segment_share(
 @wp.func
 def nearest_share(m: Model, c: int, o: int, at: vec3, along: vec3):
     """Where on its segment contact ``c`` is nearest to capsule or box ``o``, -1 to 1.
+
+    Reads: m.contact_radius, m.obstacle_kind, m.obstacle_size, m.contact_smoothing.
 
     Args:
         m: The model.
@@ -102,7 +106,10 @@ def nearest_share(m: Model, c: int, o: int, at: vec3, along: vec3):
 
 @wp.func
 def from_axis(m: Model, o: int, at: vec3):
-    """Vector from the nearest point of a capsule's axis."""
+    """Vector from the nearest point of a capsule's axis.
+
+    Reads: m.obstacle_size, m.contact_smoothing.
+    """
     half = component(constant(m.obstacle_size, o), 1)
     t = bounded(component(at, 2), half, uniform(m.contact_smoothing))
     return at - vector(real(), real(), t)
@@ -110,7 +117,10 @@ def from_axis(m: Model, o: int, at: vec3):
 
 @wp.func
 def obstacle_normal(m: Model, o: int, at: vec3):
-    """Outward normal at the obstacle point nearest to ``at``."""
+    """Outward normal at the obstacle point nearest to ``at``.
+
+    Reads: m.obstacle_kind, m.obstacle_size.
+    """
     n = vector(real(), real(), uniform(scalar(1.0)))
     if load(m.obstacle_kind, o) == ObstacleKind.CAPSULE:
         away = from_axis(m, o, at)
@@ -123,7 +133,10 @@ def obstacle_normal(m: Model, o: int, at: vec3):
 
 @wp.func
 def obstacle_distance(m: Model, o: int, at: vec3):
-    """Signed distance of ``at`` from the obstacle's surface [m]."""
+    """Signed distance of ``at`` from the obstacle's surface [m].
+
+    Reads: m.obstacle_kind, m.obstacle_size.
+    """
     d = component(at, 2)
     if load(m.obstacle_kind, o) == ObstacleKind.CAPSULE:
         radius = component(constant(m.obstacle_size, o), 0)
@@ -136,7 +149,11 @@ def obstacle_distance(m: Model, o: int, at: vec3):
 
 @wp.func
 def touch_obstacle(m: Model, sc: Scratch, offsets: Offsets, c: int):
-    """Contact point and outward normal in world axes, and gap, at an obstacle."""
+    """Contact point and outward normal in world axes, and gap, at an obstacle.
+
+    Reads: m.contact_body, m.contact_position, m.contact_segment, m.contact_radius,
+        m.contact_obstacle, m.obstacle_kind, m.obstacle_frame, sc.pose.
+    """
     o = load(m.contact_obstacle, c)
     x = load(sc.pose, offsets.body + load(m.contact_body, c))
     center = transform_point(x, constant(m.contact_position, c))

@@ -19,7 +19,11 @@ from .structs import Model, Offsets, Scratch
 
 @wp.func
 def touch_partner(m: Model, sc: Scratch, offsets: Offsets, c: int):
-    """Contact point and normal towards row ``c`` in world axes, and gap, of a pair."""
+    """Contact point and normal towards row ``c`` in world axes, and gap, of a pair.
+
+    Reads: m.contact_body, m.contact_position, m.contact_segment, m.contact_radius,
+        m.contact_partner, m.contact_lead, m.contact_smoothing, sc.pose.
+    """
     a = load(m.contact_lead, c)
     b = load(m.contact_partner, a)
     pose_a = load(sc.pose, offsets.body + load(m.contact_body, a))

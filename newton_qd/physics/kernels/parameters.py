@@ -20,7 +20,10 @@ PARAMETRIC = wp.constant(parametric)
 
 @wp.func
 def gravity(m: Model, sc: Scratch, offsets: Offsets):
-    """Downward acceleration [m/s^2]."""
+    """Downward acceleration [m/s^2].
+
+    Reads: m.gravity, m.parameters, sc.parameter.
+    """
     if PARAMETRIC:
         return load(sc.parameter, offsets.parameter + m.parameters.gravity)
     else:
@@ -29,7 +32,10 @@ def gravity(m: Model, sc: Scratch, offsets: Offsets):
 
 @wp.func
 def friction(m: Model, sc: Scratch, offsets: Offsets):
-    """Coulomb coefficient."""
+    """Coulomb coefficient.
+
+    Reads: m.friction, m.parameters, sc.parameter.
+    """
     if PARAMETRIC:
         return load(sc.parameter, offsets.parameter + m.parameters.friction)
     else:
@@ -38,7 +44,10 @@ def friction(m: Model, sc: Scratch, offsets: Offsets):
 
 @wp.func
 def contact_stiffness(m: Model, sc: Scratch, offsets: Offsets):
-    """Stiffness of a contact [N/m]."""
+    """Stiffness of a contact [N/m].
+
+    Reads: m.contact_stiffness, m.parameters, sc.parameter.
+    """
     if PARAMETRIC:
         return load(sc.parameter, offsets.parameter + m.parameters.contact_stiffness)
     else:
@@ -47,7 +56,10 @@ def contact_stiffness(m: Model, sc: Scratch, offsets: Offsets):
 
 @wp.func
 def total_mass(m: Model, sc: Scratch, offsets: Offsets):
-    """Mass of the robot [kg]."""
+    """Mass of the robot [kg].
+
+    Reads: m.total_mass, m.parameters, sc.parameter.
+    """
     if PARAMETRIC:
         return load(sc.parameter, offsets.parameter + m.parameters.total_mass)
     else:
@@ -56,7 +68,10 @@ def total_mass(m: Model, sc: Scratch, offsets: Offsets):
 
 @wp.func
 def body_mass(m: Model, sc: Scratch, offsets: Offsets, i: int):
-    """Mass of body ``i`` [kg]."""
+    """Mass of body ``i`` [kg].
+
+    Reads: m.mass, m.parameters, sc.parameter.
+    """
     if PARAMETRIC:
         return load(sc.parameter, offsets.parameter + m.parameters.mass + i - 1)
     else:
@@ -65,7 +80,10 @@ def body_mass(m: Model, sc: Scratch, offsets: Offsets, i: int):
 
 @wp.func
 def body_inertia(m: Model, sc: Scratch, offsets: Offsets, i: int):
-    """Inertia of body ``i`` about its centre of mass, body axes [kg m^2]."""
+    """Inertia of body ``i`` about its centre of mass, body axes [kg m^2].
+
+    Reads: m.inertia, m.parameters, sc.parameter.
+    """
     if PARAMETRIC:
         scales = offsets.parameter + m.parameters.inertia_scale
         scale = load(sc.parameter, scales + i - 1)
@@ -76,7 +94,10 @@ def body_inertia(m: Model, sc: Scratch, offsets: Offsets, i: int):
 
 @wp.func
 def joint_damping(m: Model, sc: Scratch, offsets: Offsets, k: int):
-    """Damping of dof ``k`` [N m s/rad or N s/m]."""
+    """Damping of dof ``k`` [N m s/rad or N s/m].
+
+    Reads: m.damping, m.parameters, sc.parameter.
+    """
     if PARAMETRIC:
         return load(sc.parameter, offsets.parameter + m.parameters.damping + k)
     else:
@@ -95,6 +116,10 @@ def load_parameters(
     lanes: int,
 ):
     """Copy the parameters of a pack into its slot, once its controls are there.
+
+    Reads: m.nb, m.nv, m.nu, m.total_mass, m.mass, m.damping, m.contact_stiffness,
+        m.inputs, m.parameters, sc.ctrl, x.
+    Writes: sc.ctrl, sc.parameter.
 
     Args:
         m: The model.
@@ -155,7 +180,11 @@ def return_gears(
     lane: int,
     lanes: int,
 ):
-    """Adjoint of the gears, which scale the controls."""
+    """Adjoint of the gears, which scale the controls.
+
+    Reads: m.nu, m.inputs, g.ctrl, x.
+    Writes: g.ctrl, x_bar.
+    """
     size = m.inputs.size
     controls = at + m.inputs.control
     gears = at + m.inputs.gear_scale
@@ -176,7 +205,11 @@ def return_one(
     count: int,
     fault: real,
 ):
-    """Hand over and clear the adjoint of a single parameter."""
+    """Hand over and clear the adjoint of a single parameter.
+
+    Reads: m.inputs, g.parameter.
+    Writes: g.parameter, x_bar.
+    """
     value = load(g.parameter, held)
     write_output(x_bar, given, m.inputs.size, count, choose(fault, real(), value))
     store(g.parameter, held, real())
@@ -196,6 +229,10 @@ def return_parameters(
     lanes: int,
 ):
     """Adjoint of ``load_parameters``; leaves that of the controls as they came in.
+
+    Reads: m.nb, m.nv, m.mass, m.damping, m.contact_stiffness, m.inputs,
+        m.parameters, g.ctrl, g.parameter, x.
+    Writes: g.ctrl, g.parameter, x_bar.
 
     Args:
         m: The model.

@@ -26,7 +26,11 @@ from .structs import Model, Offsets, Scratch, offsets_at
 
 @stage
 def body_reading(m: Model, sc: Scratch, offsets: Offsets, i: int):
-    """Position of body ``i``, and position and velocity of its centre of mass."""
+    """Position of body ``i``, and position and velocity of its centre of mass.
+
+    Reads: m.com, sc.pose, sc.twist_w, sc.twist_v.
+    Writes: sc.position, sc.com, sc.com_velocity.
+    """
     x = load(sc.pose, offsets.body + i)
     # the kernels work about O
     world = translation(load(sc.pose, offsets.body))
@@ -52,7 +56,11 @@ def store_bodies(
     lane: int,
     lanes: int,
 ):
-    """Write the bodies of a pack to ``fields`` of rows of ``size`` from ``at`` on."""
+    """Write the bodies of a pack to ``fields`` of rows of ``size`` from ``at`` on.
+
+    Reads: m.nb, sc.pose, sc.twist_w, sc.position, sc.com, sc.com_velocity.
+    Writes: y.
+    """
     for i in range(lane, m.nb, lanes):
         position = load(sc.position, offsets.reading + i + 1)
         pose = load(sc.pose, offsets.body + i + 1)
@@ -86,7 +94,11 @@ def seed_bodies(
     lane: int,
     lanes: int,
 ):
-    """Start the reverse pass of the bodies; 0 for a faulty world."""
+    """Start the reverse pass of the bodies; 0 for a faulty world.
+
+    Reads: m.nb, y_bar.
+    Writes: g.pose, g.twist_w, g.position, g.com, g.com_velocity.
+    """
     for i in range(lane, m.nb, lanes):
         k = at + 3 * i
         r = at + fields.rotation + 4 * i
@@ -109,7 +121,10 @@ def seed_bodies(
 
 @wp.func
 def seed(fault: real, y_bar: wp.array[scalar], at: int, size: int, count: int) -> real:
-    """Entry ``at`` of each row; 0 for a faulty world."""
+    """Entry ``at`` of each row; 0 for a faulty world.
+
+    Reads: y_bar.
+    """
     return choose(fault, real(), read_input(y_bar, at, size, count))
 
 
@@ -117,7 +132,10 @@ def seed(fault: real, y_bar: wp.array[scalar], at: int, size: int, count: int) -
 def seed_vector(
     fault: real, y_bar: wp.array[scalar], at: int, size: int, count: int
 ) -> vec3:
-    """Three entries from ``at`` on of each row; 0 for a faulty world."""
+    """Three entries from ``at`` on of each row; 0 for a faulty world.
+
+    Reads: y_bar.
+    """
     return vector(
         seed(fault, y_bar, at, size, count),
         seed(fault, y_bar, at + 1, size, count),
@@ -127,7 +145,11 @@ def seed_vector(
 
 @stage
 def torso_position(m: Model, sc: Scratch, slot: int, offsets: Offsets):
-    """Where the torso is on the ground: in the coordinates, if it moves freely."""
+    """Where the torso is on the ground: in the coordinates, if it moves freely.
+
+    Reads: m.torso, m.torso_q, sc.q, sc.position.
+    Writes: sc.torso_xy.
+    """
     if m.torso_q >= 0:
         store(sc.torso_xy, 2 * slot, load(sc.q, offsets.q + m.torso_q))
         store(sc.torso_xy, 2 * slot + 1, load(sc.q, offsets.q + m.torso_q + 1))
@@ -139,7 +161,12 @@ def torso_position(m: Model, sc: Scratch, slot: int, offsets: Offsets):
 
 @stage
 def body_impulse(m: Model, sc: Scratch, slot: int, offsets: Offsets, i: int):
-    """Contact impulses on body ``i`` over the control step."""
+    """Contact impulses on body ``i`` over the control step.
+
+    Reads: m.substeps, m.contact_start, sc.impulse, sc.angular_impulse,
+        sc.normal_impulse.
+    Writes: sc.body_impulse, sc.body_angular_impulse, sc.body_normal_impulse.
+    """
     linear = vec3()
     angular = vec3()
     normal = real()
@@ -156,7 +183,12 @@ def body_impulse(m: Model, sc: Scratch, slot: int, offsets: Offsets, i: int):
 
 @stage
 def foot_contact(m: Model, sc: Scratch, slot: int, offsets: Offsets, f: int):
-    """Whether foot ``f`` carries weight, at once and as a smooth step."""
+    """Whether foot ``f`` carries weight, at once and as a smooth step.
+
+    Reads: m.nf, m.foot, m.foot_weight, m.foot_fraction, m.foot_width, sc.fault,
+        sc.body_normal_impulse.
+    Writes: sc.foot_contact, sc.smooth_foot_contact.
+    """
     impulse = load(sc.body_normal_impulse, offsets.reading + load(m.foot, f))
     fault = load(sc.fault, slot)
     share = choose(fault, real(), impulse) / uniform(m.foot_weight)

@@ -30,7 +30,10 @@ from .world import Pack, detect_fault, freeze_faulty
 
 @stage
 def kinematics(m: Model, sc: Scratch, offsets: Offsets, lane: int, lanes: int):
-    """Poses, twists and bias accelerations, root to leaves."""
+    """Poses, twists and bias accelerations, root to leaves.
+
+    Reads: m.joint_kind, m.body_levels, m.body_level_start, m.body_level.
+    """
     if lane == 0:
         world_frame(m, sc, offsets)
     sync(lane)
@@ -47,7 +50,10 @@ def kinematics(m: Model, sc: Scratch, offsets: Offsets, lane: int, lanes: int):
 
 @stage
 def linear_solve(m: Model, sc: Scratch, offsets: Offsets, lane: int, lanes: int):
-    """Eliminate joints, leaves to root; velocity changes, root to leaves."""
+    """Eliminate joints, leaves to root; velocity changes, root to leaves.
+
+    Reads: m.nc, m.joint_kind, m.body_levels, m.body_level_start, m.body_level.
+    """
     if lane == 0:
         rest_world(sc, offsets)
     for n in range(m.body_levels):
@@ -87,6 +93,8 @@ def substep(
     """An iteration of substep ``s``, once its kinematics are there.
 
     ``keep`` is as in ``offsets_at``.
+
+    Reads: m.nb, m.nv, m.nc, m.iterations, m.solves.
     """
     start = iteration * m.solves
     first = offsets_at(m, slot, keep, s, start)
@@ -131,7 +139,10 @@ def simulate(
     lane: int,
     lanes: int,
 ):
-    """All substeps of a pack, then the returned state and what is read from it."""
+    """All substeps of a pack, then the returned state and what is read from it.
+
+    Reads: m.substeps, m.iterations, m.solves, m.reports_bodies, m.torso_q.
+    """
     slot = pack.slot
     for n in range(m.substeps * m.iterations + 1):
         # the kinematics of the returned state are those of a last turn: written
@@ -154,7 +165,10 @@ def simulate(
 
 @stage
 def read_out(m: Model, sc: Scratch, slot: int, offsets: Offsets, lane: int, lanes: int):
-    """What is read from the returned state and from the substeps."""
+    """What is read from the returned state and from the substeps.
+
+    Reads: m.nb, m.reports_bodies, m.torso_q, m.nf.
+    """
     for i in range(1 + lane, m.nb + 1, lanes):
         body_impulse(m, sc, slot, offsets, i)
     sync(lane)

@@ -200,6 +200,9 @@ def offsets_at(m: Model, slot: int, keep: int, s: int, p: int):
 
     ``keep`` is 1 where every substep has entries of its own, as the adjoint needs, and
     0 where a slot's substeps share them.
+
+    Reads: m.nb, m.nq, m.nv, m.nu, m.nc, m.substeps, m.iterations, m.solves,
+        m.parameters.
     """
     step = slot
     solve = slot
@@ -238,5 +241,8 @@ def offsets_at(m: Model, slot: int, keep: int, s: int, p: int):
 
 @wp.func
 def offsets_after(m: Model, slot: int, keep: int):
-    """Offsets of the returned state, one after the end of the last substep."""
+    """Offsets of the returned state, one after the end of the last substep.
+
+    Reads: m.substeps.
+    """
     return offsets_at(m, slot, keep, m.substeps + 1, 0)

@@ -50,7 +50,11 @@ def load_world(
     lane: int,
     lanes: int,
 ):
-    """Copy the inputs of a pack into its slot, from ``offsets`` on."""
+    """Copy the inputs of a pack into its slot, from ``offsets`` on.
+
+    Reads: m.nq, m.nv, m.nu, m.inputs, sc.ctrl, x.
+    Writes: sc.q, sc.v, sc.ctrl, sc.parameter.
+    """
     size = m.inputs.size
     at = pack.first * size
     q = at + m.inputs.q
@@ -79,7 +83,11 @@ def adj_load_world(
     lane: int,
     lanes: int,
 ):
-    """Hand the adjoints of the inputs to the caller; exactly 0 for a faulty world."""
+    """Hand the adjoints of the inputs to the caller; exactly 0 for a faulty world.
+
+    Reads: m.nq, m.nv, m.nu, m.inputs, sc.fault, g.q, g.v, g.ctrl, g.parameter, x.
+    Writes: g.q, g.v, g.ctrl, g.parameter, x_bar.
+    """
     sync(lane)
     size = m.inputs.size
     at = pack.first * size
@@ -105,7 +113,12 @@ def adj_load_world(
 
 @wp.func
 def detect_fault(m: Model, sc: Scratch, pack: Pack, x: wp.array[scalar], lane: int):
-    """Record where a number is not finite, or a speed out of bounds."""
+    """Record where a number is not finite, or a speed out of bounds.
+
+    Reads: m.nq, m.nv, m.nc, m.substeps, m.inputs, sc.q, sc.v, sc.impulse,
+        sc.angular_impulse, sc.normal_impulse, x.
+    Writes: sc.fault, sc.lost.
+    """
     if lane == 0:
         # zero times a finite number is zero, anything else is not a number
         zero = scalar(0.0)
@@ -156,7 +169,11 @@ def freeze_faulty(
     lane: int,
     lanes: int,
 ):
-    """The returned state: a faulty world stays where it was, or at rest."""
+    """The returned state: a faulty world stays where it was, or at rest.
+
+    Reads: m.nq, m.nv, m.rest_q, m.inputs, sc.q, sc.v, sc.fault, sc.lost, x.
+    Writes: sc.q, sc.v.
+    """
     fault = load(sc.fault, pack.slot)
     lost = load(sc.lost, pack.slot)
     size = m.inputs.size
@@ -181,7 +198,14 @@ def store_world(
     lane: int,
     lanes: int,
 ):
-    """Write the outputs of a pack; impulses are zero at a fault."""
+    """Write the outputs of a pack; impulses are zero at a fault.
+
+    Reads: m.nb, m.nq, m.nv, m.reports_bodies, m.nf, m.outputs, m.reported, sc.q,
+        sc.v, sc.fault, sc.pose, sc.twist_w, sc.body_impulse,
+        sc.body_angular_impulse, sc.body_normal_impulse, sc.position, sc.com,
+        sc.com_velocity, sc.torso_xy, sc.foot_contact, sc.smooth_foot_contact.
+    Writes: y.
+    """
     fault = load(sc.fault, pack.slot)
     count = pack.count
     size = m.outputs.size
@@ -227,7 +251,14 @@ def seed_world(
     lane: int,
     lanes: int,
 ):
-    """Start the reverse pass: the caller's adjoints of the outputs; 0 at a fault."""
+    """Start the reverse pass: the caller's adjoints of the outputs; 0 at a fault.
+
+    Reads: m.nb, m.nq, m.nv, m.reports_bodies, m.nf, m.outputs, m.reported,
+        sc.fault, y_bar.
+    Writes: g.q, g.v, g.pose, g.twist_w, g.body_impulse, g.body_angular_impulse,
+        g.body_normal_impulse, g.position, g.com, g.com_velocity, g.torso_xy,
+        g.smooth_foot_contact.
+    """
     fault = load(sc.fault, pack.slot)
     count = pack.count
     size = m.outputs.size
