@@ -45,7 +45,8 @@ def main() -> None:
     parser.add_argument("--envs", nargs="+", default=newton_qd.registered_envs())
     print(
         f"| environment | duration of {HORIZONS[-1]} steps [s] | alive "
-        "| norm: median, largest | growth | alpha | right | better |\n|---|---|---|---|---|---|---|---|"
+        "| norm: median, largest | growth | alpha | right | better |\n"
+        "|---|---|---|---|---|---|---|---|"
     )
     for name in parser.parse_args().envs:
         print(row(name), flush=True)
