@@ -12,6 +12,7 @@ from urdf_text import joint, link, row, write
 
 from newton_qd.assets import AssetNotFoundError, find_urdf
 from newton_qd.physics.model import RobotDescriptionError, build_system, load_system
+from newton_qd.physics.model.xml_reader import XmlReader
 from newton_qd.robots import ANT, Contact, RobotSpec
 
 ANT_TEXT = find_urdf("ant.urdf").read_text(encoding="utf-8")
@@ -160,6 +161,23 @@ def test_file_without_a_robot(text: str, message: str, tmp_path: Path) -> None:
     path = write(tmp_path, text)
     with pytest.raises(RobotDescriptionError, match=message):
         build_system(row(path, "torso"), "float32")
+
+
+def test_entities_do_not_grow(tmp_path: Path) -> None:
+    """Ten bytes that stand for ten thousand million."""
+    tens = (f'<!ENTITY e{n + 1} "{f"&e{n};" * 10}">' for n in range(9))
+    entities = f'<!DOCTYPE robot [<!ENTITY e0 "0123456789">{"".join(tens)}]>'
+    path = write(tmp_path, f'{entities}<robot><link name="&e9;"/></robot>')
+    with pytest.raises(RobotDescriptionError, match="malformed XML: limit on input"):
+        build_system(row(path, "torso"), "float32")
+
+
+def test_entities_read_no_file(tmp_path: Path) -> None:
+    secret = tmp_path / "secret"
+    secret.write_text("found", encoding="utf-8")
+    entity = f'<!DOCTYPE robot [<!ENTITY e SYSTEM "{secret.as_uri()}">]>'
+    path = write(tmp_path, f"{entity}<robot>&e;</robot>")
+    assert not XmlReader(Path(path)).root.text
 
 
 def changed(**changes: object) -> RobotSpec:
