@@ -25,8 +25,6 @@ from newton_qd.qd.emitters.actor_critic_learner import (
     measure_of,
 )
 
-pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
-
 # These programs run for milliseconds: they need no optimizer.
 compiled = functools.partial(
     jax.jit, compiler_options={"xla_backend_optimization_level": 0}

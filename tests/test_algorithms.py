@@ -30,9 +30,6 @@ from newton_qd.qd.scoring.task import make_task
 
 __all__ = ["compiled"]  # a fixture
 
-# QDax and what it imports warn about their own use of other packages.
-pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
-
 CRITIC = {
     "critic_hidden_layer_size": (8,),
     "num_critic_training_steps": 2,

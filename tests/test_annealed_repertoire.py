@@ -13,8 +13,6 @@ from qdax.core.containers.mapelites_repertoire import compute_euclidean_centroid
 
 from newton_qd.qd.emitters.annealed_repertoire import AnnealedRepertoire
 
-pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
-
 CELLS = (4, 3)
 RATE, FLOOR = 0.3, -0.5
 

@@ -29,9 +29,6 @@ from newton_qd.qd.run.checkpoint import CheckpointError, load_checkpoint
 
 __all__ = ["compile_once", "reference"]  # fixtures
 
-# QDax and what it imports warn about their own use of other packages.
-pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
-
 STORED = Path(__file__).resolve().parent / "data" / "archive_format_1"
 NAMES = ("genotypes", "fitnesses", "descriptors", "centroids")
 

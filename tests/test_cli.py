@@ -19,9 +19,6 @@ from newton_qd.qd.config import EvolveConfig
 from newton_qd.qd.run.archive import load_archive
 from newton_qd.qd.scoring.task import Task
 
-# QDax and what it imports warn about their own use of other packages.
-pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
-
 TESTS = Path(__file__).resolve().parent
 POINT = ["evolve", "point", "--quiet", "--iterations", "3", "--batch-size", "16"]
 POINT += ["--episode-length", "9", "--hidden", "4", "--grid", "4x4"]

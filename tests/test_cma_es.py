@@ -9,8 +9,6 @@ import pytest
 
 from newton_qd.qd.emitters.cma_es import CMAES, CMAESState
 
-pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
-
 DIMENSION, POPULATION = 4, 13
 TARGET = np.array([1.0, -2.0, 0.5, 3.0])
 STIFFNESS = np.array([1.0, 10.0, 100.0, 1000.0])

@@ -21,9 +21,6 @@ from newton_qd.compat import finder
 from newton_qd.compat.contents import CONTENTS
 from newton_qd.errors import MissingExtra
 
-# QDax and what it imports warn about their own use of other packages.
-pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
-
 TESTS = Path(__file__).resolve().parent
 
 

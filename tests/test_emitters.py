@@ -35,8 +35,6 @@ from newton_qd.qd.emitters import (
 from newton_qd.qd.emitters.annealed_repertoire import AnnealedRepertoire
 from newton_qd.qd.scoring.gradient_scores import normalize, read_scores
 
-pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
-
 # These programs run for milliseconds: they need no optimizer.
 compiled = functools.partial(
     jax.jit, compiler_options={"xla_backend_optimization_level": 0}

@@ -43,9 +43,6 @@ from newton_qd.qd.scoring.task import Task, make_task
 
 evolve_module = sys.modules[evolve.__module__]
 
-# QDax and what it imports warn about their own use of other packages.
-pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
-
 TESTS = Path(__file__).resolve().parent
 FILES = ("archive.npz", "archive.png", "checkpoint.bin", "config.json", "metrics.csv")
 SMALL = EvolveConfig(

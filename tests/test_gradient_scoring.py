@@ -16,9 +16,6 @@ from newton_qd.qd import make_policy, make_scoring_function
 from newton_qd.qd.scoring.gradient_scoring import make_gradient_scoring_function
 from newton_qd.qd.scoring.task import Task
 
-# QDax and what it imports warn about their own use of other packages.
-pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
-
 STEPS = 6
 
 

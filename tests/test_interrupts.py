@@ -13,6 +13,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
@@ -156,7 +157,7 @@ def start(child: Callable[[], None], errors: Path, device: jax.Device):
     }
     with errors.open("w", encoding="utf-8") as stderr:
         return processes.start(
-            [sys.executable, "-W", "error", __file__, child.__name__],
+            [sys.executable, __file__, child.__name__],
             seconds=TIMEOUT_S,
             stderr=stderr,
             env=environment,
@@ -208,5 +209,6 @@ def test_moments_of_a_callback(tmp_path: Path, device: jax.Device) -> None:
 
 
 if __name__ == "__main__":
+    warnings.filterwarnings("error", module="newton_qd|__main__")
     children = (child_random_moments, child_moments_of_a_callback)
     {child.__name__: child for child in children}[sys.argv[1]]()

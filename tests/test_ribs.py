@@ -16,9 +16,6 @@ from newton_qd.qd.emitters import GradientsError
 from newton_qd.qd.scoring.ribs import from_ribs, make_ribs_evaluation, to_ribs
 from newton_qd.qd.scoring.rollout import make_policy, make_scoring_function
 
-# QDax and what it imports warn about their own use of other packages.
-pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
-
 LIMITS = (np.zeros(2), np.ones(2))
 WORST = -5.0 * SMALL.episode_length
 

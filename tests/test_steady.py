@@ -13,9 +13,6 @@ from newton_qd.qd.config import EvolveConfig
 from newton_qd.qd.run.search import Search
 from newton_qd.qd.scoring.task import make_task
 
-# QDax and what it imports warn about their own use of other packages.
-pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
-
 STATM = Path("/proc/self/statm")
 PAGE = 4096  # bytes
 

@@ -15,9 +15,6 @@ from newton_qd.qd.config import ConfigError
 
 __all__ = ["compile_once"]  # a fixture
 
-# QDax and what it imports warn about their own use of other packages.
-pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
-
 
 def events(path: Path) -> Iterator[Any]:
     """Events of a file of records: length, its checksum, the event, its checksum."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import importlib.metadata
 import sys
+import warnings
 from collections.abc import Sequence
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
@@ -94,4 +95,7 @@ def _restore_jax() -> None:
     # that JAX has moved.
     xla: Any = importlib.import_module("jax.interpreters.xla")
     if not hasattr(xla, "pytype_aval_mappings"):
-        xla.pytype_aval_mappings = core.pytype_aval_mappings
+        with warnings.catch_warnings():
+            # JAX deprecates the new place as well, and has no other.
+            warnings.simplefilter("ignore", DeprecationWarning)
+            xla.pytype_aval_mappings = core.pytype_aval_mappings
