@@ -4,25 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, Protocol, Self, TypeAlias
+from typing import Any, Protocol, Self
 
 import jax
 import jax.numpy as jnp
 
-from newton_qd.types import Descriptor, Mask, Observation
-
-
-class Transitions(Protocol):
-    """What extractors read: a batch of transitions, as QDax's ``QDTransition``."""
-
-    @property
-    def state_desc(self) -> jax.Array:
-        """(n, t, nd) state descriptors before each step."""
-        ...
-
-
-Extractor: TypeAlias = Callable[[Any, Mask], Descriptor]
-"""Maps transitions and their mask (n, t) to descriptors of episodes (n, nd)."""
+from newton_qd.types import Descriptor, Mask, Observation, PyTree, StateDescriptors
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,7 +46,7 @@ def folded_sum(values: jax.Array, axis: int) -> jax.Array:
     return rest[0]
 
 
-def get_final_xy_position(data: Transitions, mask: Mask) -> Descriptor:
+def get_final_xy_position(data: StateDescriptors, mask: Mask) -> Descriptor:
     """Position before the last valid step of each episode.
 
     Args:
@@ -74,7 +61,7 @@ def get_final_xy_position(data: Transitions, mask: Mask) -> Descriptor:
     return jax.vmap(lambda rows, index: rows[index])(data.state_desc, last)
 
 
-def get_feet_contact_proportion(data: Transitions, mask: Mask) -> Descriptor:
+def get_feet_contact_proportion(data: StateDescriptors, mask: Mask) -> Descriptor:
     """Proportion of the valid steps at which each foot touched the ground.
 
     Args:
@@ -92,7 +79,7 @@ def get_feet_contact_proportion(data: Transitions, mask: Mask) -> Descriptor:
     return folded_sum(data.state_desc * valid, 1) / jax.lax.optimization_barrier(steps)
 
 
-def get_mean_state_descriptor(data: Transitions, mask: Mask) -> Descriptor:
+def get_mean_state_descriptor(data: StateDescriptors, mask: Mask) -> Descriptor:
     """Mean of the state descriptors over the valid steps of each episode.
 
     Args:
@@ -112,7 +99,9 @@ class Encoder(Protocol):
         """Returns the encoding of observations."""
         ...
 
-    def apply(self, variables: Any, *args: Any, method: Any) -> Any:
+    def apply(
+        self, variables: PyTree, *args: jax.Array, method: Callable[..., PyTree]
+    ) -> jax.Array:
         """Calls a method of the model with given parameters."""
         ...
 
@@ -126,7 +115,7 @@ class AuroraExtraInfo:
         model_params: Parameters of the model that reduces observations.
     """
 
-    model_params: Any
+    model_params: PyTree
 
     def replace(self, **changes: Any) -> Self:
         """Returns a copy with some fields replaced."""
@@ -150,7 +139,7 @@ class AuroraExtraInfoNormalization(AuroraExtraInfo):
     @classmethod
     def create(
         cls,
-        model_params: Any,
+        model_params: PyTree,
         mean_observations: jax.Array,
         std_observations: jax.Array,
     ) -> Self:

@@ -14,10 +14,10 @@ from newton_qd import tasks
 from newton_qd.envs.base import Env
 from newton_qd.envs.options import check_flag
 from newton_qd.errors import UnknownEnvironment
-from newton_qd.extractors import Extractor
 from newton_qd.moved import moved_name
 from newton_qd.robots import Material, RobotSpec
 from newton_qd.tasks import EnvironmentSpec, WrapperSpec
+from newton_qd.types import DescriptorExtractor
 from newton_qd.wrappers import (
     AutoResetWrapper,
     CompletedEvalWrapper,
@@ -57,7 +57,7 @@ def register(
     base_name: str | None = None,
     wrappers: Sequence[WrapperSpec] = (),
     descriptor: WrapperSpec | Callable[..., Env] | None = None,
-    descriptor_extractor: Extractor | None = None,
+    descriptor_extractor: DescriptorExtractor | None = None,
     reward_offset: float | None = None,
     robot: RobotSpec | None = None,
     **options: Any,
@@ -118,7 +118,11 @@ def register(
 
 
 def _check_names(env_name: object, base_name: object) -> None:
-    """Raises for names that are not, and for one that is taken."""
+    """Checks the names of ``register``.
+
+    Raises:
+        ValueError: A name is none, or taken.
+    """
     if not isinstance(env_name, str) or not env_name:
         raise ValueError(f"env_name={env_name!r}: allowed: a string that is not empty")
     if env_name in tasks.ENVIRONMENTS:
@@ -134,7 +138,11 @@ def _check_names(env_name: object, base_name: object) -> None:
 def _descriptor_specs(
     descriptor: WrapperSpec | Callable[..., Env] | None,
 ) -> tuple[WrapperSpec, ...]:
-    """Returns the wrapper that describes, if there is one; raises where it is none."""
+    """Returns the wrapper that describes, if there is one.
+
+    Raises:
+        TypeError: It is no wrapper.
+    """
     if descriptor is None:
         return ()
     if not isinstance(descriptor, WrapperSpec):
@@ -155,7 +163,12 @@ def _takes_robot(base: Callable[..., Env]) -> bool:
 
 
 def _check_offset(reward_offset: object) -> None:
-    """Raises for a ``reward_offset`` of ``register`` that is not a finite number."""
+    """Checks the ``reward_offset`` of ``register``.
+
+    Raises:
+        TypeError: It is no number.
+        ValueError: It is not finite.
+    """
     allowed = "allowed: None, or a finite number"
     if reward_offset is None:
         return
@@ -166,7 +179,11 @@ def _check_offset(reward_offset: object) -> None:
 
 
 def _check_wrappers(wrappers: object) -> None:
-    """Raises for ``wrappers`` of ``register`` that are not specs of wrappers."""
+    """Checks the ``wrappers`` of ``register``.
+
+    Raises:
+        TypeError: They are not specs of wrappers.
+    """
     if not isinstance(wrappers, Sequence) or isinstance(wrappers, str):
         raise TypeError(
             f"wrappers={wrappers!r}: allowed: a tuple or list of WrapperSpec, such as "
@@ -266,7 +283,11 @@ def create_fn(env_name: str, **kwargs: Any) -> Callable[..., Env]:
 
 
 def _spec(env_name: str) -> EnvironmentSpec:
-    """Returns the spec of an environment; raises where there is none."""
+    """Returns the spec of an environment.
+
+    Raises:
+        UnknownEnvironment: There is none.
+    """
     spec = tasks.ENVIRONMENTS.get(env_name) if isinstance(env_name, str) else None
     if spec is None:
         raise UnknownEnvironment(env_name, registered_envs())
@@ -279,7 +300,11 @@ def _base(
     material: Material | None,
     options: Mapping[str, Any],
 ) -> Env:
-    """Returns the environment inside all wrappers."""
+    """Returns the environment inside all wrappers.
+
+    Raises:
+        TypeError: ``material`` is none, or the environment does not take an option.
+    """
     if material is not None and not isinstance(material, Material):
         raise TypeError(
             f"material={material!r}: allowed: None, newton_qd.robots.Material"
@@ -292,7 +317,11 @@ def _base(
 def _require_keywords(
     env_name: str, base: Callable[..., Env], given: Mapping[str, Any]
 ) -> None:
-    """Raises for keyword arguments that the environment inside does not take."""
+    """Checks the keyword arguments of the environment inside.
+
+    Raises:
+        TypeError: It does not take one of them.
+    """
     parameters = inspect.signature(base).parameters.values()
     if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
         return
@@ -310,7 +339,12 @@ def _wrapper_options(
     spec: EnvironmentSpec,
     given: Sequence[Mapping[str, Any]] | None,
 ) -> list[Mapping[str, Any]]:
-    """Returns the keyword arguments of each wrapper of a spec."""
+    """Returns the keyword arguments of each wrapper of a spec.
+
+    Raises:
+        TypeError: They are no sequence of dictionaries.
+        ValueError: There are more or fewer than wrappers.
+    """
     if given is None:
         return [wrapper_spec.options for wrapper_spec in spec.wrappers]
     if isinstance(given, Mapping) or not all(isinstance(x, Mapping) for x in given):

@@ -19,11 +19,11 @@ By the name that wrappers receive:
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Generic, TypeVar
+from typing import Generic, TypeAlias, TypeVar
 
 from newton_qd import tasks
-from newton_qd.extractors import Extractor
 from newton_qd.tasks import EnvironmentSpec
+from newton_qd.types import DescriptorExtractor
 
 Value = TypeVar("Value")
 
@@ -79,8 +79,10 @@ class _BaseColumn(_Column[Value]):
             yield spec.base_name, spec
 
 
-descriptor_extractor: Mapping[str, Extractor] = _Column("descriptor_extractor")
-behavior_descriptor_extractor: Mapping[str, Extractor] = descriptor_extractor
+Extractors: TypeAlias = Mapping[str, DescriptorExtractor]
+
+descriptor_extractor: Extractors = _Column("descriptor_extractor")
+behavior_descriptor_extractor: Extractors = descriptor_extractor
 reward_offset: Mapping[str, float] = _Column("reward_offset")
 original_reward_offset: Mapping[str, float] = _Column("original_reward_offset")
 FEET_NAMES: Mapping[str, tuple[str, ...]] = _BaseColumn("feet")

@@ -25,12 +25,12 @@ from newton_qd.envs.reacher import Reacher, ReacherAngle
 from newton_qd.envs.swimmer import Swimmer
 from newton_qd.envs.walker2d import Walker2d
 from newton_qd.extractors import (
-    Extractor,
     get_feet_contact_proportion,
     get_final_xy_position,
 )
 from newton_qd.moved import moved_name
 from newton_qd.robots import HUMANOID, ROBOTS, RobotSpec
+from newton_qd.types import DescriptorExtractor
 from newton_qd.wrappers import (
     FeetContactWrapper,
     MazeWrapper,
@@ -83,7 +83,7 @@ class EnvironmentSpec:
     base: Callable[..., Env]
     base_name: str
     wrappers: tuple[WrapperSpec, ...] = ()
-    descriptor_extractor: Extractor | None = None
+    descriptor_extractor: DescriptorExtractor | None = None
     reward_offset: float | None = None
     original_reward_offset: float | None = None
     robot: RobotSpec | None = None

@@ -212,7 +212,9 @@ def test_old_names_of_the_methods() -> None:
 
         class Old(nq.Locomotion):
             def _outcome(self, before: Any, after: Any, action: Any) -> Any:
-                reward, done, metrics = super()._outcome(before, after, action)
+                reward, done, metrics = super()._outcome(  # pyright: ignore
+                    before, after, action
+                )
                 return 2 * reward, done, metrics
 
     assert seen[0].filename == __file__

@@ -16,7 +16,6 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-import newton_qd
 import newton_qd.compat
 
 # QDax and what it imports warn about their own use of other packages.

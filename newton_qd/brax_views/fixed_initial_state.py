@@ -49,7 +49,9 @@ class FixedInitialStateWrapper(fixed_initial_state.FixedInitialStateWrapper):
         checks.function("get_obs_fn", get_obs_fn, allowed, optional=True)
         if get_obs_fn is not None and not isinstance(base, PhysicsEnv):
             allowed = "simulated robots, or get_obs_fn=None"
-            raise unsupported(env, base_env_name or base.name, allowed)
+            raise NotImplementedError(
+                unsupported(env, base_env_name or base.name, allowed)
+            )
         self._get_obs_fn = get_obs_fn
         super().__init__(env, base_env_name)
 

@@ -10,7 +10,8 @@ from typing import Any
 import jax
 
 from newton_qd.brax_views.views import QP, SystemView, qp_view
-from newton_qd.envs.base import Env, PhysicsEnv
+from newton_qd.envs.base import PhysicsEnv
+from newton_qd.envs.env import Env
 from newton_qd.envs.state import State
 from newton_qd.physics.system import System
 from newton_qd.types import Action, Params, RNGKey
@@ -91,15 +92,29 @@ class BraxViewsWrapper(Wrapper):
         self._body_names = body_names
 
     def reset(self, rng: RNGKey) -> State:
-        """Begins an episode."""
+        """Begins an episode.
+
+        Raises:
+            ValueError: The environment is float64 and JAX x64 is off.
+        """
         return self._viewed(self.env.reset(rng))
 
     def step(self, state: State, action: Action, params: Params = None) -> State:
-        """Advances by one step."""
+        """Advances by one step.
+
+        Raises:
+            TypeError: The state or the action is of another type.
+            ValueError: The state is of another environment, or the action of another
+                shape.
+        """
         return self._viewed(self.env.step(state, action, params))
 
     def fixed_state(self) -> State:
-        """Returns the state of a reset without noise."""
+        """Returns the state of a reset without noise.
+
+        Raises:
+            ValueError: The environment is float64 and JAX x64 is off.
+        """
         inside: Any = self.env
         return self._viewed(inside.fixed_state())
 

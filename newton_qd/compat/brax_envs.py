@@ -10,7 +10,6 @@ import jax
 
 from newton_qd import registry, tables
 from newton_qd.compat.scoring import (
-    Extractor,
     default_task,
     evaluate,
     get_mask_from_transitions,
@@ -20,6 +19,7 @@ from newton_qd.compat.scoring import (
 )
 from newton_qd.envs.base import Env
 from newton_qd.envs.state import State
+from newton_qd.types import DescriptorExtractor, ExtraScores, Genotype, PyTree, RNGKey
 
 __all__ = [
     "create",
@@ -35,8 +35,8 @@ __all__ = [
     "scoring_function_brax_envs",
 ]
 
-ScoresAndKey = tuple[jax.Array, jax.Array, dict[str, Any], jax.Array]
-ScoringFunction = Callable[[Any, jax.Array], ScoresAndKey]
+ScoresAndKey = tuple[jax.Array, jax.Array, ExtraScores, jax.Array]
+ScoringFunction = Callable[[Genotype, RNGKey], ScoresAndKey]
 
 
 def create(env_name: str, *args: Any, **kwargs: Any) -> Env:
@@ -63,12 +63,12 @@ def create_fn(env_name: str, **kwargs: Any) -> Callable[..., Env]:
     static_argnames=("episode_length", "play_step_fn", "behavior_descriptor_extractor"),
 )
 def scoring_function_brax_envs(
-    policies_params: Any,
+    policies_params: Genotype,
     random_key: jax.Array,
     init_states: State,
     episode_length: int,
     play_step_fn: Callable[..., tuple],
-    behavior_descriptor_extractor: Extractor,
+    behavior_descriptor_extractor: DescriptorExtractor,
 ) -> ScoresAndKey:
     """Evaluates policies from given states.
 
@@ -105,13 +105,13 @@ def scoring_function_brax_envs(
     ),
 )
 def scoring_actor_dc_function_brax_envs(
-    actors_dc_params: Any,
+    actors_dc_params: Genotype,
     descs: jax.Array,
     random_key: jax.Array,
     init_states: State,
     episode_length: int,
     play_step_actor_dc_fn: Callable[..., tuple],
-    behavior_descriptor_extractor: Extractor,
+    behavior_descriptor_extractor: DescriptorExtractor,
 ) -> ScoresAndKey:
     """Evaluates policies that are told which descriptor to reach.
 
@@ -141,12 +141,12 @@ def scoring_actor_dc_function_brax_envs(
 
 
 def reset_based_scoring_function_brax_envs(
-    policies_params: Any,
+    policies_params: Genotype,
     random_key: jax.Array,
     episode_length: int,
     play_reset_fn: Callable[[jax.Array], State],
     play_step_fn: Callable[..., tuple],
-    behavior_descriptor_extractor: Extractor,
+    behavior_descriptor_extractor: DescriptorExtractor,
 ) -> ScoresAndKey:
     """As ``scoring_function_brax_envs``, from states that ``play_reset_fn`` makes."""
     init_states, random_key = _reset(
@@ -163,13 +163,13 @@ def reset_based_scoring_function_brax_envs(
 
 
 def reset_based_scoring_actor_dc_function_brax_envs(
-    actors_dc_params: Any,
+    actors_dc_params: Genotype,
     descs: jax.Array,
     random_key: jax.Array,
     episode_length: int,
     play_reset_fn: Callable[[jax.Array], State],
     play_step_actor_dc_fn: Callable[..., tuple],
-    behavior_descriptor_extractor: Extractor,
+    behavior_descriptor_extractor: DescriptorExtractor,
 ) -> ScoresAndKey:
     """As ``scoring_actor_dc_function_brax_envs``, from ``play_reset_fn``'s states."""
     init_states, random_key = _reset(
@@ -198,7 +198,7 @@ def _reset(
 def create_brax_scoring_fn(
     env: Env,
     policy_network: Any,
-    bd_extraction_fn: Extractor,
+    bd_extraction_fn: DescriptorExtractor,
     random_key: jax.Array,
     play_step_fn: Callable[..., tuple] | None = None,
     episode_length: int = 100,
@@ -271,8 +271,8 @@ def create_default_brax_task_components(
 
 def get_aurora_scoring_fn(
     scoring_fn: ScoringFunction,
-    observation_extractor_fn: Callable[[Any], jax.Array],
-) -> Callable[[Any, jax.Array], tuple[jax.Array, None, dict[str, Any], jax.Array]]:
+    observation_extractor_fn: Callable[[PyTree], jax.Array],
+) -> Callable[[Genotype, RNGKey], tuple[jax.Array, None, ExtraScores, jax.Array]]:
     """Makes a scoring function that leaves the descriptors to AURORA.
 
     Args:
@@ -282,8 +282,8 @@ def get_aurora_scoring_fn(
     """
 
     def score(
-        params: Any, random_key: jax.Array
-    ) -> tuple[jax.Array, None, dict[str, Any], jax.Array]:
+        params: Genotype, random_key: jax.Array
+    ) -> tuple[jax.Array, None, ExtraScores, jax.Array]:
         fitnesses, _, extra, random_key = scoring_fn(params, random_key)
         observations = observation_extractor_fn(extra["transitions"])
         extra = {**extra, "last_valid_observations": observations}

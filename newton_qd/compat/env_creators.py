@@ -10,7 +10,6 @@ import jax
 
 from newton_qd import registry, tables
 from newton_qd.compat.scoring import (
-    Extractor,
     Scores,
     default_task,
     evaluate,
@@ -21,6 +20,7 @@ from newton_qd.compat.scoring import (
 )
 from newton_qd.envs.base import Env
 from newton_qd.envs.state import State
+from newton_qd.types import DescriptorExtractor, ExtraScores, Genotype, PyTree, RNGKey
 
 __all__ = [
     "create",
@@ -33,7 +33,7 @@ __all__ = [
     "scoring_function_brax_envs",
 ]
 
-ScoringFunction = Callable[[Any, jax.Array], Scores]
+ScoringFunction = Callable[[Genotype, RNGKey], Scores]
 
 
 def create(env_name: str, *args: Any, legacy_spring: bool = True, **kwargs: Any) -> Env:
@@ -74,12 +74,12 @@ def create_fn(env_name: str, **kwargs: Any) -> Callable[..., Env]:
     ),
 )
 def scoring_function_brax_envs(
-    policies_params: Any,
+    policies_params: Genotype,
     key: jax.Array,
     episode_length: int,
     play_reset_fn: Callable[[jax.Array], State],
     play_step_fn: Callable[..., tuple],
-    descriptor_extractor: Extractor,
+    descriptor_extractor: DescriptorExtractor,
 ) -> Scores:
     """Evaluates policies side by side.
 
@@ -108,7 +108,7 @@ def scoring_function_brax_envs(
 def create_brax_scoring_fn(
     env: Env,
     policy_network: Any,
-    descriptor_extraction_fn: Extractor,
+    descriptor_extraction_fn: DescriptorExtractor,
     key: jax.Array,
     play_step_fn: Callable[..., tuple] | None = None,
     episode_length: int = 100,
@@ -171,9 +171,9 @@ def create_default_brax_task_components(
 
 def get_aurora_scoring_fn(
     scoring_fn: ScoringFunction,
-    observation_extractor_fn: Callable[[Any], jax.Array],
+    observation_extractor_fn: Callable[[PyTree], jax.Array],
     observations_key: str,
-) -> Callable[[Any, jax.Array], tuple[jax.Array, None, dict[str, Any]]]:
+) -> Callable[[Genotype, RNGKey], tuple[jax.Array, None, ExtraScores]]:
     """Makes a scoring function that leaves the descriptors to AURORA.
 
     Args:
@@ -182,7 +182,7 @@ def get_aurora_scoring_fn(
         observations_key: Key of that in the third result.
     """
 
-    def score(params: Any, key: jax.Array) -> tuple[jax.Array, None, dict[str, Any]]:
+    def score(params: Genotype, key: jax.Array) -> tuple[jax.Array, None, ExtraScores]:
         fitnesses, _, extra = scoring_fn(params, key)
         observations = observation_extractor_fn(extra["transitions"])
         return fitnesses, None, {**extra, observations_key: observations}

@@ -12,14 +12,14 @@ from newton_qd import registry
 from newton_qd.envs.base import Env
 from newton_qd.envs.state import State
 from newton_qd.extractors import folded_sum
+from newton_qd.types import DescriptorExtractor, ExtraScores, Genotype, PyTree, RNGKey
 
-Extractor = Callable[[Any, jax.Array], jax.Array]
-Scores = tuple[jax.Array, jax.Array, dict[str, Any]]
+Scores = tuple[jax.Array, jax.Array, ExtraScores]
 
 
 def make_policy_network_play_step_fn_brax(
     env: Env, policy_network: Any
-) -> Callable[[State, Any, Any], tuple[State, Any, Any, Any]]:
+) -> Callable[[State, Genotype, RNGKey], tuple[State, Genotype, RNGKey, PyTree]]:
     """Makes the function that lets a policy take one step.
 
     Args:
@@ -32,7 +32,9 @@ def make_policy_network_play_step_fn_brax(
     """
     from qdax.core.neuroevolution.buffers.buffer import QDTransition
 
-    def play_step(state: State, params: Any, key: Any) -> tuple[State, Any, Any, Any]:
+    def play_step(
+        state: State, params: Genotype, key: RNGKey
+    ) -> tuple[State, Genotype, RNGKey, PyTree]:
         actions = policy_network.apply(params, state.obs)
         following = env.step(state, actions)
         transition = QDTransition(
@@ -50,7 +52,7 @@ def make_policy_network_play_step_fn_brax(
     return play_step
 
 
-def get_mask_from_transitions(data: Any) -> jax.Array:
+def get_mask_from_transitions(data: PyTree) -> jax.Array:
     """Marks what comes after the end of an episode.
 
     Args:
@@ -65,10 +67,10 @@ def get_mask_from_transitions(data: Any) -> jax.Array:
 
 def evaluate(
     play_step: Callable[..., tuple],
-    carry: tuple[Any, ...],
+    carry: tuple[PyTree, ...],
     in_axes: tuple[int | None, ...],
     episode_length: int,
-    descriptor_extractor: Extractor,
+    descriptor_extractor: DescriptorExtractor,
 ) -> Scores:
     """Lets N policies play an episode each, side by side.
 
@@ -86,8 +88,10 @@ def evaluate(
         (N, D); and ``{"transitions": ...}``.
     """
 
-    def episode(*carry: Any) -> Any:
-        def body(carry: tuple[Any, ...], _: None) -> tuple[tuple[Any, ...], Any]:
+    def episode(*carry: PyTree) -> PyTree:
+        def body(
+            carry: tuple[PyTree, ...], _: None
+        ) -> tuple[tuple[PyTree, ...], PyTree]:
             *carry_list, transition = play_step(*carry)
             return tuple(carry_list), transition
 
@@ -99,7 +103,7 @@ def evaluate(
     return fitnesses, descriptor_extractor(data, mask), {"transitions": data}
 
 
-def population_size(params: Any) -> int:
+def population_size(params: Genotype) -> int:
     """Number of individuals whose parameters have them on the leading axis."""
     return jax.tree.leaves(params)[0].shape[0]
 

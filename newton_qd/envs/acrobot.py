@@ -37,6 +37,10 @@ class Acrobot(PhysicsEnv):
             reset_noise_scale: Half width of the uniform noise on joint angles [rad]
                 and joint velocities [rad/s] at a reset.
             dtype: ``"float32"``, or ``"float64"`` with JAX x64 on.
+
+        Raises:
+            TypeError: An option is of another type.
+            ValueError: An option has a value that is not allowed.
         """
         super().__init__(ACROBOT, reset_noise_scale=reset_noise_scale, dtype=dtype)
 

@@ -70,6 +70,10 @@ class Ant(PhysicsEnv):
             exclude_current_positions_from_observation: Whether the observation
                 omits x and y of the torso.
             dtype: ``"float32"``, or ``"float64"`` with JAX x64 on.
+
+        Raises:
+            TypeError: An option is of another type.
+            ValueError: An option has a value that is not allowed.
         """
         self._ctrl_cost_weight = ctrl_cost_weight
         self._use_contact_forces = use_contact_forces

@@ -142,6 +142,10 @@ class PhysicsEnv(Env):
 
         Args:
             material: Softness of contacts and joint limits.
+
+        Raises:
+            TypeError: ``material`` is no material.
+            ValueError: A number of the material is not allowed.
         """
         changed = copy.copy(self)
         changed.robot = dataclasses.replace(self.robot, material=material)
@@ -153,6 +157,9 @@ class PhysicsEnv(Env):
 
         Args:
             width: Share of the robot's weight over which it rises [-], above 0.
+
+        Raises:
+            ValueError: ``width`` is not above 0.
         """
         changed = copy.copy(self)
         changed._feet_width = width
@@ -256,7 +263,11 @@ class PhysicsEnv(Env):
         return physics.seen_bodies(self.system, state)
 
     def reset(self, rng: RNGKey) -> State:
-        """Begins an episode in the default pose with noise on the joints."""
+        """Begins an episode in the default pose with noise on the joints.
+
+        Raises:
+            ValueError: The environment is float64 and JAX x64 is off.
+        """
         inputs.require_precision(self._dtype)
         root_key, angle_key, velocity_key = jax.random.split(rng, 3)
         rest = self._rest()
@@ -270,12 +281,23 @@ class PhysicsEnv(Env):
         return self._first_state(physics.initial_state(self.system, q, v))
 
     def fixed_state(self) -> State:
-        """Returns the state of a reset without noise: the default pose, at rest."""
+        """Returns the state of a reset without noise: the default pose, at rest.
+
+        Raises:
+            ValueError: The environment is float64 and JAX x64 is off.
+        """
         inputs.require_precision(self._dtype)
         return self._first_state(self._rest())
 
     def step(self, state: State, action: Action, params: Params = None) -> State:
-        """Advances by one control step, or freezes a world at fault."""
+        """Advances by one control step, or freezes a world at fault.
+
+        Raises:
+            TypeError: The state or the action is of another type.
+            ValueError: The state is of another environment, the action of another
+                shape, ``params`` are not those of this robot, or the environment is
+                float64 and JAX x64 is off.
+        """
         inputs.require_precision(self._dtype)
         inputs.require_state(state, "fault")
         action = inputs.checked_action(action, self.action_size, self._dtype)
@@ -308,7 +330,11 @@ class PhysicsEnv(Env):
 
     @property
     def default_params(self) -> physics.PhysicsParams:
-        """Physical parameters of one world as in the robot's files."""
+        """Physical parameters of one world as in the robot's files.
+
+        Raises:
+            ValueError: The environment is float64 and JAX x64 is off.
+        """
         inputs.require_precision(self._dtype)
         return physics.default_params(self.system)
 

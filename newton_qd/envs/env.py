@@ -28,6 +28,9 @@ class Env(abc.ABC):
 
         Args:
             rng: One key, ``jax.random.key(0)`` or ``jax.random.PRNGKey(0)``.
+
+        Raises:
+            ValueError: The environment is float64 and JAX x64 is off.
         """
 
     @abc.abstractmethod
@@ -39,6 +42,12 @@ class Env(abc.ABC):
             action: (nu,) array of the environment's dtype, meant for -1 to 1.
             params: Physical parameters of the world, as ``default_params`` with fields
                 replaced; ``None``: as in its files.
+
+        Raises:
+            TypeError: The state or the action is of another type.
+            ValueError: The state is of another environment, the action of another
+                shape, ``params`` are not those of this robot, or the environment is
+                float64 and JAX x64 is off.
         """
 
     @property
@@ -121,7 +130,11 @@ class Env(abc.ABC):
     if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any:
-            """Says where views of brax v1 are."""
+            """Says where views of brax v1 are.
+
+            Raises:
+                AttributeError: Always: what is there is found without this.
+            """
             raise AttributeError(no_brax_view(self, name, ("sys",)))
 
 

@@ -60,6 +60,10 @@ class Hopper(PhysicsEnv):
             exclude_current_positions_from_observation: Whether the observation
                 omits x of the torso.
             dtype: ``"float32"``, or ``"float64"`` with JAX x64 on.
+
+        Raises:
+            TypeError: An option is of another type.
+            ValueError: An option has a value that is not allowed.
         """
         self._task = planar.UprightRun(
             forward_reward_weight=forward_reward_weight,

@@ -41,6 +41,10 @@ class HumanoidStandup(Humanoid):
             reset_noise_scale: Half width of the uniform noise on joint angles [rad]
                 and joint velocities [rad/s] at a reset.
             dtype: ``"float32"``, or ``"float64"`` with JAX x64 on.
+
+        Raises:
+            TypeError: An option is of another type.
+            ValueError: An option has a value that is not allowed.
         """
         super().__init__(
             ctrl_cost_weight=0.01, reset_noise_scale=reset_noise_scale, dtype=dtype

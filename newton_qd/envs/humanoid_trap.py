@@ -54,6 +54,10 @@ class HumanoidTrap(Humanoid):
             exclude_current_positions_from_observation: Whether the observation
                 omits x and y of the torso.
             dtype: ``"float32"``, or ``"float64"`` with JAX x64 on.
+
+        Raises:
+            TypeError: An option is of another type.
+            ValueError: An option has a value that is not allowed.
         """
         super().__init__(
             forward_reward_weight=forward_reward_weight,

@@ -37,6 +37,10 @@ class InvertedPendulum(PhysicsEnv):
             reset_noise_scale: Half width of the uniform noise on the pole's angle
                 [rad] and angular velocity [rad/s] at a reset.
             dtype: ``"float32"``, or ``"float64"`` with JAX x64 on.
+
+        Raises:
+            TypeError: An option is of another type.
+            ValueError: An option has a value that is not allowed.
         """
         super().__init__(
             INVERTED_PENDULUM, reset_noise_scale=reset_noise_scale, dtype=dtype
@@ -80,6 +84,10 @@ class InvertedDoublePendulum(PhysicsEnv):
             reset_noise_scale: Half width of the uniform noise on the poles' angles
                 [rad] and angular velocities [rad/s] at a reset.
             dtype: ``"float32"``, or ``"float64"`` with JAX x64 on.
+
+        Raises:
+            TypeError: An option is of another type.
+            ValueError: An option has a value that is not allowed.
         """
         super().__init__(
             INVERTED_DOUBLE_PENDULUM, reset_noise_scale=reset_noise_scale, dtype=dtype

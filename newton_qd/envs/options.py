@@ -7,9 +7,10 @@ import inspect
 import math
 import numbers
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, TypeGuard, TypeVar
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 Constructor = TypeVar("Constructor", bound=Callable[..., None])
 
@@ -36,11 +37,11 @@ def checked_options(init: Constructor) -> Constructor:
     return checked  # pyright: ignore[reportReturnType]
 
 
-def _anything(name: str, value: Any) -> None:
+def _anything(name: str, value: object) -> None:
     del name, value
 
 
-def check_number(name: str, value: Any) -> None:
+def check_number(name: str, value: object) -> None:
     """Raises where a number is none, or scales noise and is below 0.
 
     Raises:
@@ -54,7 +55,7 @@ def check_number(name: str, value: Any) -> None:
         raise ValueError(f"{name}={value!r}: allowed: {allowed}")
 
 
-def _range(name: str, value: Any) -> None:
+def _range(name: str, value: object) -> None:
     allowed = "two numbers, lowest below highest"
     if not isinstance(value, (tuple, list, np.ndarray)) or len(value) != 2:
         raise TypeError(f"{name}={value!r}: allowed: {allowed}")
@@ -64,7 +65,7 @@ def _range(name: str, value: Any) -> None:
         raise ValueError(f"{name}={value!r}: allowed: {allowed}")
 
 
-def check_flag(name: str, value: Any) -> None:
+def check_flag(name: str, value: object) -> None:
     """Raises where a value that switches something is none.
 
     Raises:
@@ -76,7 +77,9 @@ def check_flag(name: str, value: Any) -> None:
         raise TypeError(f"{name}={value!r}: allowed: True, False")
 
 
-def check_count(name: str, value: Any, least: int = 1, most: int = 2**31 - 1) -> None:
+def check_count(
+    name: str, value: object, least: int = 1, most: int = 2**31 - 1
+) -> None:
     """Raises where a number of things is none.
 
     Args:
@@ -89,12 +92,12 @@ def check_count(name: str, value: Any, least: int = 1, most: int = 2**31 - 1) ->
         ValueError: It is no integer, or out of its range.
     """
     integer = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
-    if not integer or not least <= value <= most:
+    if not integer or not least <= value <= most:  # pyright: ignore
         raise ValueError(f"{name}={value!r}: allowed: integers from {least} to {most}")
 
 
 def check_positive(
-    name: str, value: Any, *, endless: bool = False, optional: bool = False
+    name: str, value: object, *, endless: bool = False, optional: bool = False
 ) -> None:
     """Raises where a number is not above 0.
 
@@ -118,7 +121,7 @@ def check_positive(
         raise ValueError(f"{name}={value!r}: {allowed}")
 
 
-def float_type(dtype: Any) -> np.dtype:
+def float_type(dtype: DTypeLike) -> np.dtype:
     """The type that an environment computes in.
 
     Raises:
@@ -133,12 +136,12 @@ def float_type(dtype: Any) -> np.dtype:
     return found
 
 
-def is_number(value: Any) -> bool:
+def is_number(value: object) -> TypeGuard[float]:
     """Returns whether a value is a real number; ``True`` and ``False`` are none."""
     return isinstance(value, numbers.Real) and not isinstance(value, bool)
 
 
-_CHECKS: dict[str, Callable[[str, Any], None]] = {
+_CHECKS: dict[str, Callable[[str, object], None]] = {
     "float": check_number,
     "tuple[float, float]": _range,
     "bool": check_flag,

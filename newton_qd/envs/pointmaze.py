@@ -68,6 +68,10 @@ class PointMaze(QDEnv):
             upper_wall_height_offset: y of the lower face of the upper wall.
             lower_wall_height_offset: y of the lower face of the lower wall.
             dtype: ``"float32"``, or ``"float64"`` with JAX x64 on.
+
+        Raises:
+            ValueError: A number is not finite, a border or a wall leaves no way, or
+                ``dtype`` is float64 and JAX x64 is off.
         """
         _require_numbers(
             zone_width_offset_from_x_min=zone_width_offset_from_x_min,
@@ -95,7 +99,11 @@ class PointMaze(QDEnv):
         self._upper_ends = x_min + width
 
     def reset(self, rng: RNGKey) -> State:
-        """Begins an episode at a random place at the bottom of the box."""
+        """Begins an episode at a random place at the bottom of the box.
+
+        Raises:
+            ValueError: The environment is float64 and JAX x64 is off.
+        """
         require_precision(self._dtype)
         _, x_key, y_key = jax.random.split(rng, 3)
         (left, bottom), (right, _) = self._low, self._high
@@ -104,12 +112,23 @@ class PointMaze(QDEnv):
         return self._first_state(jnp.stack([x, y]))
 
     def fixed_state(self) -> State:
-        """Returns the state of a reset without noise: the middle of the places."""
+        """Returns the state of a reset without noise: the middle of the places.
+
+        Raises:
+            ValueError: The environment is float64 and JAX x64 is off.
+        """
         require_precision(self._dtype)
         return self._first_state(self._start())
 
     def step(self, state: State, action: Action, params: Params = None) -> State:
-        """Moves the point, or freezes it where something is not finite."""
+        """Moves the point, or freezes it where something is not finite.
+
+        Raises:
+            TypeError: The state or the action is of another type.
+            ValueError: The state is of another environment, the action of another
+                shape, ``params`` are given, or the environment is float64 and JAX x64
+                is off.
+        """
         require_precision(self._dtype)
         require_state(state, "fault")
         refuse_params(params)
@@ -280,7 +299,11 @@ def _crossing(
 
 
 def _require_numbers(positive: bool = False, **settings: float) -> None:
-    """Raises for a setting that is not finite, or not above 0."""
+    """Checks settings.
+
+    Raises:
+        ValueError: One is not finite, or not above 0.
+    """
     for name, value in settings.items():
         if not math.isfinite(value) or (positive and value <= 0):
             allowed = "finite, above 0" if positive else "finite numbers"
@@ -290,7 +313,11 @@ def _require_numbers(positive: bool = False, **settings: float) -> None:
 def _require_box(
     x: tuple[float, float], y: tuple[float, float], walls: tuple[float, float]
 ) -> None:
-    """Raises for borders or walls that leave no way from the start to the top."""
+    """Checks borders and walls.
+
+    Raises:
+        ValueError: They leave no way from the start to the top.
+    """
     if not -math.inf < x[0] < x[1] < math.inf:
         raise ValueError(
             f"x_min={x[0]!r}, x_max={x[1]!r}: allowed: finite, x_min below x_max"

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from newton_qd.envs.base import Env
 from newton_qd.envs.options import check_count
 from newton_qd.physics.parameters import FIELDS, PhysicsParams, check_bounds
 from newton_qd.types import RNGKey
 
-Range: TypeAlias = tuple[Any, Any]
+Range: TypeAlias = tuple[ArrayLike, ArrayLike]
+"""Lowest and highest value."""
 
 
 def randomize_params(
@@ -79,7 +81,12 @@ def randomize_params(
 
 
 def _default(env: Env, worlds: int | None) -> PhysicsParams:
-    """Returns the parameters of one world as in the files."""
+    """Returns the parameters of one world as in the files.
+
+    Raises:
+        TypeError: ``env`` is no environment.
+        ValueError: It has no physical parameters, or ``worlds`` is no number of worlds.
+    """
     if not hasattr(env, "unwrapped"):
         raise TypeError(f"env={env!r}; allowed: an environment, as create() makes it")
     default = env.unwrapped.default_params
@@ -92,8 +99,12 @@ def _default(env: Env, worlds: int | None) -> PhysicsParams:
     return default
 
 
-def _bounds(name: str, limits: Any, default: jax.Array) -> tuple[np.ndarray, ...]:
-    """Returns the checked ends of a range, in the type of the parameter."""
+def _bounds(name: str, limits: Range, default: jax.Array) -> tuple[np.ndarray, ...]:
+    """Returns the checked ends of a range, in the type of the parameter.
+
+    Raises:
+        ValueError: The range is not one.
+    """
     allowed = f"allowed: (low, high), numbers or arrays of shape {default.shape}"
     try:
         low, high = (

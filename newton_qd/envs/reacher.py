@@ -49,6 +49,10 @@ class Reacher(PhysicsEnv):
                 reset [rad].
             reset_velocity_noise_scale: That of joint velocities [rad/s].
             dtype: ``"float32"``, or ``"float64"`` with JAX x64 on.
+
+        Raises:
+            TypeError: An option is of another type.
+            ValueError: An option has a value that is not allowed.
         """
         super().__init__(
             self._spec,

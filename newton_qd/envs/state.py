@@ -42,7 +42,11 @@ class State:
     if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any:
-            """Says where views of brax v1 are."""
+            """Says where views of brax v1 are.
+
+            Raises:
+                AttributeError: Always: what is there is found without this.
+            """
             raise AttributeError(no_brax_view(self, name, ("qp", "system")))
 
     def replace(self, **changes: Any) -> State:

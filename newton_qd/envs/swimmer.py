@@ -72,6 +72,10 @@ class Swimmer(PhysicsEnv):
             exclude_current_positions_from_observation: Whether the observation
                 omits x and y of the torso.
             dtype: ``"float32"``, or ``"float64"`` with JAX x64 on.
+
+        Raises:
+            TypeError: An option is of another type.
+            ValueError: An option has a value that is not allowed.
         """
         self._forward_reward_weight = forward_reward_weight
         self._ctrl_cost_weight = ctrl_cost_weight

@@ -21,7 +21,11 @@ class AutoResetWrapper(Wrapper):
     """
 
     def reset(self, rng: RNGKey) -> State:
-        """Begins an episode and remembers its first state."""
+        """Begins an episode and remembers its first state.
+
+        Raises:
+            ValueError: The environment is float64 and JAX x64 is off.
+        """
         state = self.env.reset(rng)
         first = {
             "first_pipeline_state": state.pipeline_state,
@@ -35,7 +39,13 @@ class AutoResetWrapper(Wrapper):
         return state.replace(info={**state.info, **first})
 
     def step(self, state: State, action: Action, params: Params = None) -> State:
-        """Advances by one step, then returns the finished worlds."""
+        """Advances by one step, then returns the finished worlds.
+
+        Raises:
+            TypeError: The state or the action is of another type.
+            ValueError: The state is of another environment, or the action of another
+                shape.
+        """
         require_state(state, "first_obs")
         begins = state.done > 0
         counters = {key: state.info[key] for key in _COUNTERS if key in state.info}

@@ -16,8 +16,8 @@ from newton_qd.scenes import Scene
 from newton_qd.types import Action, Params, RNGKey
 
 
-def unsupported(env: Env, env_name: str, allowed: str) -> NotImplementedError:
-    """Returns the error of a wrapper that an environment does not fit into.
+def unsupported(env: Env, env_name: str, allowed: str) -> str:
+    """Returns the message of a wrapper that an environment does not fit into.
 
     Args:
         env: The environment.
@@ -25,9 +25,7 @@ def unsupported(env: Env, env_name: str, allowed: str) -> NotImplementedError:
         allowed: What does fit.
     """
     refusal = message("env", Fact(type(env.unwrapped).__name__), allowed)
-    return NotImplementedError(
-        f"This wrapper does not support {env_name} yet. {refusal}"
-    )
+    return f"This wrapper does not support {env_name} yet. {refusal}"
 
 
 class Wrapper(Env):
@@ -38,14 +36,29 @@ class Wrapper(Env):
     """
 
     def __init__(self, env: Env) -> None:
+        """Wraps an environment.
+
+        Args:
+            env: The environment.
+        """
         self.env = env
 
     def reset(self, rng: RNGKey) -> State:
-        """Begins an episode."""
+        """Begins an episode.
+
+        Raises:
+            ValueError: The environment is float64 and JAX x64 is off.
+        """
         return self.env.reset(rng)
 
     def step(self, state: State, action: Action, params: Params = None) -> State:
-        """Advances by one step."""
+        """Advances by one step.
+
+        Raises:
+            TypeError: The state or the action is of another type.
+            ValueError: The state is of another environment, or the action of another
+                shape.
+        """
         return self.env.step(state, action, params)
 
     @property
@@ -98,7 +111,11 @@ class Wrapper(Env):
         return self.with_base(lambda base: base.with_material(material))
 
     def __getattr__(self, name: str) -> Any:
-        """Looks in the environment inside: ``batch_size``, descriptors, ``system``."""
+        """Looks in the environment inside: ``batch_size``, descriptors, ``system``.
+
+        Raises:
+            AttributeError: It is not there.
+        """
         # Private names stay private, and while a copy is being made ``env`` is not
         # there yet: asking for it here would never end.
         if name.startswith("_") or name == "env":

@@ -29,6 +29,9 @@ class ClipRewardWrapper(Wrapper):
             env: The environment.
             clip_min: Lowest reward; ``None``: no limit.
             clip_max: Highest reward, not below ``clip_min``; ``None``: no limit.
+
+        Raises:
+            ValueError: A limit is no number, or the lowest is above the highest.
         """
         for name, value in (("clip_min", clip_min), ("clip_max", clip_max)):
             checks.number(name, value, endless=True, optional=True, error=ValueError)
@@ -42,11 +45,21 @@ class ClipRewardWrapper(Wrapper):
         self._high = math.inf if clip_max is None else float(clip_max)
 
     def reset(self, rng: RNGKey) -> State:
-        """Begins an episode."""
+        """Begins an episode.
+
+        Raises:
+            ValueError: The environment is float64 and JAX x64 is off.
+        """
         return self._clipped(self.env.reset(rng))
 
     def step(self, state: State, action: Action, params: Params = None) -> State:
-        """Advances by one step."""
+        """Advances by one step.
+
+        Raises:
+            TypeError: The state or the action is of another type.
+            ValueError: The state is of another environment, or the action of another
+                shape.
+        """
         return self._clipped(self.env.step(state, action, params))
 
     def _clipped(self, state: State) -> State:

@@ -41,7 +41,12 @@ class CompletedEvalWrapper(Wrapper):
     STATE_INFO_KEY = "completed_eval_metrics"
 
     def reset(self, rng: RNGKey) -> State:
-        """Begins an episode with empty sums."""
+        """Begins an episode with empty sums.
+
+        Raises:
+            ValueError: No ``EpisodeWrapper`` inside counts steps, or the environment is
+                float64 and JAX x64 is off.
+        """
         state = with_reward_metric(self.env.reset(rng))
         require_steps(state, type(self).__name__)
         sums = CompletedEvalMetrics(
@@ -53,7 +58,13 @@ class CompletedEvalWrapper(Wrapper):
         return state.replace(info={**state.info, self.STATE_INFO_KEY: sums})
 
     def step(self, state: State, action: Action, params: Params = None) -> State:
-        """Advances by one step; an episode that ends is added to the completed."""
+        """Advances by one step; an episode that ends is added to the completed.
+
+        Raises:
+            TypeError: The state or the action is of another type.
+            ValueError: The state has no sums of this wrapper, or the action has another
+                shape.
+        """
         sums = state.info[self.STATE_INFO_KEY]
         if not isinstance(sums, CompletedEvalMetrics):
             raise ValueError(f"Incorrect type for state_metrics: {type(sums)}")

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 from newton_qd.checks import message
 from newton_qd.envs.base import Env, QDEnv
 from newton_qd.envs.state import State
-from newton_qd.extractors import Extractor, get_mean_state_descriptor
-from newton_qd.types import Action, Descriptor, Params, RNGKey
+from newton_qd.extractors import get_mean_state_descriptor
+from newton_qd.types import Action, Descriptor, DescriptorExtractor, Params, RNGKey
 from newton_qd.wrappers.base import Wrapper
 
 
@@ -27,7 +27,7 @@ class DescriptorWrapper(Wrapper, QDEnv):
     limits: ClassVar[tuple[Sequence[float], Sequence[float]]]
     """Lowest and highest value of each of the nd components; what is beyond them is in
     the outermost cells of an archive."""
-    descriptor_extractor: Extractor = staticmethod(get_mean_state_descriptor)
+    descriptor_extractor: DescriptorExtractor = staticmethod(get_mean_state_descriptor)
     """Makes the descriptors of episodes from their state descriptors: the mean."""
 
     def __init__(self, env: Env, env_name: str) -> None:
@@ -52,7 +52,12 @@ class DescriptorWrapper(Wrapper, QDEnv):
         """
 
     def reset(self, rng: RNGKey) -> State:
-        """Begins an episode."""
+        """Begins an episode.
+
+        Raises:
+            ValueError: ``describe`` returns another shape than the limits have, or the
+                environment is float64 and JAX x64 is off.
+        """
         return self._described(self.env.reset(rng))
 
     def step(self, state: State, action: Action, params: Params = None) -> State:
@@ -73,7 +78,11 @@ class DescriptorWrapper(Wrapper, QDEnv):
         return state.replace(info={**state.info, "state_descriptor": described})
 
     def _checked(self, state: State) -> Descriptor:
-        """Returns what describes a state of one world, or raises for its shape."""
+        """Returns what describes a state of one world.
+
+        Raises:
+            ValueError: It is of another shape than the limits have.
+        """
         described = jnp.asarray(self.describe(state), self.dtype)
         if described.shape != (self.state_descriptor_length,):
             allowed = f"shape {(self.state_descriptor_length,)}, as its limits"

@@ -26,6 +26,16 @@ class EpisodeWrapper(Wrapper):
     """
 
     def __init__(self, env: Env, episode_length: int, action_repeat: int) -> None:
+        """Wraps an environment.
+
+        Args:
+            env: The environment.
+            episode_length: Control steps after which an episode ends.
+            action_repeat: Control steps for each action.
+
+        Raises:
+            ValueError: A number is no integer above 0.
+        """
         checks.integer("episode_length", episode_length)
         checks.integer("action_repeat", action_repeat)
         super().__init__(env)
@@ -33,7 +43,11 @@ class EpisodeWrapper(Wrapper):
         self.action_repeat = int(action_repeat)
 
     def reset(self, rng: RNGKey) -> State:
-        """Begins an episode at step 0."""
+        """Begins an episode at step 0.
+
+        Raises:
+            ValueError: The environment is float64 and JAX x64 is off.
+        """
         state = self.env.reset(rng)
         counts = {
             "steps": jnp.zeros_like(state.done),
@@ -42,7 +56,13 @@ class EpisodeWrapper(Wrapper):
         return state.replace(info={**state.info, **counts})
 
     def step(self, state: State, action: Action, params: Params = None) -> State:
-        """Repeats the action; the rewards are summed, the rest is of the last."""
+        """Repeats the action; the rewards are summed, the rest is of the last.
+
+        Raises:
+            TypeError: The state or the action is of another type.
+            ValueError: The state is of another environment, or the action of another
+                shape.
+        """
         require_state(state, "steps")
         nstate, steps = state, state.info["steps"]
         if self.action_repeat == 1:

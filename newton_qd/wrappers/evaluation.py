@@ -35,7 +35,12 @@ class EvalWrapper(Wrapper):
     STATE_INFO_KEY = "eval_metrics"
 
     def reset(self, rng: RNGKey) -> State:
-        """Begins an episode with empty sums."""
+        """Begins an episode with empty sums.
+
+        Raises:
+            ValueError: No ``EpisodeWrapper`` inside counts steps, or the environment is
+                float64 and JAX x64 is off.
+        """
         state = with_reward_metric(self.env.reset(rng))
         require_steps(state, type(self).__name__)
         sums = EvalMetrics(
@@ -46,7 +51,13 @@ class EvalWrapper(Wrapper):
         return state.replace(info={**state.info, self.STATE_INFO_KEY: sums})
 
     def step(self, state: State, action: Action, params: Params = None) -> State:
-        """Advances by one step and adds its metrics while the episode lasts."""
+        """Advances by one step and adds its metrics while the episode lasts.
+
+        Raises:
+            TypeError: The state or the action is of another type.
+            ValueError: The state has no sums of this wrapper, or the action has another
+                shape.
+        """
         sums = state.info[self.STATE_INFO_KEY]
         if not isinstance(sums, EvalMetrics):
             raise ValueError(f"Incorrect type for state_metrics: {type(sums)}")
@@ -73,7 +84,11 @@ def with_reward_metric(state: State) -> State:
 
 
 def require_steps(state: State, wrapper: str) -> None:
-    """Raises where no ``EpisodeWrapper`` counts steps."""
+    """Raises where no ``EpisodeWrapper`` counts steps.
+
+    Raises:
+        ValueError: ``info`` has no steps.
+    """
     if "steps" not in state.info:
         given = Fact("a state without info['steps']")
         allowed = (

@@ -50,7 +50,9 @@ class FeetContactWrapper(DescriptorWrapper):
         """
         robot = env.unwrapped
         if not isinstance(robot, PhysicsEnv) or not len(robot.system.feet):
-            raise unsupported(env, env_name, "simulated robots with feet")
+            raise NotImplementedError(
+                unsupported(env, env_name, "simulated robots with feet")
+            )
         checks.number("smooth_width", smooth_width, above=0, optional=True)
         if straight_through and smooth_width is None:
             allowed = (

@@ -42,13 +42,19 @@ class FixedInitialStateWrapper(Wrapper):
             raise TypeError(message("get_obs_fn", get_obs_fn, allowed))
         if not callable(getattr(base, "fixed_state", None)):
             allowed = "environments with a method fixed_state(), as every PhysicsEnv"
-            raise unsupported(env, base_env_name or base.name, allowed)
+            raise NotImplementedError(
+                unsupported(env, base_env_name or base.name, allowed)
+            )
         self._env_name = base_env_name
         self._effective = env is base
         super().__init__(env if self._effective else env.with_base(self._around))
 
     def reset(self, rng: RNGKey) -> State:
-        """Begins an episode; the key is not used."""
+        """Begins an episode; the key is not used.
+
+        Raises:
+            ValueError: The environment is float64 and JAX x64 is off.
+        """
         if not self._effective:
             return self.env.reset(rng)
         # of what is inside now: ``with_base`` may have put something else there

@@ -32,6 +32,10 @@ class MazeWrapper(SceneTaskWrapper):
         Args:
             env: The environment, with or without wrappers.
             env_name: Its name, for the error.
+
+        Raises:
+            NotImplementedError: The environment is no such robot.
+            ValueError: The robot stands in a scene already.
         """
         super().__init__(env, env_name)
         system = self.system

@@ -19,6 +19,10 @@ class NoForwardRewardWrapper(Wrapper):
             env: The environment; its class gives ``forward_reward_name``. Where it
                 repeats actions, this wrapper goes inside the ``EpisodeWrapper``.
             env_name: Its name, for the error.
+
+        Raises:
+            NotImplementedError: The reward has no forward part.
+            ValueError: The environment repeats actions.
         """
         base = env.unwrapped
         name = base.forward_reward_name if isinstance(base, PhysicsEnv) else None
@@ -27,7 +31,7 @@ class NoForwardRewardWrapper(Wrapper):
                 "simulated robots whose class names the metric of its forward reward "
                 "as forward_reward_name"
             )
-            raise unsupported(env, env_name, allowed)
+            raise NotImplementedError(unsupported(env, env_name, allowed))
         repeat = getattr(env, "action_repeat", 1)
         if repeat != 1:
             given = Fact(f"an environment that repeats actions {repeat} times")
@@ -40,7 +44,13 @@ class NoForwardRewardWrapper(Wrapper):
         self._forward_reward = name
 
     def step(self, state: State, action: Action, params: Params = None) -> State:
-        """Advances by one step."""
+        """Advances by one step.
+
+        Raises:
+            TypeError: The state or the action is of another type.
+            ValueError: The state is of another environment, or the action of another
+                shape.
+        """
         state = self.env.step(state, action, params)
         forward = state.metrics[self._forward_reward]
         return state.replace(reward=state.reward - forward)

@@ -18,17 +18,31 @@ class OffsetRewardWrapper(Wrapper):
         Args:
             env: The environment; an action that it repeats gets the offset once.
             offset: What is added, as ``newton_qd.tables.reward_offset[name]``.
+
+        Raises:
+            TypeError: ``offset`` is no number.
+            ValueError: ``offset`` is not finite.
         """
         checks.number("offset", offset)
         super().__init__(env)
         self._offset = float(offset)
 
     def reset(self, rng: RNGKey) -> State:
-        """Begins an episode."""
+        """Begins an episode.
+
+        Raises:
+            ValueError: The environment is float64 and JAX x64 is off.
+        """
         return self._shifted(self.env.reset(rng))
 
     def step(self, state: State, action: Action, params: Params = None) -> State:
-        """Advances by one step."""
+        """Advances by one step.
+
+        Raises:
+            TypeError: The state or the action is of another type.
+            ValueError: The state is of another environment, or the action of another
+                shape.
+        """
         return self._shifted(self.env.step(state, action, params))
 
     def _shifted(self, state: State) -> State:

@@ -44,7 +44,9 @@ class SceneTaskWrapper(Wrapper):
         """
         base = env.unwrapped
         if not isinstance(base, PhysicsEnv) or not _floats(base.system):
-            raise unsupported(env, env_name, "simulated robots whose torso floats")
+            raise NotImplementedError(
+                unsupported(env, env_name, "simulated robots whose torso floats")
+            )
         if base.system.scene is not None:
             given = Fact(f"{env_name} in the scene {base.system.scene.name!r}")
             raise ValueError(message("env", given, "robots without a scene"))
@@ -56,15 +58,29 @@ class SceneTaskWrapper(Wrapper):
         super().__init__(env)
 
     def reset(self, rng: RNGKey) -> State:
-        """Begins an episode."""
+        """Begins an episode.
+
+        Raises:
+            ValueError: The environment is float64 and JAX x64 is off.
+        """
         return self._judged(self.env.reset(rng))
 
     def step(self, state: State, action: Action, params: Params = None) -> State:
-        """Advances by one step."""
+        """Advances by one step.
+
+        Raises:
+            TypeError: The state or the action is of another type.
+            ValueError: The state is of another environment, or the action of another
+                shape.
+        """
         return self._judged(self.env.step(state, action, params))
 
     def fixed_state(self) -> State:
-        """Returns the state of a reset without noise."""
+        """Returns the state of a reset without noise.
+
+        Raises:
+            ValueError: The environment is float64 and JAX x64 is off.
+        """
         inside: Any = self.env
         return self._judged(inside.fixed_state())
 
@@ -83,7 +99,8 @@ class SceneTaskWrapper(Wrapper):
 
     def _position(self, state: State) -> jax.Array:
         """Returns the position (3,) of the torso [m]."""
-        base: Any = self.unwrapped
+        base = self.unwrapped
+        assert isinstance(base, PhysicsEnv)
         start = int(base.system.q_start[base.system.torso])
         return state.pipeline_state.q[start : start + 3]
 

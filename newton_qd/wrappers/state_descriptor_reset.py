@@ -17,7 +17,12 @@ class StateDescriptorResetWrapper(QDWrapper):
     """
 
     def reset(self, rng: RNGKey) -> State:
-        """Begins an episode and remembers its first state descriptor."""
+        """Begins an episode and remembers its first state descriptor.
+
+        Raises:
+            KeyError: No wrapper inside writes a state descriptor.
+            ValueError: The environment is float64 and JAX x64 is off.
+        """
         state = self.env.reset(rng)
         if "state_descriptor" not in state.info:
             raise KeyError(
@@ -28,7 +33,13 @@ class StateDescriptorResetWrapper(QDWrapper):
         return state.replace(info={**state.info, "first_state_descriptor": first})
 
     def step(self, state: State, action: Action, params: Params = None) -> State:
-        """Advances by one step, then returns the descriptors of finished worlds."""
+        """Advances by one step, then returns the descriptors of finished worlds.
+
+        Raises:
+            TypeError: The state or the action is of another type.
+            ValueError: The state is of another environment, or the action of another
+                shape.
+        """
         state = self.env.step(state, action, params)
         first = state.info["first_state_descriptor"]
         descriptor = select(state.done > 0, first, state.info["state_descriptor"])

@@ -22,6 +22,15 @@ class VectorWrapper(Wrapper):
     """
 
     def __init__(self, env: Env, batch_size: int) -> None:
+        """Wraps an environment of one world.
+
+        Args:
+            env: The environment.
+            batch_size: Number of worlds that a reset makes.
+
+        Raises:
+            ValueError: The number is no integer above 0, or there is a batch already.
+        """
         checks.integer("batch_size", batch_size)
         inside = env
         while isinstance(inside, Wrapper):
@@ -34,7 +43,11 @@ class VectorWrapper(Wrapper):
         self.batch_size = int(batch_size)
 
     def reset(self, rng: RNGKey) -> State:
-        """Begins an episode in every world, from one key."""
+        """Begins an episode in every world, from one key.
+
+        Raises:
+            ValueError: The environment is float64 and JAX x64 is off.
+        """
         return jax.vmap(self.env.reset)(jax.random.split(rng, self.batch_size))
 
     def step(self, state: State, action: Action, params: Params = None) -> State:
@@ -44,6 +57,11 @@ class VectorWrapper(Wrapper):
             state: Batched state.
             action: (batch, nu) actions.
             params: As for the environment inside, with the batch axis in front.
+
+        Raises:
+            TypeError: The state or the action is of another type.
+            ValueError: State, action or parameters do not have the same batch axis in
+                front.
         """
         batch = jnp.shape(state.done)
         if len(batch) != 1:

@@ -51,7 +51,7 @@ class XYPositionWrapper(DescriptorWrapper):
                 below the highest.
         """
         if not isinstance(env.unwrapped, PhysicsEnv):
-            raise unsupported(env, env_name, "simulated robots")
+            raise NotImplementedError(unsupported(env, env_name, "simulated robots"))
         super().__init__(env, env_name)
         self._low = _limit("minval", minval, -np.inf)
         self._high = _limit("maxval", maxval, np.inf)
@@ -87,7 +87,11 @@ class XYPositionWrapper(DescriptorWrapper):
 
 
 def _limit(name: str, given: Limits | None, unlimited: float) -> np.ndarray:
-    """Returns a limit as (2,) numbers, or raises what is wrong with it."""
+    """Returns a limit as (2,) numbers.
+
+    Raises:
+        ValueError: It is not two finite numbers.
+    """
     if given is None:
         return np.full(2, unlimited)
     refusal = message(name, given, "None, or two finite numbers")
