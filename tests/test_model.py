@@ -246,7 +246,7 @@ def test_joint_without_a_kind_is_refused(monkeypatch: pytest.MonkeyPatch) -> Non
         return built
 
     monkeypatch.setattr(build, "newton_builder", misbuild)
-    message = "joint 'ant/hip_2' is of Newton's type D6; allowed: FREE, REVOLUTE"
+    message = "Newton's type of joint 'ant/hip_2': got D6; allowed: FREE, REVOLUTE"
     with pytest.raises(RobotDescriptionError, match=message):
         build_system(ANT, "float32")
 
@@ -363,9 +363,11 @@ def test_robot_without_joints(tmp_path: Path) -> None:
 
 
 def test_precision() -> None:
-    with pytest.raises(ValueError, match="dtype='float16'; allowed: float32, float64"):
+    with pytest.raises(
+        ValueError, match="dtype: got 'float16'; allowed: float32, float64"
+    ):
         load_system(ANT, "float16")
-    with pytest.raises(ValueError, match="dtype='float64' needs JAX's 64-bit mode"):
+    with pytest.raises(ValueError, match="dtype: got 'float64' while JAX x64 is off"):
         load_system(ANT, "float64")
 
 

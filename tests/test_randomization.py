@@ -105,9 +105,9 @@ def test_ranges_of_arrays_and_of_one_value() -> None:
         ({"friction": 0.5}, r"friction=0.5.*\(low, high\)"),
         ({"gear_scale": (np.ones(3), 2.0)}, r"gear_scale=.*\(8,\)"),
         ({"gravity": (2.0, 1.0)}, r"gravity=.*low is above high"),
-        ({"mass_scale": (0.0, 1.0)}, r"mass_scale: 0.0 given; .*above 0"),
-        ({"damping_scale": (-1.0, 1.0)}, r"damping_scale: -1.0 given; .*0 or more"),
-        ({"friction": (0.0, np.inf)}, r"friction: inf given; .*finite"),
+        ({"mass_scale": (0.0, 1.0)}, r"mass_scale: got 0.0; .*above 0"),
+        ({"damping_scale": (-1.0, 1.0)}, r"damping_scale: got -1.0; .*from 0"),
+        ({"friction": (0.0, np.inf)}, r"friction: got inf; .*finite"),
         ({"worlds": 0}, "worlds=0: allowed: integers from 1"),
         ({"worlds": True}, r"worlds=True: allowed"),
     ],
@@ -125,17 +125,25 @@ def replaced(**changes: Any) -> PhysicsParams:
 @pytest.mark.parametrize(
     ("params", "error", "message"),
     [
-        ({"mass": 2.0}, TypeError, r"params: dict given; allowed: None, or Phys"),
-        (2.0, TypeError, r"params: float given"),
+        (
+            {"mass": 2.0},
+            TypeError,
+            r"params: got {'mass': 2.0}; allowed: None, or Phys",
+        ),
+        (2.0, TypeError, r"params: got 2.0"),
         (lambda: replaced(mass_scale=jnp.ones(8)), ValueError, r"mass_scale: .*\(9,\)"),
         (lambda: replaced(friction=jnp.ones(1)), ValueError, r"friction: .*\(\)"),
-        (lambda: replaced(gravity=jnp.ones((), int)), TypeError, r"gravity: dtype int"),
-        (lambda: replaced(gear_scale=None), TypeError, r"gear_scale: NoneType"),
-        (lambda: replaced(friction="a"), TypeError, r"friction: str"),
-        (lambda: replaced(mass_scale=-jnp.ones(9)), ValueError, r"mass_scale: -1.0"),
+        (lambda: replaced(gravity=jnp.ones((), int)), TypeError, r"gravity: got .*int"),
+        (lambda: replaced(gear_scale=None), TypeError, r"gear_scale: got None"),
+        (lambda: replaced(friction="a"), TypeError, r"friction: got 'a'"),
+        (
+            lambda: replaced(mass_scale=-jnp.ones(9)),
+            ValueError,
+            r"mass_scale: got -1.0",
+        ),
         (lambda: replaced(inertia_scale=jnp.zeros(9)), ValueError, r"above 0"),
-        (lambda: replaced(friction=-0.5), ValueError, r"params.friction: -0.5"),
-        (lambda: replaced(gravity=np.float32(np.nan)), ValueError, r"gravity: nan"),
+        (lambda: replaced(friction=-0.5), ValueError, r"params.friction: got -0.5"),
+        (lambda: replaced(gravity=np.float32(np.nan)), ValueError, r"gravity: got nan"),
     ],
 )
 def test_wrong_parameters(params: Any, error: type[Exception], message: str) -> None:
@@ -150,7 +158,7 @@ def test_wrong_batch() -> None:
     env = make("ant_uni", "batch")
     state, action = reset(env)(KEY), jnp.zeros((3, 8), np.float32)
     one = make("ant_uni").default_params
-    with pytest.raises(ValueError, match=r"params: .*shape \(\) .*batch axis \(3,\)"):
+    with pytest.raises(ValueError, match=r"params: .*shape \(\), .*batch axis \(3,\)"):
         env.step(state, action, one)
     with pytest.raises(ValueError, match=r"params: .*shape \(4,\)"):
         env.step(state, action, randomize_params(KEY, env, 4))
@@ -161,7 +169,7 @@ def test_float64_parameters_are_refused_by_float32(x64: None) -> None:
     default: Any = env.default_params
     assert default.gravity.dtype == np.float32
     wide = default.replace(damping_scale=jnp.ones(14, np.float64))
-    with pytest.raises(TypeError, match=r"damping_scale: dtype float64.*float32"):
+    with pytest.raises(TypeError, match=r"damping_scale: got .*float64; .*float32"):
         jax.eval_shape(env.step, reset(env)(KEY), jnp.zeros(8, np.float32), wide)
 
 

@@ -140,5 +140,5 @@ def test_variants_are_made_once() -> None:
     assert smooth is physics.load_system(ANT, feet_width=0.1)
     assert smooth is not plain and smooth.feet_width == 0.1
     assert dataclasses.replace(smooth).mass is plain.mass
-    with pytest.raises(ValueError, match=r"feet_width=0.0.*above 0"):
+    with pytest.raises(ValueError, match=r"feet_width: got 0.0.*above 0"):
         physics.load_system(ANT, feet_width=0.0)

@@ -238,14 +238,14 @@ def test_precision(x64: None) -> None:
 @pytest.mark.parametrize("task", TASKS)
 def test_other_environments_are_refused(task: str) -> None:
     message = (
-        "This wrapper does not support pointmaze yet. Given: PointMaze; allowed: "
+        "This wrapper does not support pointmaze yet. env: got PointMaze; allowed: "
         "simulated robots whose torso floats"
     )
     with pytest.raises(NotImplementedError, match=message):
         TASKS[task](PointMaze(), "pointmaze")
     with pytest.raises(NotImplementedError, match="pointmaze is not a simulated robot"):
         PointMaze().with_scene(TRAP)
-    with pytest.raises(TypeError, match="scene='maze': allowed: None, or a Scene"):
+    with pytest.raises(TypeError, match="scene: got 'maze'; allowed: None, or a Scene"):
         Ant().with_scene("maze")  # pyright: ignore[reportArgumentType]
 
 

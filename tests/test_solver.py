@@ -319,7 +319,7 @@ def test_worlds_must_be_identical(
     model = finalized(replicated(robot, 3), device)
     solver = NewtonQDSolver(model, robot)
     edit(model)
-    with pytest.raises(ValueError, match=rf"model\.{name} of world {world} has"):
+    with pytest.raises(ValueError, match=rf"model\.{name} of world {world}: got"):
         NewtonQDSolver(model, robot)
     with pytest.raises(ValueError, match=rf"model\.{name}"):
         solver.notify_model_changed(0)
@@ -343,9 +343,9 @@ def _two_in_a_world(scene: newton.ModelBuilder, robot: RobotSpec) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (_particle, "model.particle_count is 1; expected 0"),
-        (_other_robot, "model.body_count is 13; expected 6: 3 worlds, each with one"),
-        (_two_in_a_world, "model.body_count is 8; expected 6"),
+        (_particle, "model.particle_count: got 1; allowed: 0"),
+        (_other_robot, "model.body_count: got 13; allowed: 6: 3 worlds, each with one"),
+        (_two_in_a_world, "model.body_count: got 8; allowed: 6"),
     ],
 )
 def test_other_things_in_the_model(
@@ -362,9 +362,9 @@ def test_another_joint_and_nothing(tmp_path: Path, device: jax.Device) -> None:
     robot = off_centre(tmp_path, ARM)
     builder = one_world(robot)
     builder.joint_type[1] = newton.JointType.PRISMATIC
-    with pytest.raises(ValueError, match=r"model\.joint_type of world 0 has 0 where"):
+    with pytest.raises(ValueError, match=r"model\.joint_type of world 0: got 0; allow"):
         NewtonQDSolver(finalized(builder, device), robot)
-    with pytest.raises(ValueError, match=r"model\.body_count is 0; expected 2"):
+    with pytest.raises(ValueError, match=r"model\.body_count: got 0; allowed: 2"):
         NewtonQDSolver(finalized(newton.ModelBuilder(), device), robot)
 
 
@@ -372,15 +372,15 @@ def test_bad_arguments_of_a_step(tmp_path: Path, device: jax.Device) -> None:
     robot = off_centre(tmp_path, ARM)
     loop = Loop(robot, 2, device)
     for dt in (0.0, -0.01, float("nan"), float("inf")):
-        with pytest.raises(ValueError, match=f"dt={dt!r}; allowed: positive"):
+        with pytest.raises(ValueError, match=f"dt: got {dt!r}; allowed: .*above 0"):
             loop.step(dt)
     other = finalized(replicated(robot, 3), device).state()
-    with pytest.raises(ValueError, match=r"state_in.joint_q has shape \(24,\); exp"):
+    with pytest.raises(ValueError, match=r"state_in.joint_q: got shape \(24,\); al"):
         loop.solver.step(other, loop.next, loop.control, None, 0.01)
-    with pytest.raises(ValueError, match=r"state_out.joint_q has shape \(24,\); exp"):
+    with pytest.raises(ValueError, match=r"state_out.joint_q: got shape \(24,\); al"):
         loop.solver.step(loop.now, other, loop.control, None, 0.01)
     loop.control.joint_f = None
-    with pytest.raises(ValueError, match=r"control.joint_f has shape None; expected"):
+    with pytest.raises(ValueError, match=r"control.joint_f: got None; allowed: shape"):
         loop.step(0.01)
 
 

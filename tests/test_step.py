@@ -342,10 +342,10 @@ def test_bad_number_of_threads_stops_a_step(
     system, states = single_states(4)
     monkeypatch.setenv("NEWTON_QD_THREADS", "many")
     # a callback's error arrives as JAX's own, which names it
-    with pytest.raises((ValueError, RuntimeError), match="THREADS='many'"):
+    with pytest.raises((ValueError, RuntimeError), match="THREADS: got 'many'"):
         outputs(system, states)
     # where a step is traced, before anything is compiled
-    with pytest.raises(ValueError, match="THREADS='many'"):
+    with pytest.raises(ValueError, match="THREADS: got 'many'"):
         jax.eval_shape(functools.partial(physics.step, system), *one_state(system))
     monkeypatch.delenv("NEWTON_QD_THREADS")
     assert np.isfinite(outputs(system, states)[0]).all()
@@ -361,11 +361,19 @@ def one_state(system: System) -> tuple[physics.PhysicsState, jax.Array]:
 @pytest.mark.parametrize(
     ("changes", "error", "message"),
     [
-        ({"q": np.zeros(14, np.float32)}, ValueError, r"q: shape \(14,\).*\(15,\)"),
-        ({"v": np.zeros(15, np.float32)}, ValueError, r"v: shape \(15,\).*\(14,\)"),
-        ({"q": np.zeros((2, 15), np.float32)}, ValueError, r"q: shape \(2, 15\)"),
-        ({"v": np.zeros(14, np.int32)}, TypeError, "v: dtype int32.*float32"),
-        ({"q": np.zeros(15, np.float16)}, TypeError, "q: dtype float16.*float32"),
+        (
+            {"q": np.zeros(14, np.float32)},
+            ValueError,
+            r"q: got .*shape \(14,\).*\(15,\)",
+        ),
+        (
+            {"v": np.zeros(15, np.float32)},
+            ValueError,
+            r"v: got .*shape \(15,\).*\(14,\)",
+        ),
+        ({"q": np.zeros((2, 15), np.float32)}, ValueError, r"q: got .*shape \(2, 15\)"),
+        ({"v": np.zeros(14, np.int32)}, TypeError, "v: got .*int32; .*float32"),
+        ({"q": np.zeros(15, np.float16)}, TypeError, "q: got .*float16; .*float32"),
     ],
 )
 def test_a_state_of_another_robot_is_named(

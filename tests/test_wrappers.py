@@ -346,7 +346,7 @@ def test_feet_contact_can_be_smooth() -> None:
         TypeError, match=r"smooth_width: got 'wide'; allowed: None, or f"
     ):
         FeetContactWrapper(Ant(), "ant", smooth_width=width)
-    with pytest.raises(ValueError, match=r"feet_width=-1.*above 0"):
+    with pytest.raises(ValueError, match=r"feet_width: got -1.*above 0"):
         Ant().with_feet_width(-1.0)
 
 

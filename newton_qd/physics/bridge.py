@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import warp as wp
 from jax.core import Tracer
 
+from newton_qd.checks import Fact, listed, message
 from newton_qd.physics import interrupts, layout
 from newton_qd.physics.launch import Launcher, thread_count
 from newton_qd.physics.layout import Layout
@@ -149,11 +150,11 @@ def _row(
         ValueError: An array has another shape.
     """
     for name, array in arrays.items():
-        expected = f"allowed: shape {shapes[name]}, {system.dtype}"
+        allowed = f"an array of shape {shapes[name]}, {system.dtype}"
         if array.shape != shapes[name]:
-            raise ValueError(f"{name}: shape {array.shape} given; {expected}")
+            raise ValueError(message(name, array, allowed))
         if array.dtype != system.dtype:
-            raise TypeError(f"{name}: dtype {array.dtype} given; {expected}")
+            raise TypeError(message(name, array, allowed))
     return jnp.concatenate(list(arrays.values()))
 
 
@@ -276,14 +277,11 @@ def _episode_reduction(name: str, dtype: str, steps: int, nd: int, size: int) ->
 
 def _episode_row(state_desc: jax.Array, mask: jax.Array) -> jax.Array:
     if state_desc.ndim != 2 or mask.shape != state_desc.shape[:1] or not mask.size:
-        raise ValueError(
-            f"state_desc, mask: shapes {state_desc.shape}, {mask.shape} given; "
-            "allowed: (t, nd) and (t,), t of 1 or more"
-        )
+        given = Fact(f"shapes {state_desc.shape}, {mask.shape}")
+        allowed = "(t, nd) and (t,), t of 1 or more"
+        raise ValueError(message("state_desc, mask", given, allowed))
     if state_desc.dtype.name not in SCALARS:
-        raise TypeError(
-            f"state_desc: dtype {state_desc.dtype} given; allowed: {', '.join(SCALARS)}"
-        )
+        raise TypeError(message("state_desc", state_desc, listed(SCALARS)))
     return jnp.concatenate([state_desc.ravel(), mask.astype(state_desc.dtype)])
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from newton_qd.checks import message
 from newton_qd.physics import bridge
 from newton_qd.physics.system import Kinematics, PhysicsState, System
 
@@ -19,7 +20,7 @@ def _rotate(quaternion: jax.Array, vector: jax.Array) -> jax.Array:
 def _checked(system: System, name: str, value: jax.Array, size: int) -> jax.Array:
     value = jnp.asarray(value, jnp.dtype(system.dtype))
     if value.shape != (size,):
-        raise ValueError(f"{name} has shape {value.shape}: expected ({size},)")
+        raise ValueError(message(name, value, f"an array of shape ({size},)"))
     return value
 
 

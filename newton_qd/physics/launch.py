@@ -9,6 +9,7 @@ from typing import Any
 
 import warp as wp
 
+from newton_qd.checks import listed, message
 from newton_qd.physics import buffers, layout
 from newton_qd.physics.precision import pack_width
 from newton_qd.physics.system import System
@@ -42,9 +43,7 @@ def thread_count() -> int:
             return len(os.sched_getaffinity(0))
         return os.cpu_count() or 1
     if not text.isdecimal() or int(text) < 1:
-        raise ValueError(
-            f"NEWTON_QD_THREADS={text!r}: expected an integer of 1 or more"
-        )
+        raise ValueError(message("NEWTON_QD_THREADS", text, "integers from 1"))
     return int(text)
 
 
@@ -63,7 +62,7 @@ def lane_count(kernel: str) -> int:
     if text is None:
         return _LANES[kernel]
     if not text.isdecimal() or int(text) not in LANES:
-        raise ValueError(f"NEWTON_QD_LANES={text!r}: expected one of {LANES}")
+        raise ValueError(message("NEWTON_QD_LANES", text, listed(LANES)))
     return int(text)
 
 

@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from newton_qd import checks
+from newton_qd.checks import message
 from newton_qd.physics import layout
 from newton_qd.physics.system import System
 
@@ -91,31 +93,19 @@ def check_bounds(name: str, values: np.ndarray) -> None:
     positive = name in _POSITIVE
     valid = np.isfinite(values) & ((values > 0) if positive else (values >= 0))
     if not np.all(valid):
-        raise ValueError(
-            f"params.{name}: {np.extract(~valid, values)[0]} given; allowed: finite, "
-            f"{'above 0' if positive else '0 or more'}"
-        )
+        allowed = f"finite numbers {'above' if positive else 'from'} 0"
+        wrong = np.extract(~valid, values)[0].item()
+        raise ValueError(message(f"params.{name}", wrong, allowed))
 
 
 def _checked(
     name: str, value: Any, shape: tuple[int, ...], dtype: np.dtype
 ) -> jax.Array:
     """Returns one parameter, strongly typed; weakly typed numbers are converted."""
-    expected = f"allowed: shape {shape}, {dtype}"
-    if not isinstance(value, (jax.Array, np.ndarray, np.generic, int, float)):
-        raise TypeError(f"params.{name}: {type(value).__name__} given; {expected}")
-    array = jnp.asarray(value)
-    weak = array.weak_type and not jnp.issubdtype(array.dtype, jnp.bool_)
-    if array.dtype != dtype and not weak:
-        raise TypeError(f"params.{name}: dtype {array.dtype} given; {expected}")
-    if array.shape != shape:
-        raise ValueError(
-            f"params.{name}: shape {array.shape} given; {expected} (for a batch, use "
-            "jax.vmap or create(..., batch_size=...))"
-        )
+    array = checks.array(f"params.{name}", value, shape, dtype, scalars=True)
     if not isinstance(array, Tracer):
         check_bounds(name, np.asarray(array))
-    return array.astype(dtype)
+    return array
 
 
 def parameter_row(system: System, params: PhysicsParams) -> jax.Array:
@@ -131,11 +121,8 @@ def parameter_row(system: System, params: PhysicsParams) -> jax.Array:
             system.
         ValueError: A field has another shape, or a number that is out of bounds.
     """
-    if not isinstance(params, PhysicsParams):
-        raise TypeError(
-            f"params: {type(params).__name__} given; allowed: None, or PhysicsParams, "
-            "as env.default_params.replace(friction=0.5)"
-        )
+    allowed = "None, or PhysicsParams, as env.default_params.replace(friction=0.5)"
+    checks.instance("params", params, PhysicsParams, allowed)
     dtype = np.dtype(system.dtype)
     return jnp.concatenate(
         [

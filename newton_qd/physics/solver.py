@@ -13,7 +13,9 @@ import numpy as np
 import warp as wp
 from newton.solvers import SolverBase
 
+from newton_qd import checks
 from newton_qd.assets import find_urdf
+from newton_qd.checks import Fact, message
 from newton_qd.physics import layout
 from newton_qd.physics.buffers import fill_row
 from newton_qd.physics.kernels.conventions import read_rows, write_rows
@@ -151,8 +153,7 @@ class NewtonQDSolver(SolverBase):
             RuntimeError: A ``wp.Tape`` is recording.
         """
         self.validate_observables(observables)
-        if not (math.isfinite(dt) and dt > 0.0):
-            raise ValueError(f"dt={dt!r}; allowed: positive numbers of seconds")
+        checks.number("dt", dt, above=0)
         if tape_is_recording():
             raise RuntimeError(
                 "NewtonQDSolver.step inside wp.Tape would record no gradient; "
@@ -190,8 +191,8 @@ class NewtonQDSolver(SolverBase):
         """Returns the array as (worlds, columns), without a copy."""
         size = self._worlds * columns
         if array is None or array.shape != (size,):
-            shape = None if array is None else array.shape
-            raise ValueError(f"{name} has shape {shape}; expected ({size},)")
+            given = None if array is None else Fact(f"shape {array.shape}")
+            raise ValueError(message(name, given, f"shape ({size},)"))
         return array.reshape((self._worlds, columns))
 
     def _zeros(self, *shape: int) -> wp.array:
@@ -229,15 +230,16 @@ def _check_model(model: newton.Model, one: newton.Model, robot: RobotSpec) -> No
     worlds = model.world_count
     for name in _ABSENT:
         if getattr(model, name):
-            raise ValueError(f"model.{name} is {getattr(model, name)}; expected 0")
+            raise ValueError(message(f"model.{name}", getattr(model, name), "0"))
     for kind in _COMPARED:
         name = f"{kind}_count"
         found, expected = getattr(model, name), worlds * getattr(one, name)
         if worlds < 1 or found != expected:
-            raise ValueError(
-                f"model.{name} is {found}; expected {expected}: {worlds} worlds, each "
-                f"with one robot {robot.name!r} of {getattr(one, name)}"
+            allowed = (
+                f"{expected}: {worlds} worlds, each with one robot {robot.name!r} of "
+                f"{getattr(one, name)}"
             )
+            raise ValueError(message(f"model.{name}", found, allowed))
     for names in _COMPARED.values():
         for name in names:
             _compare(name, _per_world(model, name, worlds), _per_world(one, name, 1))
@@ -247,10 +249,10 @@ def _check_model(model: newton.Model, one: newton.Model, robot: RobotSpec) -> No
         ours = _colliders(one, name, one.body_count)[0]
         for world, theirs in enumerate(_colliders(model, name, one.body_count)):
             if len(theirs) != len(ours):
-                raise ValueError(
-                    f"model.{name} has {len(theirs)} colliders on the bodies of world "
-                    f"{world}; the robot has {len(ours)}"
-                )
+                field = f"model.{name} of world {world}"
+                given = Fact(f"{len(theirs)} colliders")
+                allowed = f"{len(ours)}, as the robot has"
+                raise ValueError(message(field, given, allowed))
             _compare(name, theirs[None], ours[None], world)
 
 
@@ -284,8 +286,9 @@ def _compare(
     different = worlds != robot
     if different.any():
         place = tuple(np.argwhere(different)[0])
-        raise ValueError(
-            f"model.{name} of world {first_world + place[0]} has {worlds[place]} where "
-            f"the robot has {robot[(0, *place[1:])]}; every world must be a copy of "
-            "newton_builder()'s, unchanged"
+        field = f"model.{name} of world {first_world + place[0]}"
+        allowed = (
+            f"{robot[(0, *place[1:])]}, as the robot has; every world is an unchanged "
+            "copy of newton_builder()'s"
         )
+        raise ValueError(message(field, Fact(worlds[place]), allowed))

@@ -7,6 +7,7 @@ import dataclasses
 import jax
 import numpy as np
 
+from newton_qd.checks import Fact, message
 from newton_qd.physics.kinds import JointKind as JointKind
 from newton_qd.physics.kinds import ObstacleKind as ObstacleKind
 from newton_qd.robots import RobotSpec
@@ -134,10 +135,9 @@ class System:
             # the kernels read these tables without looking at their length
             rows = len(getattr(self, f"contact_{field}"))
             if rows != len(self.contact_body):
-                raise ValueError(
-                    f"contact_{field}: {rows} rows given; allowed: "
-                    f"{len(self.contact_body)}, as many as contact_body has"
-                )
+                allowed = f"{len(self.contact_body)}, as many as contact_body has"
+                given = Fact(f"{rows} rows")
+                raise ValueError(message(f"contact_{field}", given, allowed))
 
     @property
     def nb(self) -> int:

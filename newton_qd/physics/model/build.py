@@ -11,10 +11,11 @@ import dataclasses
 import functools
 from typing import TYPE_CHECKING
 
-import jax
 import numpy as np
 
+from newton_qd import checks
 from newton_qd.assets import find_urdf
+from newton_qd.checks import Fact, listed, message
 from newton_qd.physics import reference
 from newton_qd.physics.model.contacts import body_of, contact_tables, pair_shares
 from newton_qd.physics.model.description import (
@@ -36,7 +37,6 @@ from newton_qd.scenes import Scene
 if TYPE_CHECKING:
     import newton
 
-_DTYPES = ("float32", "float64")
 _EARTH_GRAVITY = 9.81  # [m/s^2]
 _DEFAULT_GEAR = 100.0  # [N m]
 
@@ -102,10 +102,9 @@ def _joint_kinds(model: newton.Model, description: Description) -> np.ndarray:
     for label, number in zip(model.joint_label, _numpy(model.joint_type), strict=True):
         kind = JointType(number)
         if kind not in kinds:
-            raise RobotDescriptionError(
-                f"{description.path}: joint {label!r} is of Newton's type "
-                f"{kind.name}; allowed: {', '.join(known.name for known in kinds)}"
-            )
+            name = f"{description.path}: Newton's type of joint {label!r}"
+            allowed = listed([known.name for known in kinds])
+            raise RobotDescriptionError(message(name, Fact(kind.name), allowed))
         found.append(kinds[kind])
     return np.array(found, dtype=np.int32)
 
@@ -117,10 +116,9 @@ def _read_newton(model: newton.Model, description: Description) -> BuiltModel:
     child = _numpy(model.joint_child)
     order = np.argsort(child, kind="stable")
     if not np.array_equal(child[order], np.arange(model.body_count)):
-        raise ModelMismatchError(
-            f"{description.path}: Newton's joints move the bodies {child.tolist()}; "
-            f"allowed: each of the {model.body_count} bodies once"
-        )
+        name = f"{description.path}: bodies that Newton's joints move"
+        allowed = f"each of the {model.body_count} bodies once"
+        raise ModelMismatchError(message(name, child.tolist(), allowed))
     v_start = _numpy(model.joint_qd_start)[:-1][order]
     single = kinds[order] != JointKind.FREE
 
@@ -225,7 +223,7 @@ def build_system(robot: RobotSpec, dtype: str, scene: Scene | None = None) -> Sy
         ModelMismatchError: Newton's model differs from the file.
         ValueError: ``dtype`` is not allowed, or needs JAX's 64-bit mode.
     """
-    _check_dtype(dtype)
+    dtype = checks.precision(dtype).name
     check_robot(robot)
     description = read_description(find_urdf(robot.urdf))
     builder = newton_builder(str(description.path), description.floating, robot.gravity)
@@ -271,16 +269,6 @@ def build_system(robot: RobotSpec, dtype: str, scene: Scene | None = None) -> Sy
     return dataclasses.replace(system, contact_pair_share=pair_shares(system))
 
 
-def _check_dtype(dtype: str) -> None:
-    if dtype not in _DTYPES:
-        raise ValueError(f"dtype={dtype!r}; allowed: {', '.join(_DTYPES)}")
-    if dtype == "float64" and not jax.config.read("jax_enable_x64"):
-        raise ValueError(
-            "dtype='float64' needs JAX's 64-bit mode; call "
-            "jax.config.update('jax_enable_x64', True) at the start, or use 'float32'"
-        )
-
-
 @functools.cache
 def _cached_system(robot: RobotSpec, dtype: str, scene: Scene | None) -> System:
     return build_system(robot, dtype, scene)
@@ -320,9 +308,10 @@ def load_system(
         ValueError: ``dtype`` is not allowed, or needs JAX's 64-bit mode; or
             ``feet_width`` is not above 0.
     """
-    _check_dtype(dtype)
-    if feet_width is not None and not feet_width > 0:
-        raise ValueError(f"feet_width={feet_width!r}: allowed: None, or above 0")
+    dtype = checks.precision(dtype).name
+    checks.number(
+        "feet_width", feet_width, above=0, endless=True, optional=True, error=ValueError
+    )
     check_robot(robot)  # before the cache hashes it
     system = _cached_system(robot, dtype, scene)
     return _cached_variant(system, feet_width, reports_bodies)

@@ -6,16 +6,16 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from newton_qd.checks import Fact, listed
 from newton_qd.physics import reference
 from newton_qd.physics.model.description import Body, Shape
-from newton_qd.physics.model.robot_checks import index_of
+from newton_qd.physics.model.robot_checks import index_of, refusal
 from newton_qd.physics.model.scene import (
     TOUCHING,
     ContactRow,
     wall_contacts,
     whole_collider,
 )
-from newton_qd.physics.model.xml_reader import RobotDescriptionError
 from newton_qd.physics.system import System
 from newton_qd.robots import Contact, RobotSpec
 from newton_qd.scenes import Scene
@@ -52,11 +52,13 @@ def _collider(robot: RobotSpec, contact: Contact, body: Body) -> Shape:
     found = _colliders(contact, body, (kind,))
     if len(found) != 1:
         named = "" if contact.collider is None else f" named {contact.collider!r}"
-        raise RobotDescriptionError(
-            f"robot {robot.name!r}, contacts: end={contact.end} of link "
-            f"{contact.link!r} needs a {kind} collider{named} and the link has "
-            f"{len(found)}; allowed: exactly one, with end 0 for a sphere, 1 or -1 "
-            "for a capsule, and its name in the file where there are several"
+        raise refusal(
+            robot,
+            f"contacts: end of {contact.link!r}",
+            contact.end,
+            "exactly one, with end 0 for a sphere, 1 or -1 for a capsule, and its name "
+            "in the file where there are several",
+            why=f"which needs a {kind} collider{named}, and the link has {len(found)}",
         )
     return found[0]
 
@@ -69,10 +71,9 @@ def _ground_contacts(robot: RobotSpec, bodies: list[Body]) -> Iterator[ContactRo
         body = body_of(robot, "contacts", contact.link, bodies)
         shape = _collider(robot, contact, bodies[body])
         if (id(shape), contact.end) in seen:
-            raise RobotDescriptionError(
-                f"robot {robot.name!r}, contacts: end={contact.end} of link "
-                f"{contact.link!r} given twice; allowed: once"
-            )
+            given = Fact(f"{contact.end} twice")
+            field = f"contacts: end of {contact.link!r}"
+            raise refusal(robot, field, given, "each once")
         seen.add((id(shape), contact.end))
         centre, radius = _contact_sphere(shape, contact.end)
         yield ContactRow(body, 0, centre, np.zeros(3), radius)
@@ -89,19 +90,16 @@ def _pair_sides(
             found = _colliders(contact, bodies[body], TOUCHING)
             if len(found) != 1:
                 named = "" if contact.collider is None else f" {contact.collider!r}"
-                raise RobotDescriptionError(
-                    f"robot {robot.name!r}, pairs: link {contact.link!r} has "
-                    f"{len(found)} colliders{named} of {', '.join(TOUCHING)}; "
-                    "allowed: exactly one, with its name in the file where there are "
-                    "several"
-                )
+                allowed = "exactly one, with its name in the file if there are several"
+                count = f"a link with {len(found)} colliders{named}"
+                why = f"{count} of {listed(TOUCHING)}"
+                raise refusal(robot, "pairs", contact.link, allowed, why=why)
             sides.append(whole_collider(body, -1, found[0]))
         first, second = sides
         if first.body == second.body:
-            raise RobotDescriptionError(
-                f"robot {robot.name!r}, pairs: {pair[0].link!r} and {pair[1].link!r} "
-                "move as one body; allowed: links with a joint between them"
-            )
+            given = Fact(f"{pair[0].link!r} and {pair[1].link!r}")
+            allowed = "links with a joint between them"
+            raise refusal(robot, "pairs", given, allowed, why="which move as one body")
         # from a sphere the nearest point of a segment is exact, not the other way round
         swap = np.linalg.norm(first.segment) > np.linalg.norm(second.segment)
         yield (second, first) if swap else (first, second)

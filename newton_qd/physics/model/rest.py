@@ -6,9 +6,9 @@ import dataclasses
 
 import numpy as np
 
+from newton_qd.checks import Fact
 from newton_qd.physics import reference
-from newton_qd.physics.model.robot_checks import index_of
-from newton_qd.physics.model.xml_reader import RobotDescriptionError
+from newton_qd.physics.model.robot_checks import index_of, refusal
 from newton_qd.physics.system import JointKind, System
 
 
@@ -57,10 +57,8 @@ def rest_coordinates(system: System) -> np.ndarray:
     q = np.array(system.rest_q)
     free = system.q_start[system.joint_kind == JointKind.FREE]
     if not len(free) and any(robot.rest_rotation):
-        raise RobotDescriptionError(
-            f"robot {robot.name!r}, rest_rotation={robot.rest_rotation!r}: the root is "
-            "not free; allowed: zeros"
-        )
+        why = "and the root is not free"
+        raise refusal(robot, "rest_rotation", robot.rest_rotation, "zeros", why=why)
     for start in free:
         q[start + 3 : start + 7] = reference.rpy_quaternion(*robot.rest_rotation)
     for joint, angle in robot.rest_pose:
@@ -71,18 +69,15 @@ def rest_coordinates(system: System) -> np.ndarray:
         dof, angle = system.v_start[body], q[system.q_start[body]]
         lower, upper = system.limit_lower[dof], system.limit_upper[dof]
         if not lower - 1e-9 <= angle <= upper + 1e-9:
-            raise RobotDescriptionError(
-                f"robot {robot.name!r}, rest_pose: joint {system.joint_names[body]!r} "
-                f"rests at {angle:g}; allowed: {lower:g} to {upper:g}"
-            )
+            field = f"rest_pose: angle of {system.joint_names[body]!r}"
+            allowed = f"{lower:g} to {upper:g}"
+            raise refusal(robot, field, Fact(f"{angle:g}"), allowed)
     posed = dataclasses.replace(system, rest_q=q.copy())
     height = raising_coordinate(posed)
     if height is None:
         if robot.rest_height is not None:
-            raise RobotDescriptionError(
-                f"robot {robot.name!r}, rest_height={robot.rest_height:g}: no "
-                "coordinate raises the torso; allowed: None"
-            )
+            why = "and no coordinate raises the torso"
+            raise refusal(robot, "rest_height", robot.rest_height, "None", why=why)
         return q
     coordinate, sign = height
     if robot.rest_height is not None:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import math
-import numbers
 import os
 from collections.abc import Callable
+from typing import Any
 
+from newton_qd import checks
+from newton_qd.checks import Fact, listed, message
 from newton_qd.physics.model.xml_reader import RobotDescriptionError
 from newton_qd.robots import Contact, Material, RobotSpec
 
@@ -51,6 +52,14 @@ _TUPLES: dict[str, tuple[Callable[[object], bool], str]] = {
 }
 
 
+def refusal(
+    robot: RobotSpec, field: str, value: Any, allowed: str, *, why: str = ""
+) -> RobotDescriptionError:
+    """Returns the error about a field of a robot."""
+    name = f"robot {robot.name!r}, {field}"
+    return RobotDescriptionError(message(name, value, allowed, why=why))
+
+
 def index_of(robot: RobotSpec, field: str, name: str, allowed: tuple[str, ...]) -> int:
     """Returns the position of a link's or joint's name in ``allowed``.
 
@@ -58,35 +67,26 @@ def index_of(robot: RobotSpec, field: str, name: str, allowed: tuple[str, ...]) 
         RobotDescriptionError: The row's field names something that is not there.
     """
     if not name or name not in allowed:
-        known = ", ".join(known for known in allowed if known)
-        raise RobotDescriptionError(
-            f"robot {robot.name!r}, {field}: {name!r} is not in {robot.urdf}; "
-            f"allowed: {known}"
-        )
+        known = listed([known for known in allowed if known])
+        raise refusal(robot, field, name, known, why=f"which is not in {robot.urdf}")
     return allowed.index(name)
 
 
 def _check_number(robot: RobotSpec, field: str, value: float, *, signed: bool) -> None:
     zero = field.split(".")[-1] in _MAY_BE_ZERO
-    valid = (
-        isinstance(value, numbers.Real)
-        and math.isfinite(value)
-        and (signed or value > 0 or (zero and value == 0))
+    checks.number(
+        f"robot {robot.name!r}, {field}",
+        value,
+        least=0 if zero and not signed else None,
+        above=None if zero or signed else 0,
+        error=RobotDescriptionError,
     )
-    if not valid:
-        allowed = "finite" if signed else "finite, " + ("0 or more" if zero else "> 0")
-        raise RobotDescriptionError(
-            f"robot {robot.name!r}, {field}={value!r}; allowed: {allowed}"
-        )
 
 
 def _check_unique(robot: RobotSpec, field: str, names: list[str]) -> None:
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
-        raise RobotDescriptionError(
-            f"robot {robot.name!r}, {field}: {', '.join(twice)} named twice; "
-            "allowed: once"
-        )
+        raise refusal(robot, field, Fact(f"{listed(twice)} twice"), "each once")
 
 
 def _pair_name(pair: tuple[Contact, Contact]) -> str:
@@ -102,59 +102,38 @@ def _check_types(robot: RobotSpec) -> None:
         TypeError: ``robot`` is not a row.
         RobotDescriptionError: A field is not of the type that it is read as.
     """
-    if not isinstance(robot, RobotSpec):
-        raise TypeError(
-            f"robot={robot!r}: allowed: a RobotSpec, such as newton_qd.robots.ANT"
-        )
-    if not isinstance(robot.name, str) or not robot.name:
-        raise RobotDescriptionError(
-            f"robot, name={robot.name!r}; allowed: a text that is not empty"
-        )
+    allowed = "a RobotSpec, such as newton_qd.robots.ANT"
+    checks.instance("robot", robot, RobotSpec, allowed)
+    checks.text("robot, name", robot.name, error=RobotDescriptionError)
     if not isinstance(robot.urdf, (str, os.PathLike)):
-        raise RobotDescriptionError(
-            f"robot {robot.name!r}, urdf={robot.urdf!r}; allowed: a path, such as "
-            '"robot.urdf"'
-        )
+        raise refusal(robot, "urdf", robot.urdf, 'a path, such as "robot.urdf"')
     for field, (is_entry, allowed) in _TUPLES.items():
         value = getattr(robot, field)
         # a text is a sequence, too: read letter by letter, not as one name
         if not isinstance(value, tuple):
-            raise RobotDescriptionError(
-                f"robot {robot.name!r}, {field}={value!r}; allowed: {allowed}"
-            )
+            raise refusal(robot, field, value, allowed)
         for index, entry in enumerate(value):
             if not is_entry(entry):
-                raise RobotDescriptionError(
-                    f"robot {robot.name!r}, {field}[{index}]={entry!r}; allowed: "
-                    f"{allowed}"
-                )
+                raise refusal(robot, f"{field}[{index}]", entry, allowed)
     rotation = robot.rest_rotation
     if not isinstance(rotation, tuple) or len(rotation) != 3:
-        raise RobotDescriptionError(
-            f"robot {robot.name!r}, rest_rotation={rotation!r}; allowed: a tuple of "
-            "roll, pitch and yaw"
-        )
+        allowed = "a tuple of roll, pitch and yaw"
+        raise refusal(robot, "rest_rotation", rotation, allowed)
     if not isinstance(robot.material, Material):
-        raise RobotDescriptionError(
-            f"robot {robot.name!r}, material={robot.material!r}; allowed: a Material"
-        )
+        raise refusal(robot, "material", robot.material, "a Material")
 
 
 def _check_contacts(robot: RobotSpec) -> None:
     """Checks the ends of contacts and pairs."""
     for contact in robot.contacts:
         if contact.end not in (-1, 0, 1):
-            raise RobotDescriptionError(
-                f"robot {robot.name!r}, contacts: end={contact.end!r} of link "
-                f"{contact.link!r}; allowed: -1, 0, 1"
-            )
+            field = f"contacts: end of {contact.link!r}"
+            raise refusal(robot, field, contact.end, "-1, 0, 1")
     for pair in robot.pairs:
         for contact in pair:
             if contact.end != 0:
-                raise RobotDescriptionError(
-                    f"robot {robot.name!r}, pairs: end={contact.end!r} of link "
-                    f"{contact.link!r}; allowed: 0, the whole collider"
-                )
+                field = f"pairs: end of {contact.link!r}"
+                raise refusal(robot, field, contact.end, "0, the whole collider")
 
 
 def check_robot(robot: RobotSpec) -> None:
@@ -182,15 +161,14 @@ def check_robot(robot: RobotSpec) -> None:
     driven = tuple(joint for joint, _ in robot.actuators)
     for joint in robot.servos:
         if joint not in driven:
-            raise RobotDescriptionError(
-                f"robot {robot.name!r}, servos: {joint!r} is not driven; allowed: "
-                f"{', '.join(driven) or 'none, as actuators is empty'}"
-            )
-    substeps = robot.substeps
-    if not isinstance(substeps, int) or isinstance(substeps, bool) or substeps < 1:
-        raise RobotDescriptionError(
-            f"robot {robot.name!r}, substeps={robot.substeps!r}; allowed: 1, 2, ..."
-        )
+            allowed = listed(driven, "none, as actuators is empty")
+            raise refusal(robot, "servos", joint, allowed, why="which is not driven")
+    checks.integer(
+        f"robot {robot.name!r}, substeps",
+        robot.substeps,
+        most=None,
+        error=RobotDescriptionError,
+    )
     _check_contacts(robot)
     _check_unique(robot, "actuators", [joint for joint, _ in robot.actuators])
     _check_unique(robot, "rest_pose", [joint for joint, _ in robot.rest_pose])
@@ -199,7 +177,5 @@ def check_robot(robot: RobotSpec) -> None:
     touching = {contact.link for contact in robot.contacts}
     for foot in robot.feet:
         if foot not in touching:
-            raise RobotDescriptionError(
-                f"robot {robot.name!r}, feet: {foot!r} has no contact; allowed: "
-                f"{', '.join(sorted(touching)) or 'none, as contacts is empty'}"
-            )
+            allowed = listed(sorted(touching), "none, as contacts is empty")
+            raise refusal(robot, "feet", foot, allowed, why="which has no contact")

@@ -7,7 +7,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from newton_qd import checks
 from newton_qd.assets import find_urdf
+from newton_qd.checks import Fact, listed, message
 from newton_qd.physics import reference
 from newton_qd.physics.model.description import (
     WORLD,
@@ -75,10 +77,8 @@ def read_scene(scene: Scene) -> tuple[SceneLink, ...]:
         RobotDescriptionError: The file is malformed, something in it moves or has
             mass, or a collider is of a kind that contacts do not have.
     """
-    if not isinstance(scene, Scene):
-        raise TypeError(
-            f"scene={scene!r}: allowed: None, or a Scene such as newton_qd.scenes.TRAP"
-        )
+    allowed = "None, or a Scene such as newton_qd.scenes.TRAP"
+    checks.instance("scene", scene, Scene, allowed)
     reader = XmlReader(find_urdf(scene.urdf))
     if reader.root.tag != "robot":
         raise reader.error(reader.root, "allowed as the outermost element: <robot>")
@@ -88,14 +88,12 @@ def read_scene(scene: Scene) -> tuple[SceneLink, ...]:
     links = {name: read_link(reader, element) for name, element in elements.items()}
     for name, link in links.items():
         if (name == WORLD and link.shapes) or link.mass > 0:
-            what = "a mass" if link.mass > 0 else "a collider"
-            raise reader.error(elements[name], f"has {what}; allowed in a scene: none")
+            what = "mass" if link.mass > 0 else "collider"
+            raise reader.refused(elements[name], what, Fact("one"), "none in a scene")
         for shape in link.shapes:
             if shape.kind not in _KINDS:
-                raise reader.error(
-                    elements[name],
-                    f"has a {shape.kind} as collider; allowed: {', '.join(_KINDS)}",
-                )
+                given = Fact(shape.kind)
+                raise reader.refused(elements[name], "collider", given, listed(_KINDS))
     frames = _link_frames(reader, links)
     return tuple(
         SceneLink(name, frames[name], _placed(links[name], frames[name]))
@@ -113,9 +111,9 @@ def _link_frames(reader: XmlReader, links: dict[str, Link]) -> dict[str, np.ndar
     for parent in pending:
         for joint in children[parent]:
             if joint.kind != "fixed":
+                name = f"{reader.path}: type of joint {joint.name!r}"
                 raise RobotDescriptionError(
-                    f"{reader.path}: joint {joint.name!r} is {joint.kind}; allowed in "
-                    "a scene: fixed"
+                    message(name, joint.kind, "fixed joints in a scene")
                 )
             frames[joint.child] = reference.compose(frames[parent], joint.frame)
             pending.append(joint.child)
@@ -170,17 +168,16 @@ def wall_contacts(
         names = tuple(dict.fromkeys(contact.link for contact in robot.contacts))
     for name in names:
         if name not in colliders:
+            field, why = f"scene {scene.name!r}, links", f"which is not in {robot.urdf}"
             raise RobotDescriptionError(
-                f"scene {scene.name!r}, links: {name!r} is not in {robot.urdf}; "
-                f"allowed: {', '.join(colliders)}"
+                message(field, name, listed(colliders), why=why)
             )
         body, shapes = colliders[name]
         if not shapes or any(shape.kind not in TOUCHING for shape in shapes):
-            found = ", ".join(shape.kind for shape in shapes) or "none"
-            raise RobotDescriptionError(
-                f"scene {scene.name!r}, links: colliders of {name!r} are {found}; "
-                f"allowed: at least one, each of {', '.join(TOUCHING)}"
-            )
+            field = f"scene {scene.name!r}, links: colliders of {name!r}"
+            found = Fact(listed([shape.kind for shape in shapes]))
+            allowed = f"at least one, each of {listed(TOUCHING)}"
+            raise RobotDescriptionError(message(field, found, allowed))
         for shape in shapes:
             for obstacle in range(1, obstacles):
                 yield whole_collider(body, obstacle, shape)

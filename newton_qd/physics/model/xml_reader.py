@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 from xml.parsers import expat
 
 import numpy as np
 
+from newton_qd.checks import message
 from newton_qd.physics.reference import rpy_quaternion
 
 IDENTITY = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
@@ -66,6 +68,12 @@ class XmlReader:
             f"{self.path}, line {self.lines[element]}, {label}: {text}"
         )
 
+    def refused(
+        self, element: ElementTree.Element, name: str, value: Any, allowed: str
+    ) -> RobotDescriptionError:
+        """Returns an error about a value, with file, line and element in front."""
+        return self.error(element, message(name, value, allowed))
+
     def text(self, element: ElementTree.Element, key: str) -> str:
         """Returns an attribute that must be there and not be empty."""
         value = element.get(key)
@@ -99,9 +107,7 @@ class XmlReader:
             values = np.empty(0)
         valid = np.isfinite(values) if finite else ~np.isnan(values)
         if len(values) != count or not valid.all():
-            raise self.error(
-                element, f"{key}={text!r}; allowed: {count} finite number(s)"
-            )
+            raise self.refused(element, key, text, f"{count} finite number(s)")
         return values
 
     def number(
@@ -116,9 +122,7 @@ class XmlReader:
         """Returns the ``count`` numbers of an attribute, all above zero."""
         values = self.numbers(element, key, count)
         if not (values > 0).all():
-            raise self.error(
-                element, f"{key}={element.get(key)!r}; allowed: positive numbers"
-            )
+            raise self.refused(element, key, element.get(key), "positive numbers")
         return values
 
     def frame(self, element: ElementTree.Element) -> np.ndarray:
