@@ -4,7 +4,7 @@ Every run, of one task, algorithm and seed, has the same budget of seconds: proc
 seconds on a CPU, which depend on what else the machine does only as far as cores share
 caches and memory, and wall-clock seconds on a GPU. Compilation is left out: all
 functions run once on a state that is thrown away before the clock starts. What
-evaluates the elites again, for corrected metrics, runs after the clock has stopped.
+evaluates the elites again, for metrics without luck, runs after the clock has stopped.
 
 A run is a process of its own and writes one csv file when it is finished; runs whose
 file exists are left out, so that a study can be stopped and continued. Settings of
@@ -178,10 +178,10 @@ def execute(run: Run, seconds: float, device: str, file: Path) -> None:
     held = search.checkpoint(state)
     names = [field.name for field in dataclasses.fields(Archive)]
     archive = Archive(**{name: getattr(held, name) for name in names})
-    corrected = search.correct(archive)
+    again = search.reevaluate(archive)
     empty = dict.fromkeys(("qd_score", "coverage", "max_fitness"), math.nan)
     for row in rows:
-        values = vars(corrected) if corrected and row is rows[-1] else empty
+        values = vars(again) if again and row is rows[-1] else empty
         row.update({f"corrected_{name}": values[name] for name in empty})
     write(file, rows)
 

@@ -194,10 +194,10 @@ def test_metrics_file(reference: Path) -> None:
 def test_corrected_metrics_are_those_of_the_elites_put_anew(tmp_path: Path) -> None:
     config = SMALL.replace(iterations=2, reevaluations=5)
     result = run(config, out=tmp_path / "run")
-    corrected = result.corrected
-    assert corrected is not None
+    again = result.reevaluated
+    assert again is not None
     written = json.loads((tmp_path / "run" / "corrected.json").read_text())
-    assert written == dataclasses.asdict(corrected)
+    assert written == dataclasses.asdict(again)
     task = point_task(config)
     policy = make_policy(task.env, config.hidden)
     score = jax.jit(make_scoring_function(task, policy, config.episode_length))
@@ -211,10 +211,10 @@ def test_corrected_metrics_are_those_of_the_elites_put_anew(tmp_path: Path) -> N
         distance = np.square(result.archive.centroids - descriptor).sum(-1)
         cell = int(distance.argmin())
         best[cell] = max(value, best.get(cell, -np.inf))
-    assert corrected.coverage == 100 * len(best) / 16
-    assert corrected.max_fitness == pytest.approx(max(best.values()))
-    assert corrected.qd_score == pytest.approx(sum(best.values()) + 45 * len(best))
-    assert run(SMALL.replace(iterations=1)).corrected is None
+    assert again.coverage == 100 * len(best) / 16
+    assert again.max_fitness == pytest.approx(max(best.values()))
+    assert again.qd_score == pytest.approx(sum(best.values()) + 45 * len(best))
+    assert run(SMALL.replace(iterations=1)).reevaluated is None
 
 
 def test_seed_decides() -> None:

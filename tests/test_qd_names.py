@@ -4,7 +4,13 @@ from __future__ import annotations
 
 import importlib
 
+import numpy as np
 import pytest
+
+from newton_qd.qd.config import EvolveConfig
+from newton_qd.qd.run.archive import Archive
+from newton_qd.qd.run.evolution import EvolveResult
+from newton_qd.qd.run.reevaluation import Reevaluated
 
 QD = "newton_qd.qd"
 
@@ -35,3 +41,20 @@ def test_old_defaults_of_environments() -> None:
     assert tuned["hopper_uni"] == tuned["humanoidtrap"] == falls and len(tuned) == 6
     with pytest.raises(AttributeError, match="has no attribute 'FlowOptions'"):
         old.FlowOptions  # noqa: B018
+
+
+def test_old_name_of_reevaluated() -> None:
+    again = Reevaluated(reevaluations=1, qd_score=1.0, coverage=2.0, max_fitness=3.0)
+    nothing = np.zeros((0, 0))
+    result = EvolveResult(
+        config=EvolveConfig(),
+        archive=Archive(nothing, nothing, nothing, nothing),
+        metrics={},
+        iteration=0,
+        interrupted=False,
+        out=None,
+        seconds=0.0,
+        reevaluated=again,
+    )
+    with pytest.warns(DeprecationWarning, match=r"is now EvolveResult\.reevaluated"):
+        assert result.corrected is again

@@ -163,9 +163,9 @@ def evolved(name, algorithm="me", options=(), **arguments):
         batch_size=10, episode_length=10, hidden=(8,), centroids=32, reevaluations=2,
     )
     found = newton_qd.qd.evolve(config, progress=False, **arguments)
-    archive, corrected = found.archive, found.corrected
+    archive, again = found.archive, found.reevaluated
     names = ("genotypes", "fitnesses", "descriptors")
-    return [str(corrected), *(np.asarray(getattr(archive, x)).tolist() for x in names)]
+    return [str(again), *(np.asarray(getattr(archive, x)).tolist() for x in names)]
 """
 
 

@@ -266,11 +266,11 @@ def _report(result: EvolveResult, out: Path) -> None:
             f"coverage {first['coverage']:.1f} -> {last['coverage']:.1f} %, "
             f"best fitness {first['max_fitness']:.1f} -> {last['max_fitness']:.1f}"
         )
-        if (corrected := result.corrected) is not None:
+        if (again := result.reevaluated) is not None:
             print(
-                f"corrected ({corrected.reevaluations} evaluations of each elite): "
-                f"QD score {corrected.qd_score:,.0f}, coverage "
-                f"{corrected.coverage:.1f} %, best fitness {corrected.max_fitness:.1f}"
+                f"reevaluated ({again.reevaluations} evaluations of each elite): "
+                f"QD score {again.qd_score:,.0f}, coverage {again.coverage:.1f} %, "
+                f"best fitness {again.max_fitness:.1f}"
             )
         print(f"results in {out}")
     if result.interrupted:

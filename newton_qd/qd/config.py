@@ -52,8 +52,8 @@ class EvolveConfig:
             units of policy weights [-].
         line_sigma: Standard deviation of the step towards the second parent,
             relative to the distance of the parents [-].
-        reevaluations: Evaluations of each elite at the end of the run, for corrected
-            metrics; 0 leaves them out.
+        reevaluations: Evaluations of each elite at the end of the run, for metrics
+            without luck; 0 leaves them out.
         algorithm: Name of one of ``newton_qd.qd.algorithms.ALGORITHMS``.
         options: Settings that this algorithm alone has, as ``(name, value)`` in the
             order of their names; may be given as a dictionary.

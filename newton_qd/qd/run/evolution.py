@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import time
+import warnings
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from pathlib import Path
@@ -18,11 +19,11 @@ from newton_qd.qd.config import ConfigError, EvolveConfig, environment_facts
 from newton_qd.qd.extras import require_extra
 from newton_qd.qd.run.archive import Archive
 from newton_qd.qd.run.checkpoint import Checkpoint
-from newton_qd.qd.run.corrected import Corrected
 from newton_qd.qd.run.folder import COLUMNS, EVENTS, RunFolder
 from newton_qd.qd.run.interrupt import StopFlag, graceful_stop
 from newton_qd.qd.run.plot import archive_png
 from newton_qd.qd.run.progress import Progress
+from newton_qd.qd.run.reevaluation import Reevaluated
 from newton_qd.qd.run.search import Search, SearchState
 from newton_qd.qd.run.tensorboard import EventLog
 from newton_qd.qd.scoring.sharding import device_mesh
@@ -43,7 +44,7 @@ class EvolveResult:
         interrupted: Whether a signal ended the run before its last generation.
         out: Results folder, if there is one.
         seconds: Time that this call took [s].
-        corrected: Metrics from evaluating the elites again, of a finished run.
+        reevaluated: Metrics from evaluating the elites again, of a finished run.
     """
 
     config: EvolveConfig
@@ -53,7 +54,17 @@ class EvolveResult:
     interrupted: bool
     out: Path | None
     seconds: float
-    corrected: Corrected | None = None
+    reevaluated: Reevaluated | None = None
+
+    @property
+    def corrected(self) -> Reevaluated | None:
+        """Old name of ``reevaluated``."""
+        warnings.warn(
+            "EvolveResult.corrected is now EvolveResult.reevaluated",
+            DeprecationWarning,
+            stacklevel=2,
+        )
+        return self.reevaluated
 
 
 def evolve(
@@ -262,15 +273,15 @@ def _finished(
     stop: StopFlag,
     begin: float,
 ) -> EvolveResult:
-    """Adds the corrected metrics, and writes what is known at the end."""
+    """Adds the metrics of re-evaluated elites, and writes what is known at the end."""
     if not result.interrupted:
-        display.note("evaluating the elites again, for corrected metrics")
-        corrected = search.correct(result.archive, lambda: stop.requested)
+        display.note("evaluating the elites again, for metrics without luck")
+        again = search.reevaluate(result.archive, lambda: stop.requested)
         seconds = time.monotonic() - begin
-        result = dataclasses.replace(result, corrected=corrected, seconds=seconds)
+        result = dataclasses.replace(result, reevaluated=again, seconds=seconds)
     if folder is not None and result.iteration >= 0:
         picture = archive_png(result.archive, result.config, task, result.iteration)
         folder.save_archive(result.archive, picture)
-    if folder is not None and result.corrected is not None:
-        folder.save_corrected(dataclasses.asdict(result.corrected))
+    if folder is not None and result.reevaluated is not None:
+        folder.save_reevaluated(dataclasses.asdict(result.reevaluated))
     return result

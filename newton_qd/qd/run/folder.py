@@ -39,9 +39,9 @@ CONFIG = "config.json"
 CHECKPOINT = "checkpoint.bin"
 METRICS = "metrics.csv"
 PICTURE = "archive.png"
-CORRECTED = "corrected.json"
+REEVALUATED = "corrected.json"  # a name that earlier versions know
 EVENTS = "tensorboard"
-_FILES = (CONFIG, CHECKPOINT, METRICS, ARCHIVE, PICTURE, CORRECTED)
+_FILES = (CONFIG, CHECKPOINT, METRICS, ARCHIVE, PICTURE, REEVALUATED)
 
 COLUMNS = (
     "iteration",
@@ -193,10 +193,10 @@ class RunFolder:
         write_atomically(self.path / ARCHIVE, archive_bytes(archive))
         write_atomically(self.path / PICTURE, picture)
 
-    def save_corrected(self, corrected: dict[str, Any]) -> None:
-        """Writes the corrected metrics."""
-        text = json.dumps(corrected, indent=2) + "\n"
-        write_atomically(self.path / CORRECTED, text.encode())
+    def save_reevaluated(self, metrics: dict[str, Any]) -> None:
+        """Writes the metrics of re-evaluated elites."""
+        text = json.dumps(metrics, indent=2) + "\n"
+        write_atomically(self.path / REEVALUATED, text.encode())
 
 
 def metrics_to_csv(metrics: np.ndarray) -> str:

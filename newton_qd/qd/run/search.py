@@ -18,8 +18,8 @@ from newton_qd.qd.extras import require_extra
 from newton_qd.qd.run.archive import Archive
 from newton_qd.qd.run.cells import cell_centroids
 from newton_qd.qd.run.checkpoint import Checkpoint, CheckpointError
-from newton_qd.qd.run.corrected import Corrected, correct
 from newton_qd.qd.run.folder import COLUMNS
+from newton_qd.qd.run.reevaluation import Reevaluated, reevaluate
 from newton_qd.qd.scoring.rollout import (
     make_policy,
     make_scoring_function,
@@ -85,7 +85,7 @@ class Search:
         keys = jax.random.split(jax.random.key(config.seed), 4)
         key_centroids, self._key_reset = keys[0], keys[1]
         self._key_initial, self._key_generations = keys[2], keys[3]
-        self._key_corrected = jax.random.fold_in(self._key_reset, 1)
+        self._key_reevaluations = jax.random.fold_in(self._key_reset, 1)
         self._key_emitter = jax.random.fold_in(self._key_generations, 0)
         self._policy = make_policy(task.env, config.hidden)
         self._centroids = cell_centroids(config, task.limits, key_centroids)
@@ -171,16 +171,16 @@ class Search:
             emitter=tuple(_leaf_to_host(x) for x in jax.tree.leaves(state.emitter)),
         )
 
-    def correct(
+    def reevaluate(
         self, archive: Archive, stop: Callable[[], bool] = lambda: False
-    ) -> Corrected | None:
+    ) -> Reevaluated | None:
         """Evaluates the elites of an archive again; ``None`` where none are asked."""
         if not self._config.reevaluations:
             return None
-        return correct(
+        return reevaluate(
             archive,
             self._compiled(self._plain_scoring()),
-            self._key_corrected,
+            self._key_reevaluations,
             reevaluations=self._config.reevaluations,
             offset=self._task.reward_offset * self._config.episode_length,
             stop=stop,

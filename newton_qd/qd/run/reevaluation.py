@@ -1,4 +1,4 @@
-"""What an archive is worth once luck is taken out: its elites, evaluated again."""
+"""The metrics of an archive without luck: its elites, evaluated again."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from newton_qd.types import ScoringFunction
 
 
 @dataclasses.dataclass(frozen=True)
-class Corrected:
-    """Metrics of an archive into which every elite was put anew.
+class Reevaluated:
+    """Metrics of an archive that is rebuilt from re-evaluated elites.
 
-    An elite is where the median of its descriptors is, with the median of its
-    fitnesses, over evaluations from different start states (Flageat and Cully 2020,
+    An elite enters it with the medians of its descriptors and of its fitnesses over
+    evaluations from different start states (Flageat and Cully 2020,
     "Fast and stable MAP-Elites in noisy domains using deep grids").
 
     Attributes:
         reevaluations: Evaluations of each elite.
-        qd_score: Corrected QD score, with the task's reward offset.
-        coverage: Corrected coverage [%].
-        max_fitness: Highest corrected fitness.
+        qd_score: QD score of this archive, with the task's reward offset.
+        coverage: Its coverage [%].
+        max_fitness: Its highest fitness.
     """
 
     reevaluations: int
@@ -34,7 +34,7 @@ class Corrected:
     max_fitness: float
 
 
-def correct(
+def reevaluate(
     archive: Archive,
     score: ScoringFunction,
     key: jax.Array,
@@ -42,7 +42,7 @@ def correct(
     reevaluations: int,
     offset: float,
     stop: Callable[[], bool] = lambda: False,
-) -> Corrected | None:
+) -> Reevaluated | None:
     """Evaluates the elites of an archive again.
 
     Args:
@@ -69,7 +69,7 @@ def correct(
     best = np.full(len(archive.centroids), -np.inf)
     np.maximum.at(best, cells, fitness)
     kept = best[np.isfinite(best)]
-    return Corrected(
+    return Reevaluated(
         reevaluations=reevaluations,
         qd_score=float(np.sum(kept + offset)),
         coverage=100.0 * len(kept) / len(best),
