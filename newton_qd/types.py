@@ -23,6 +23,9 @@ PyTree: TypeAlias = Any
 Genotype: TypeAlias = PyTree
 """What a search changes: weights of a policy, or actions; N of them have N in front."""
 
+Repertoire: TypeAlias = PyTree
+"""An archive of QDax: genotypes, fitnesses, descriptors and centroids of cells."""
+
 ExtraScores: TypeAlias = dict[str, Any]
 """What a scoring function returns besides fitness and descriptor, by name."""
 
@@ -76,7 +79,7 @@ class StateLike(Protocol):
         ...
 
     @property
-    def info(self) -> Mapping[str, Any]:
+    def info(self) -> Mapping[str, PyTree]:
         """Readings by name; :data:`INFO_KEYS` lists the keys."""
         ...
 
@@ -101,7 +104,7 @@ class Environment(Protocol):
         """Begins an episode."""
         ...
 
-    def step(self, state: Any, action: Action, /) -> StateLike:
+    def step(self, state: PyTree, action: Action, /) -> StateLike:
         """Advances by one control step."""
         ...
 

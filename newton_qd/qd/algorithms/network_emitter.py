@@ -8,6 +8,7 @@ from typing import Any
 import jax
 
 from newton_qd.qd.scoring.rollout import Policy
+from newton_qd.types import ExtraScores, Genotype, PyTree, Repertoire
 
 
 class OfParameters:
@@ -20,32 +21,37 @@ class OfParameters:
     """
 
     def __init__(
-        self, emitter: Any, policy: Policy, convert: Callable[[Any], Any]
+        self,
+        emitter: Any,
+        policy: Policy,
+        convert: Callable[[dict[str, jax.Array]], PyTree],
     ) -> None:
         self._emitter = emitter
         self._policy = policy
         self._convert = convert
 
-    def init(self, key: jax.Array, **told: Any) -> Any:
+    def init(self, key: jax.Array, **told: PyTree) -> PyTree:
         """Returns the state before the second generation."""
         return self._emitter.init(key=key, **self._told(told))
 
-    def emit(self, repertoire: Any, state: Any, key: jax.Array) -> Any:
+    def emit(
+        self, repertoire: Repertoire, state: PyTree, key: jax.Array
+    ) -> tuple[jax.Array, ExtraScores]:
         """Returns weights (N, size) and what the emitter remembers of them."""
         parameters, remembered = self._emitter.emit(self._seen(repertoire), state, key)
         return jax.vmap(self._policy.ravel)(parameters), remembered
 
-    def state_update(self, emitter_state: Any, **told: Any) -> Any:
+    def state_update(self, emitter_state: PyTree, **told: PyTree) -> PyTree:
         """Learns from a generation."""
         return self._emitter.state_update(emitter_state, **self._told(told))
 
-    def _seen(self, repertoire: Any) -> Any:
+    def _seen(self, repertoire: Repertoire) -> Repertoire:
         return repertoire.replace(genotypes=self._unravel(repertoire.genotypes))
 
-    def _unravel(self, genotypes: jax.Array) -> Any:
+    def _unravel(self, genotypes: jax.Array) -> Genotype:
         return jax.vmap(self._policy.unravel)(genotypes)
 
-    def _told(self, told: dict[str, Any]) -> dict[str, Any]:
+    def _told(self, told: dict[str, PyTree]) -> dict[str, PyTree]:
         extra = told["extra_scores"]
         return {
             **told,

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import functools
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from newton_qd.qd.config import EvolveConfig
 
 if TYPE_CHECKING:
-    import jax
+    from collections.abc import Callable
+
+    from qdax.core.emitters.emitter import Emitter
+
+    from newton_qd.types import Genotype, RNGKey
 
 
-def isoline(config: EvolveConfig) -> Any:
+def isoline(
+    config: EvolveConfig,
+) -> Callable[[Genotype, Genotype, RNGKey], Genotype]:
     """The iso+line variation (Vassiliades and Mouret 2018) of a run."""
     from qdax.core.emitters.mutation_operators import isoline_variation
 
@@ -20,7 +26,7 @@ def isoline(config: EvolveConfig) -> Any:
     )
 
 
-def isoline_emitter(config: EvolveConfig, batch_size: int) -> Any:
+def isoline_emitter(config: EvolveConfig, batch_size: int) -> Emitter:
     """Emitter of iso+line variations, as MAP-Elites has it."""
     from qdax.core.emitters.standard_emitters import MixingEmitter
 
@@ -32,7 +38,7 @@ def isoline_emitter(config: EvolveConfig, batch_size: int) -> Any:
     )
 
 
-def with_isoline(emitter: Any, config: EvolveConfig) -> Any:
+def with_isoline(emitter: Emitter, config: EvolveConfig) -> Emitter:
     """Fills up a generation with iso+line variations.
 
     Args:
@@ -45,6 +51,6 @@ def with_isoline(emitter: Any, config: EvolveConfig) -> Any:
     return MultiEmitter((emitter, isoline_emitter(config, rest))) if rest else emitter
 
 
-def _no_mutation(genotypes: Any, key: jax.Array) -> Any:
+def _no_mutation(genotypes: Genotype, key: RNGKey) -> Genotype:
     del key
     return genotypes

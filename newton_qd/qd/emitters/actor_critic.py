@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +11,13 @@ from qdax.core.emitters.emitter import Emitter
 from newton_qd.envs.state import select
 from newton_qd.qd.emitters.actor_critic_learner import ActorCritic, Learner
 from newton_qd.qd.emitters.cells import draw_cells
+from newton_qd.types import (
+    ExtraScores,
+    Genotype,
+    PyTree,
+    Repertoire,
+    StateLike,
+)
 
 
 @jax.tree_util.register_dataclass
@@ -61,7 +67,7 @@ class ActorCriticEmitter(Emitter):
     def __init__(
         self,
         method: ActorCritic,
-        first: Any,
+        first: StateLike,
         *,
         actors: int,
         branches: int,
@@ -121,12 +127,12 @@ class ActorCriticEmitter(Emitter):
     def init(
         self,
         key: jax.Array,
-        repertoire: Any,
-        genotypes: Any,
-        fitnesses: Any,
-        descriptors: Any,
-        extra_scores: Any,
-    ) -> Any:
+        repertoire: Repertoire,
+        genotypes: Genotype,
+        fitnesses: jax.Array,
+        descriptors: jax.Array,
+        extra_scores: ExtraScores,
+    ) -> PyTree:
         """Begins from the best of the initial population, which it emits once more."""
         del repertoire, descriptors, extra_scores
         key, scale_key, aim_key, critic_key = jax.random.split(key, 4)
@@ -144,8 +150,8 @@ class ActorCriticEmitter(Emitter):
         )
 
     def emit(
-        self, repertoire: Any, emitter_state: Any, key: jax.Array
-    ) -> tuple[jax.Array, dict[str, Any]]:
+        self, repertoire: Repertoire, emitter_state: PyTree, key: jax.Array
+    ) -> tuple[jax.Array, ExtraScores]:
         """Draws individuals between actors and elites.
 
         Returns:
@@ -171,13 +177,13 @@ class ActorCriticEmitter(Emitter):
 
     def state_update(
         self,
-        emitter_state: Any,
-        repertoire: Any = None,
-        genotypes: Any = None,
-        fitnesses: Any = None,
-        descriptors: Any = None,
-        extra_scores: Any = None,
-    ) -> Any:
+        emitter_state: PyTree,
+        repertoire: Repertoire = None,
+        genotypes: Genotype | None = None,
+        fitnesses: jax.Array | None = None,
+        descriptors: jax.Array | None = None,
+        extra_scores: ExtraScores | None = None,
+    ) -> PyTree:
         """Learns for one generation; actors that are due begin again before it."""
         del genotypes, fitnesses, descriptors, extra_scores
         state = emitter_state
@@ -203,7 +209,7 @@ class ActorCriticEmitter(Emitter):
             learners, state.scale, snapshots, failed, state.generation + 1, key
         )
 
-    def _worlds(self) -> Any:
+    def _worlds(self) -> PyTree:
         """States that the worlds of an actor begin in."""
         number = self._method.settings.worlds
         return jax.tree.map(
@@ -231,7 +237,7 @@ class ActorCriticEmitter(Emitter):
         )
 
     def _renewed(
-        self, state: ActorCriticState, repertoire: Any, key: jax.Array
+        self, state: ActorCriticState, repertoire: Repertoire, key: jax.Array
     ) -> Learner:
         """The actors, of which those that are due begin again from elites."""
         aim_key, cell_key, critic_key = jax.random.split(key, 3)

@@ -17,6 +17,7 @@ from newton_qd.extractors import get_final_xy_position
 from newton_qd.gradients.flow import passed_back
 from newton_qd.qd.emitters.actor_critic_settings import ActorCriticSettings
 from newton_qd.qd.scoring.task import Task
+from newton_qd.types import Environment, PyTree, StateLike
 
 Layers: TypeAlias = list[tuple[jax.Array, jax.Array]]
 """Weights and bias of each layer of a perceptron."""
@@ -44,9 +45,9 @@ class Learner:
     aim: jax.Array
     critic: Layers
     target: Layers
-    moments: tuple[Any, Any]
-    first: Any
-    worlds: Any
+    moments: tuple[PyTree, PyTree]
+    first: PyTree
+    worlds: PyTree
     age: jax.Array
 
 
@@ -72,9 +73,9 @@ class ActorCritic:
         settings: How to learn.
     """
 
-    env: Any
+    env: Environment
     policy: Callable[[jax.Array, jax.Array], jax.Array]
-    measure: Callable[[Any, Any], jax.Array]
+    measure: Callable[[StateLike, StateLike], jax.Array]
     episode_length: int
     settings: ActorCriticSettings
 
@@ -84,7 +85,7 @@ class ActorCritic:
         return self.settings.worlds * self.settings.window
 
     @functools.cached_property
-    def _optimizers(self) -> tuple[Any, Any]:
+    def _optimizers(self) -> tuple[PyTree, PyTree]:
         rates = self.settings.rate, self.settings.critic_rate
         actor, critic = (
             optax.chain(optax.clip_by_global_norm(1.0), optax.adam(rate, b1=0.7))
@@ -92,7 +93,7 @@ class ActorCritic:
         )
         return actor, critic
 
-    def scale(self, key: jax.Array, first: Any) -> tuple[jax.Array, jax.Array]:
+    def scale(self, key: jax.Array, first: PyTree) -> tuple[jax.Array, jax.Array]:
         """Mean and deviation (no,) of observations under random actions.
 
         Args:
@@ -102,7 +103,7 @@ class ActorCritic:
         shape = (_SETTLING, len(first.done), self.env.action_size)
         actions = jax.random.uniform(key, shape, first.obs.dtype, -1, 1)
 
-        def advance(state: Any, action: jax.Array) -> tuple[Any, jax.Array]:
+        def advance(state: PyTree, action: jax.Array) -> tuple[PyTree, jax.Array]:
             after = jax.vmap(self.env.step)(state, action)
             state = select((after.done > 0) | ~_sound(after), first, after)
             return state, state.obs
@@ -111,7 +112,7 @@ class ActorCritic:
         return obs.mean(axis=0), obs.std(axis=0) + 0.01
 
     def begin(
-        self, key: jax.Array, weights: jax.Array, aim: jax.Array, first: Any
+        self, key: jax.Array, weights: jax.Array, aim: jax.Array, first: PyTree
     ) -> Learner:
         """An actor with a critic that knows nothing yet.
 
@@ -155,7 +156,7 @@ class ActorCritic:
         shape = (settings.worlds, settings.window, self.env.action_size)
         noise = jax.random.normal(noise_key, shape, learner.weights.dtype)
 
-        def loss(weights: jax.Array) -> tuple[jax.Array, Any]:
+        def loss(weights: jax.Array) -> tuple[jax.Array, PyTree]:
             run = functools.partial(self._window, weights, learner, scale)
             returns, found = jax.vmap(run)(
                 learner.first, learner.worlds, settings.noise * noise
@@ -187,7 +188,7 @@ class ActorCritic:
         kept = dataclasses.replace(learner, worlds=learned.worlds, age=learned.age)
         return select(failed, kept, learned), failed
 
-    def _value(self, critic: Layers, scale: Any, obs: jax.Array) -> jax.Array:
+    def _value(self, critic: Layers, scale: PyTree, obs: jax.Array) -> jax.Array:
         mean, deviation = scale
         for weights, bias in critic[:-1]:
             obs = jnp.tanh(((obs - mean) / deviation) @ weights + bias)
@@ -201,14 +202,14 @@ class ActorCritic:
         weights: jax.Array,
         learner: Learner,
         scale: tuple[jax.Array, jax.Array],
-        first: Any,
-        state: Any,
+        first: PyTree,
+        state: PyTree,
         noise: jax.Array,
-    ) -> tuple[jax.Array, Any]:
+    ) -> tuple[jax.Array, PyTree]:
         """One world's window: its return, last state, observations and targets."""
         settings = self.settings
 
-        def advance(state: Any, noise: jax.Array) -> tuple[Any, Any]:
+        def advance(state: PyTree, noise: jax.Array) -> tuple[PyTree, PyTree]:
             one = jnp.ones((), noise.dtype)
             before = passed_back(state, one, settings.clip)
             action = self.policy(weights, before.obs) + noise
@@ -220,7 +221,7 @@ class ActorCritic:
 
         last, (obs, gains, overs, values) = jax.lax.scan(advance, state, noise)
 
-        def back(sums: Any, row: Any) -> tuple[Any, jax.Array]:
+        def back(sums: PyTree, row: PyTree) -> tuple[PyTree, jax.Array]:
             total, target = sums
             gain, over, value = row
             mixed = (1 - settings.trace) * value + settings.trace * target
@@ -235,8 +236,13 @@ class ActorCritic:
         return total, jax.lax.stop_gradient((last, obs, targets))
 
     def _fit(
-        self, learner: Learner, scale: Any, key: jax.Array, obs: Any, targets: Any
-    ) -> tuple[Layers, Any]:
+        self,
+        learner: Learner,
+        scale: PyTree,
+        key: jax.Array,
+        obs: PyTree,
+        targets: PyTree,
+    ) -> tuple[Layers, PyTree]:
         """Some steps of the critic towards its targets (worlds, window)."""
         optimizer = self._optimizers[1]
         obs, targets = obs.reshape(self.steps, -1), targets.reshape(self.steps)
@@ -247,7 +253,7 @@ class ActorCritic:
             values = jax.vmap(value)(obs[rows])
             return jnp.square(factor * (values - targets[rows])).mean()
 
-        def fit(carry: Any, rows: jax.Array) -> tuple[Any, None]:
+        def fit(carry: PyTree, rows: jax.Array) -> tuple[PyTree, None]:
             critic, moments = carry
             change, moments = optimizer.update(jax.grad(error)(critic, rows), moments)
             return (optax.apply_updates(critic, change), moments), None
@@ -261,7 +267,7 @@ class ActorCritic:
         return jax.lax.scan(fit, (learner.critic, learner.moments[1]), order)[0]
 
 
-def measure_of(task: Task) -> Callable[[Any, Any], jax.Array]:
+def measure_of(task: Task) -> Callable[[StateLike, StateLike], jax.Array]:
     """What a control step adds to the measures of a task, (D,).
 
     Of a task that is described by the final position, the velocity [m/s]; of others,
@@ -277,7 +283,7 @@ def measure_of(task: Task) -> Callable[[Any, Any], jax.Array]:
     return velocity
 
 
-def _sound(state: Any) -> jax.Array:
+def _sound(state: PyTree) -> jax.Array:
     """Whether a world holds finite numbers, as far as its observation shows."""
     return jnp.all(jnp.isfinite(state.obs), axis=-1)
 

@@ -11,6 +11,7 @@ from newton_qd.qd.emitters.annealed_repertoire import (
     AnnealedRepertoire,
     check_annealing,
 )
+from newton_qd.types import ExtraScores, Genotype, PyTree, Repertoire
 
 
 class AnnealedState(EmitterState):
@@ -57,11 +58,11 @@ class OnAnnealedRepertoire(Emitter):
     def init(
         self,
         key: jax.Array,
-        repertoire: Any,
-        genotypes: Any,
+        repertoire: Repertoire,
+        genotypes: Genotype,
         fitnesses: jax.Array,
         descriptors: jax.Array,
-        extra_scores: Any,
+        extra_scores: ExtraScores,
     ) -> AnnealedState:
         """Makes the annealed archive of the initial population."""
         annealed = AnnealedRepertoire.init(
@@ -78,20 +79,20 @@ class OnAnnealedRepertoire(Emitter):
         return AnnealedState(annealed, state)
 
     def emit(
-        self, repertoire: Any, emitter_state: Any, key: jax.Array
-    ) -> tuple[Any, dict[str, Any]]:
+        self, repertoire: Repertoire, emitter_state: PyTree, key: jax.Array
+    ) -> tuple[Genotype, ExtraScores]:
         """Lets the emitter emit from the annealed archive."""
         del repertoire
         return self._emitter.emit(emitter_state.repertoire, emitter_state.emitter, key)
 
     def state_update(
         self,
-        emitter_state: Any,
-        repertoire: Any = None,
-        genotypes: Any = None,
+        emitter_state: PyTree,
+        repertoire: Repertoire = None,
+        genotypes: Genotype | None = None,
         fitnesses: Any = None,
         descriptors: Any = None,
-        extra_scores: Any = None,
+        extra_scores: ExtraScores | None = None,
     ) -> AnnealedState:
         """Adds a generation to the annealed archive and tells the emitter of it."""
         del repertoire

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import flax.struct
 import jax
@@ -12,6 +11,8 @@ from qdax.core.containers.mapelites_repertoire import (
     MapElitesRepertoire,
     get_cells_indices,
 )
+
+from newton_qd.types import ExtraScores, Genotype
 
 
 class AnnealedRepertoire(MapElitesRepertoire, kw_only=True):
@@ -45,10 +46,10 @@ class AnnealedRepertoire(MapElitesRepertoire, kw_only=True):
 
     def add(  # pyright: ignore[reportIncompatibleMethodOverride]
         self,
-        batch_of_genotypes: Any,
+        batch_of_genotypes: Genotype,
         batch_of_descriptors: jax.Array,
         batch_of_fitnesses: jax.Array,
-        batch_of_extra_scores: Any = None,
+        batch_of_extra_scores: ExtraScores | None = None,
     ) -> AnnealedRepertoire:
         """Adds a batch of individuals.
 
@@ -95,11 +96,11 @@ class AnnealedRepertoire(MapElitesRepertoire, kw_only=True):
     @classmethod
     def init(  # pyright: ignore[reportIncompatibleMethodOverride]
         cls,
-        genotypes: Any,
+        genotypes: Genotype,
         fitnesses: jax.Array,
         descriptors: jax.Array,
         centroids: jax.Array,
-        extra_scores: Any = None,
+        extra_scores: ExtraScores | None = None,
         *,
         learning_rate: float,
         threshold_min: float,

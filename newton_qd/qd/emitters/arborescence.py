@@ -34,7 +34,13 @@ from newton_qd.qd.scoring.gradient_scores import (
     normalize,
     read_scores,
 )
-from newton_qd.types import ScoringFunction
+from newton_qd.types import (
+    ExtraScores,
+    Genotype,
+    PyTree,
+    Repertoire,
+    ScoringFunction,
+)
 
 # Ranks of offspring (pyribs' status); what failed comes last.
 NEW, IMPROVED, WORSE, FAILED = 2, 1, 0, -1
@@ -143,7 +149,7 @@ class ArborescenceEmitter(Emitter, abc.ABC):
         return self._num_emitters * self._population
 
     @abc.abstractmethod
-    def _bars(self, repertoire: Any) -> jax.Array:
+    def _bars(self, repertoire: Repertoire) -> jax.Array:
         """(cells,) what an individual must exceed to enter the repertoire."""
 
     @abc.abstractmethod
@@ -163,11 +169,11 @@ class ArborescenceEmitter(Emitter, abc.ABC):
     def init(
         self,
         key: jax.Array,
-        repertoire: Any,
-        genotypes: Any,
+        repertoire: Repertoire,
+        genotypes: Genotype,
         fitnesses: jax.Array,
         descriptors: jax.Array,
-        extra_scores: Any,
+        extra_scores: ExtraScores,
     ) -> ArborescenceState:
         """Scores the first solution points.
 
@@ -205,8 +211,8 @@ class ArborescenceEmitter(Emitter, abc.ABC):
         return state
 
     def emit(
-        self, repertoire: Any, emitter_state: Any, key: jax.Array
-    ) -> tuple[jax.Array, dict[str, Any]]:
+        self, repertoire: Repertoire, emitter_state: PyTree, key: jax.Array
+    ) -> tuple[jax.Array, ExtraScores]:
         """Moves the solution points along their gradients.
 
         Args:
@@ -225,12 +231,12 @@ class ArborescenceEmitter(Emitter, abc.ABC):
 
     def state_update(
         self,
-        emitter_state: Any,
-        repertoire: Any = None,
-        genotypes: Any = None,
+        emitter_state: PyTree,
+        repertoire: Repertoire = None,
+        genotypes: Genotype | None = None,
         fitnesses: Any = None,
         descriptors: Any = None,
-        extra_scores: Any = None,
+        extra_scores: ExtraScores | None = None,
     ) -> ArborescenceState:
         """Ranks the offspring, moves the points and scores them.
 
@@ -306,7 +312,7 @@ class ArborescenceEmitter(Emitter, abc.ABC):
 
     def _state(
         self,
-        repertoire: Any,
+        repertoire: Repertoire,
         search: tuple,
         keys: tuple[jax.Array, jax.Array, jax.Array],
         restarts: jax.Array,

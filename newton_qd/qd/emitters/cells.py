@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
+
+from newton_qd.types import Repertoire
 
 
 def draw_cells(key: jax.Array, wanted: jax.Array, count: int) -> jax.Array:
@@ -24,7 +24,7 @@ def draw_cells(key: jax.Array, wanted: jax.Array, count: int) -> jax.Array:
     return jax.random.choice(key, wanted.shape[0], (count,), p=probabilities)
 
 
-def empty_targets(repertoire: Any, key: jax.Array, count: int) -> jax.Array:
+def empty_targets(repertoire: Repertoire, key: jax.Array, count: int) -> jax.Array:
     """(count, D) centres of empty cells; of any cells once none is empty."""
     cells = draw_cells(key, repertoire.fitnesses[:, 0] == -jnp.inf, count)
     return repertoire.centroids[cells]

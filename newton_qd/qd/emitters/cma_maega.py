@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 
 from newton_qd.qd.emitters.annealed_repertoire import AnnealedRepertoire
 from newton_qd.qd.emitters.arborescence import ArborescenceEmitter
 from newton_qd.qd.emitters.restarts import RestartRule
+from newton_qd.types import Repertoire
 
 
 class CMAMAEGAEmitter(ArborescenceEmitter):
@@ -22,7 +21,7 @@ class CMAMAEGAEmitter(ArborescenceEmitter):
 
     default_restart_rule = RestartRule.BASIC
 
-    def _bars(self, repertoire: Any) -> jax.Array:
+    def _bars(self, repertoire: Repertoire) -> jax.Array:
         if not isinstance(repertoire, AnnealedRepertoire):
             raise TypeError(
                 "repertoire must be an AnnealedRepertoire, whose cells have "

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 
@@ -14,6 +12,7 @@ from newton_qd.qd.emitters.arborescence import (
     ArborescenceEmitter,
 )
 from newton_qd.qd.emitters.restarts import RestartRule
+from newton_qd.types import Repertoire
 
 
 class CMAMEGAEmitter(ArborescenceEmitter):
@@ -26,7 +25,7 @@ class CMAMEGAEmitter(ArborescenceEmitter):
 
     default_restart_rule = RestartRule.NO_IMPROVEMENT
 
-    def _bars(self, repertoire: Any) -> jax.Array:
+    def _bars(self, repertoire: Repertoire) -> jax.Array:
         return repertoire.fitnesses[:, 0]
 
     def _rank(

@@ -13,9 +13,16 @@ import jax
 import jax.numpy as jnp
 from qdax.core.containers.mapelites_repertoire import get_cells_indices
 from qdax.core.emitters.emitter import Emitter, EmitterState
+from qdax.core.emitters.repertoire_selectors.selector import Selector
 
 from newton_qd.qd.scoring.gradient_scores import Scores, read_scores
-from newton_qd.types import ScoringFunction
+from newton_qd.types import (
+    ExtraScores,
+    Genotype,
+    PyTree,
+    Repertoire,
+    ScoringFunction,
+)
 
 _ROUNDINGS = 16
 
@@ -35,7 +42,7 @@ class EliteGradients(EmitterState):
     fitnesses: jax.Array
     rejected: jax.Array
 
-    def add(self, repertoire: Any, scores: Scores) -> EliteGradients:
+    def add(self, repertoire: Repertoire, scores: Scores) -> EliteGradients:
         """Keeps the gradients of those individuals that the repertoire took.
 
         The repertoire decides: an individual counts as taken if its cell holds it.
@@ -59,18 +66,22 @@ class EliteGradients(EmitterState):
             rejected=self.rejected + jnp.sum(~scores.finite, dtype=jnp.int32),
         )
 
-    def known(self, repertoire: Any) -> jax.Array:
+    def known(self, repertoire: Repertoire) -> jax.Array:
         """(cells,) whether a cell holds an elite whose gradients are known."""
         filled = repertoire.fitnesses[:, 0] > -jnp.inf
         return filled & (repertoire.fitnesses[:, 0] == self.fitnesses)
 
-    def at(self, repertoire: Any, cells: jax.Array) -> jax.Array:
+    def at(self, repertoire: Repertoire, cells: jax.Array) -> jax.Array:
         """(N, 1 + D, size) gradients of the elites of some cells, zero if unknown."""
         known = self.known(repertoire)[cells]
         return jnp.where(known[:, None, None], self.gradients[cells], 0)
 
     def select(
-        self, repertoire: Any, key: jax.Array, count: int, selector: Any = None
+        self,
+        repertoire: Repertoire,
+        key: jax.Array,
+        count: int,
+        selector: Selector | None = None,
     ) -> jax.Array:
         """Draws cells whose elites have gradients; any filled ones if none has.
 
@@ -95,7 +106,7 @@ class EliteGradients(EmitterState):
 class EliteGradientEmitter(Emitter, abc.ABC):
     """An emitter whose parents are elites with known gradients."""
 
-    def __init__(self, batch_size: int, selector: Any = None) -> None:
+    def __init__(self, batch_size: int, selector: Selector | None = None) -> None:
         """Sets how parents are drawn.
 
         Args:
@@ -123,11 +134,11 @@ class EliteGradientEmitter(Emitter, abc.ABC):
     def init(
         self,
         key: jax.Array,
-        repertoire: Any,
-        genotypes: Any,
+        repertoire: Repertoire,
+        genotypes: Genotype,
         fitnesses: jax.Array,
         descriptors: jax.Array,
-        extra_scores: Any,
+        extra_scores: ExtraScores,
     ) -> EliteGradients:
         """Keeps the gradients of the initial elites.
 
@@ -146,12 +157,12 @@ class EliteGradientEmitter(Emitter, abc.ABC):
 
     def state_update(
         self,
-        emitter_state: Any,
-        repertoire: Any = None,
-        genotypes: Any = None,
+        emitter_state: PyTree,
+        repertoire: Repertoire = None,
+        genotypes: Genotype | None = None,
         fitnesses: Any = None,
         descriptors: Any = None,
-        extra_scores: Any = None,
+        extra_scores: ExtraScores | None = None,
     ) -> EliteGradients:
         """Keeps the gradients of the new elites.
 

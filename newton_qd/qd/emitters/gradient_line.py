@@ -10,6 +10,7 @@ from qdax.core.emitters.emitter import Emitter
 
 from newton_qd.gradients.exact import DirectionalGradient
 from newton_qd.qd.emitters.cells import draw_cells, empty_targets, nearest_cells
+from newton_qd.types import ExtraScores, PyTree, Repertoire
 
 
 class GradientLineEmitter(Emitter):
@@ -77,8 +78,8 @@ class GradientLineEmitter(Emitter):
         return self._parents * self._branches
 
     def emit(
-        self, repertoire: Any, emitter_state: Any, key: jax.Array
-    ) -> tuple[jax.Array, dict[str, Any]]:
+        self, repertoire: Repertoire, emitter_state: PyTree, key: jax.Array
+    ) -> tuple[jax.Array, ExtraScores]:
         """Draws parents and follows one gradient of each.
 
         Returns:

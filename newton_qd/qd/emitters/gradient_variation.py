@@ -8,10 +8,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from numpy.typing import ArrayLike
+from qdax.core.emitters.repertoire_selectors.selector import Selector
 
 from newton_qd.qd.emitters.elite_gradients import EliteGradientEmitter, check_steps
 from newton_qd.qd.scoring.gradient_scores import normalize, read_scores
-from newton_qd.types import ScoringFunction
+from newton_qd.types import (
+    ExtraScores,
+    Genotype,
+    PyTree,
+    Repertoire,
+    ScoringFunction,
+)
 
 
 class GradientVariationEmitter(EliteGradientEmitter):
@@ -36,8 +44,8 @@ class GradientVariationEmitter(EliteGradientEmitter):
         *,
         steps: int = 1,
         scoring_function: ScoringFunction | None = None,
-        directions: Any = None,
-        selector: Any = None,
+        directions: ArrayLike | None = None,
+        selector: Selector | None = None,
     ) -> None:
         """Sets the steps and their directions.
 
@@ -72,8 +80,8 @@ class GradientVariationEmitter(EliteGradientEmitter):
         self._directions = directions
 
     def emit(
-        self, repertoire: Any, emitter_state: Any, key: jax.Array
-    ) -> tuple[jax.Array, dict[str, Any]]:
+        self, repertoire: Repertoire, emitter_state: PyTree, key: jax.Array
+    ) -> tuple[jax.Array, ExtraScores]:
         """Draws parents and lets each climb along its direction.
 
         Returns:
@@ -94,7 +102,7 @@ class GradientVariationEmitter(EliteGradientEmitter):
         directions = self._draw(direction_key, gradients)
         states = jax.vmap(self._optimizer.init)(genotypes)
 
-        def climb(genotypes: Any, states: Any, gradients: Any) -> tuple[Any, Any]:
+        def climb(genotypes: Genotype, states: Any, gradients: Any) -> tuple[Any, Any]:
             ascent = jnp.einsum("nr,nrs->ns", directions, normalize(gradients))
             # optax descends.
             update: Any = jax.vmap(self._optimizer.update)

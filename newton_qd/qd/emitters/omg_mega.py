@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
+from qdax.core.emitters.repertoire_selectors.selector import Selector
 
 from newton_qd.qd.emitters.elite_gradients import EliteGradientEmitter
 from newton_qd.qd.scoring.gradient_scores import normalize
+from newton_qd.types import ExtraScores, PyTree, Repertoire
 
 
 class OMGMEGAEmitter(EliteGradientEmitter):
@@ -27,7 +27,9 @@ class OMGMEGAEmitter(EliteGradientEmitter):
     evaluations this emits twice as many individuals as the paper's implementation.
     """
 
-    def __init__(self, batch_size: int, sigma_g: float, selector: Any = None) -> None:
+    def __init__(
+        self, batch_size: int, sigma_g: float, selector: Selector | None = None
+    ) -> None:
         """Sets the size of steps.
 
         Args:
@@ -45,8 +47,8 @@ class OMGMEGAEmitter(EliteGradientEmitter):
         self._sigma_g = sigma_g
 
     def emit(
-        self, repertoire: Any, emitter_state: Any, key: jax.Array
-    ) -> tuple[jax.Array, dict[str, Any]]:
+        self, repertoire: Repertoire, emitter_state: PyTree, key: jax.Array
+    ) -> tuple[jax.Array, ExtraScores]:
         """Draws parents and moves each along its gradients.
 
         Returns:

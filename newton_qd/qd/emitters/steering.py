@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 
 from newton_qd.qd.emitters.cells import empty_targets, nearest_cells
 from newton_qd.qd.emitters.elite_gradients import EliteGradientEmitter, check_steps
 from newton_qd.qd.scoring.gradient_scores import read_scores
-from newton_qd.types import ScoringFunction
+from newton_qd.types import ExtraScores, PyTree, Repertoire, ScoringFunction
 
 # Keeps the system regular where no descriptor has a gradient.
 _TINY = 1e-12
@@ -67,8 +65,8 @@ class SteeringEmitter(EliteGradientEmitter):
         self._damping = damping
 
     def emit(
-        self, repertoire: Any, emitter_state: Any, key: jax.Array
-    ) -> tuple[jax.Array, dict[str, Any]]:
+        self, repertoire: Repertoire, emitter_state: PyTree, key: jax.Array
+    ) -> tuple[jax.Array, ExtraScores]:
         """Draws empty cells and steers the nearest elites towards them.
 
         Returns:

@@ -26,7 +26,13 @@ from newton_qd.qd.scoring.rollout import (
 )
 from newton_qd.qd.scoring.sharding import on_mesh, shard_scoring
 from newton_qd.qd.scoring.task import Task
-from newton_qd.types import ScoringFunction
+from newton_qd.types import (
+    ExtraScores,
+    Genotype,
+    PyTree,
+    Repertoire,
+    ScoringFunction,
+)
 
 
 class SearchError(RuntimeError):
@@ -45,7 +51,7 @@ class SearchState:
     """
 
     iteration: int
-    repertoire: Any
+    repertoire: Repertoire
     metrics: np.ndarray
     emitter: Any = None
 
@@ -205,7 +211,7 @@ class Search:
             self._restore_emitter(checkpoint.emitter),
         )
 
-    def _restore_emitter(self, leaves: tuple[np.ndarray, ...]) -> Any:
+    def _restore_emitter(self, leaves: tuple[np.ndarray, ...]) -> PyTree:
         """Puts the leaves of a checkpoint where they belong."""
         shape = (self._config.batch_size, self._policy.size)
         genotypes = jax.ShapeDtypeStruct(shape, jnp.float32)
@@ -257,20 +263,24 @@ class Search:
     def _split(self, score: ScoringFunction) -> ScoringFunction:
         return score if self._mesh is None else shard_scoring(score, self._mesh)
 
-    def _compiled(self, function: Callable[..., Any], evaluates: bool = True) -> Any:
+    def _compiled(self, function: Callable[..., Any], evaluates: bool = True) -> PyTree:
         """Compiles a function, for all devices of the mesh if it evaluates."""
         if self._mesh is None or not evaluates:
             return jax.jit(function)
         return on_mesh(function, self._mesh)
 
-    def _proposed(self, repertoire: Any, emitter: Any, key: jax.Array) -> Any:
+    def _proposed(
+        self, repertoire: Repertoire, emitter: PyTree, key: jax.Array
+    ) -> PyTree:
         """Next genotypes (N, size), and what the emitter wants told with them."""
         _, key = jax.random.split(key)
         genotypes, remembered = self._emitter.emit(repertoire, emitter, key)
         # Under x64 QDax draws its noise in double precision.
         return genotypes.astype(jnp.float32), remembered
 
-    def _begun(self, repertoire: Any, genotypes: Any, scores: Any) -> Any:
+    def _begun(
+        self, repertoire: Repertoire, genotypes: Genotype, scores: PyTree
+    ) -> PyTree:
         """Archive, emitter's state and metrics after the initial population."""
         repertoire, told = self._added(repertoire, genotypes, scores)
         emitter = self._emitter.init(key=self._key_emitter, **told)
@@ -278,12 +288,12 @@ class Search:
 
     def _told(
         self,
-        repertoire: Any,
-        emitter: Any,
-        genotypes: Any,
-        remembered: dict[str, Any],
-        scores: Any,
-    ) -> Any:
+        repertoire: Repertoire,
+        emitter: PyTree,
+        genotypes: Genotype,
+        remembered: ExtraScores,
+        scores: PyTree,
+    ) -> PyTree:
         """Archive, emitter's state and metrics after another generation."""
         repertoire, told = self._added(repertoire, genotypes, scores)
         told["extra_scores"] = {**told["extra_scores"], **remembered}
@@ -292,7 +302,9 @@ class Search:
         metrics["rejected"] += jnp.sum(remembered.get("overflowed", 0))
         return repertoire, emitter, metrics
 
-    def _added(self, repertoire: Any, genotypes: Any, scores: Any) -> tuple[Any, dict]:
+    def _added(
+        self, repertoire: Repertoire, genotypes: Genotype, scores: PyTree
+    ) -> tuple[Any, dict]:
         """The archive with a generation in it, and what the emitter hears of that."""
         fitnesses, found, extra = scores
         kept = _break_ties(fitnesses, found, repertoire.centroids)
@@ -308,7 +320,7 @@ class Search:
             "extra_scores": extra,
         }
 
-    def _measured(self, repertoire: Any, scores: Any) -> Any:
+    def _measured(self, repertoire: Repertoire, scores: PyTree) -> PyTree:
         """QD score, coverage [%], best fitness and individuals that were rejected."""
         from qdax.utils.metrics import default_qd_metrics
 
@@ -339,7 +351,7 @@ def _runnable(config: EvolveConfig) -> AlgorithmSpec[Any]:
     return spec
 
 
-def _strongly_typed(tree: Any) -> Any:
+def _strongly_typed(tree: PyTree) -> PyTree:
     """Takes weak types off; those of the next generation differ, and compile again."""
 
     def strong(leaf: Any) -> jax.Array:

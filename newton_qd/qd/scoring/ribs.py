@@ -11,7 +11,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from newton_qd.qd.extras import require_extra
-from newton_qd.types import ScoringFunction
+from newton_qd.types import Repertoire, ScoringFunction
 
 Limits = tuple[np.ndarray, np.ndarray]
 
@@ -76,7 +76,7 @@ def make_ribs_evaluation(
 
 
 def to_ribs(
-    repertoire: Any, limits: Limits, grid: tuple[int, ...] | None = None
+    repertoire: Repertoire, limits: Limits, grid: tuple[int, ...] | None = None
 ) -> Any:
     """Makes a ``ribs`` archive with the elites of a repertoire.
 
