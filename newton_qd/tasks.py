@@ -61,7 +61,7 @@ class WrapperSpec:
     """
 
     wrapper: Callable[..., Env]
-    options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    options: Mapping[str, object] = dataclasses.field(default_factory=dict)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,7 +102,7 @@ class EnvironmentSpec:
     @property
     def forward_reward(self) -> str | None:
         """Metric that is the forward part of the reward; ``None``: there is none."""
-        base: Any = self.base
+        base: object = self.base
         # a class with some of its arguments filled in is still that class
         while isinstance(base, functools.partial):
             base = base.func

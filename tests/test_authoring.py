@@ -199,6 +199,13 @@ def test_descriptors_have_the_length_of_their_limits(page: dict[str, Any]) -> No
         env.reset(jax.random.key(0))
 
 
+@pytest.mark.parametrize("limits", [None, 3, (0.0, 1.0), ((0, 0), (1,)), ((1,), (0,))])
+def test_limits_of_descriptors(limits: Any, page: dict[str, Any]) -> None:
+    kind = type("Bad", (page["ArmAngles"],), {"limits": limits})
+    with pytest.raises(ValueError, match=r"^Bad\.limits: got .*; allowed: lowest"):
+        kind(page["Crawler"](page["ROBOT"]), "crawler")
+
+
 def test_descriptors_around_a_batch(page: dict[str, Any]) -> None:
     inside = nq.create("crawler", batch_size=3)
     state = page["ArmAngles"](inside, "crawler").reset(jax.random.key(0))

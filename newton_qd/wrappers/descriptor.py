@@ -8,6 +8,7 @@ from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from newton_qd.checks import message
 from newton_qd.envs.base import Env, QDEnv
@@ -36,7 +37,15 @@ class DescriptorWrapper(Wrapper, QDEnv):
         Args:
             env: The environment.
             env_name: Its name, for errors.
+
+        Raises:
+            ValueError: The class has no ``limits``, or they are not of one length with
+                the lowest value of each component below the highest.
         """
+        # limits of a class that makes them itself are not asked for
+        own = type(self).state_descriptor_limits
+        if own is DescriptorWrapper.state_descriptor_limits:
+            _check_limits(type(self))
         super().__init__(env)
 
     @abc.abstractmethod
@@ -106,3 +115,19 @@ class DescriptorWrapper(Wrapper, QDEnv):
         """Lower and upper limits, (nd,) each."""
         low, high = self.limits
         return jnp.asarray(low, self.dtype), jnp.asarray(high, self.dtype)
+
+
+def _check_limits(kind: type[DescriptorWrapper]) -> None:
+    """Checks the limits of a class.
+
+    Raises:
+        ValueError: They are none.
+    """
+    limits = getattr(kind, "limits", None)
+    try:
+        pair = np.asarray(limits, np.float64)
+    except (TypeError, ValueError):
+        pair = np.zeros(())
+    if pair.ndim != 2 or len(pair) != 2 or not np.all(pair[0] < pair[1]):
+        allowed = "lowest and highest values, such as ((0.0, 0.0), (1.0, 1.0))"
+        raise ValueError(message(f"{kind.__name__}.limits", limits, allowed))
