@@ -7,14 +7,14 @@ import textwrap
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-from newton_qd.cli.arguments import OK
+from newton_qd.cli.arguments import OK, Commands
 from newton_qd.qd.algorithms import ALGORITHMS, AlgorithmSpec, algorithm_named
 from newton_qd.qd.algorithms.options import option_texts
 
 _WIDTH = 79
 
 
-def add_parser(commands: Any) -> None:
+def add_parser(commands: Commands) -> None:
     """Adds the command to the subparsers of ``newton-qd``."""
     parser = commands.add_parser(
         "algorithms",

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import argparse
 import sys
+from typing import TypeAlias
+
+Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
+"""The subparsers of ``newton-qd``."""
 
 OK, FAILED, BAD_ARGUMENTS = 0, 1, 2
 

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
-from newton_qd.cli.arguments import BAD_ARGUMENTS, OK, complain, widths
+from newton_qd.cli.arguments import BAD_ARGUMENTS, OK, Commands, complain, widths
 
 
-def add_parser(commands: Any) -> None:
+def add_parser(commands: Commands) -> None:
     """Adds the command to the subparsers of ``newton-qd``."""
     doctor = commands.add_parser("doctor", help="measure where gradients are useful")
     ailments = doctor.add_subparsers(dest="ailment", required=True, metavar="WHAT")

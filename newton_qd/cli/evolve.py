@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from newton_qd.cli.arguments import FAILED, OK, complain, integers, widths
+from newton_qd.cli.arguments import FAILED, OK, Commands, complain, integers, widths
 from newton_qd.qd.algorithms import ALGORITHMS
 from newton_qd.qd.config import (
     ConfigError,
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 _DEFAULTS = EvolveConfig()
 
 
-def add_parser(commands: Any) -> None:
+def add_parser(commands: Commands) -> None:
     """Adds the command to the subparsers of ``newton-qd``."""
     parser = commands.add_parser(
         "evolve",
