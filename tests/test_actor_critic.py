@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from point_runs import PointEnv, point_task
 from qdax.core.containers.mapelites_repertoire import (
     MapElitesRepertoire,
     compute_euclidean_centroids,
 )
-from test_evolve import PointEnv, point_task
 
 import newton_qd
 from newton_qd.extractors import get_final_xy_position

@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from test_evolve import SMALL, interrupt_after, point_task, run
+from point_runs import SMALL, interrupt_after, point_task, run
 from test_steady import compiled
 
 import newton_qd.compat

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_evolve import (
+from point_runs import (
     SMALL,
     assert_same_results,
     compile_once,

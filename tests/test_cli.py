@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_evolve import SMALL, point_task
+from point_runs import SMALL, point_task
 
 import newton_qd
 from newton_qd import cli

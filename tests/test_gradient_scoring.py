@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_evolve import SMALL, PointEnv, PointState, point_task
+from point_runs import SMALL, PointEnv, PointState, point_task
 
 from newton_qd.extractors import get_final_xy_position
 from newton_qd.gradients import GradientOptions

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_evolve import SMALL, PointEnv, point_task, run
+from point_runs import SMALL, PointEnv, point_task, run
 
 from newton_qd.errors import MissingExtra
 from newton_qd.qd.emitters import GradientsError

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import jax
 import pytest
-from test_evolve import SMALL, point_task
+from point_runs import SMALL, point_task
 
 from newton_qd.qd.config import EvolveConfig
 from newton_qd.qd.run.search import Search

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from test_evolve import SMALL, compile_once, interrupt_after, run
+from point_runs import SMALL, compile_once, interrupt_after, run
 
 from newton_qd.qd.config import ConfigError
 

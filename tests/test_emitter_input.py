@@ -1,0 +1,117 @@
+"""What gradient-based emitters refuse: scores without gradients, bad settings."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+import pytest
+from emitter_problems import (
+    MAKERS,
+    SIZE,
+    algorithm,
+    along,
+    begin,
+    broken,
+    centroids,
+    emit,
+    score,
+    start,
+)
+
+from newton_qd.qd.emitters import (
+    CMAMAEGAEmitter,
+    CMAMEGAEmitter,
+    GradientLineEmitter,
+    GradientsError,
+    GradientVariationEmitter,
+    OMGMEGAEmitter,
+    SteeringEmitter,
+)
+from newton_qd.qd.scoring.gradient_scores import read_scores
+
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
+
+
+def _without_gradients(genotypes: jax.Array, key: jax.Array) -> tuple:
+    fitnesses, descriptors, _ = score(genotypes, key)
+    return fitnesses, descriptors, {"grads": fitnesses}
+
+
+@pytest.mark.parametrize("name", ["omg_mega", "cma_mega", "cma_maega", "mixed"])
+def test_missing_gradients_are_named(name: str) -> None:
+    scoring = _without_gradients
+    search = algorithm(MAKERS[name](scoring), scoring, name == "cma_maega")
+    with pytest.raises(GradientsError, match=r"'gradients'\] is missing.*'grads'"):
+        jax.eval_shape(search.init, start(), centroids(), jax.random.key(0))
+
+
+def test_errors_name_what_is_wrong() -> None:
+    fitnesses, descriptors, extra = score(start(), jax.random.key(0))
+    read = functools.partial(read_scores, start(), fitnesses, descriptors)
+    with pytest.raises(GradientsError, match="extra_scores holds nothing"):
+        read(None)
+    swapped = {"gradients": jnp.swapaxes(extra["gradients"], 1, 2)}
+    with pytest.raises(GradientsError, match=r"\(16, 20, 3\).*swap the last two axes"):
+        read(swapped)
+    with pytest.raises(GradientsError, match=r"got \(16, 19, 3\)"):
+        read({"gradients": extra["gradients"][:, 1:]})
+    with pytest.raises(GradientsError, match="ravel_pytree"):
+        read_scores({"w": start()}, fitnesses, descriptors, extra)
+
+    with pytest.raises(GradientsError, match=r"start must have .*\(20,\), got \(3,\)"):
+        begin(CMAMEGAEmitter(score, sigma_g=1.0, start=jnp.zeros(3)))
+    with pytest.raises(TypeError, match="AnnealedRepertoire"):
+        begin(CMAMAEGAEmitter(score, sigma_g=1.0))
+    with pytest.raises(ValueError, match=r"1 \+ D = 3 columns, got 2"):
+        emitter = GradientVariationEmitter(4, optax.sgd(1.0), directions=[(1, 0)])
+        emit(emitter, *begin(emitter))
+    # Values are known outside jit only.
+    search = algorithm(
+        CMAMEGAEmitter(broken, sigma_g=1.0, start=jnp.ones(SIZE)), broken
+    )
+    with pytest.raises(GradientsError, match="not finite"):
+        search.init(start(), centroids(), jax.random.key(0))
+
+
+def line(**changes: Any) -> GradientLineEmitter:
+    given = {"parents": 2, "branches": 2, "shortest": 0.1, "longest": 1.0, **changes}
+    return GradientLineEmitter(along(score), **given)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: OMGMEGAEmitter(0, 1.0), "batch_size must be at least 1, got 0"),
+        (lambda: OMGMEGAEmitter(4, 0.0), "sigma_g must be positive, got 0.0"),
+        (lambda: CMAMEGAEmitter(score, sigma_g=-1.0), "sigma_g must be positive"),
+        (lambda: CMAMEGAEmitter(score, sigma_g=1.0, batch_size=2), "at least 3, got 2"),
+        (
+            lambda: CMAMEGAEmitter(score, sigma_g=1.0, restart_period=0),
+            "restart_period must be at least 1, got 0",
+        ),
+        (
+            lambda: GradientVariationEmitter(4, optax.sgd(1.0), steps=2),
+            "steps = 2 needs a scoring_function",
+        ),
+        (
+            lambda: GradientVariationEmitter(4, optax.sgd(1.0), directions=[1.0]),
+            "directions must be finite numbers",
+        ),
+        (
+            lambda: line(parents=0),
+            "parents must be at least 1, got 0",
+        ),
+        (lambda: line(steered=2.0), r"steered must be in \[0, 1\], got 2.0"),
+        (lambda: line(longest=0.0), "shortest <= longest, got shortest = 0.1, longest"),
+        (lambda: SteeringEmitter(4, max_step=0.0), "max_step must be positive"),
+        (lambda: SteeringEmitter(4, max_step=1.0, steps=0), "steps must be at least 1"),
+    ],
+)
+def test_bad_settings_are_refused(make: Callable, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make()

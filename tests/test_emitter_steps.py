@@ -1,0 +1,159 @@
+"""The steps of gradient-based emitters, where gradients are known."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from emitter_problems import (
+    SIZE,
+    algorithm,
+    along,
+    begin,
+    centroids,
+    compiled,
+    emit,
+    score,
+    start,
+)
+from qdax.core.containers.mapelites_repertoire import (
+    get_cells_indices,
+)
+
+from newton_qd.qd.emitters import (
+    CMAMEGAEmitter,
+    GradientLineEmitter,
+    GradientVariationEmitter,
+    OMGMEGAEmitter,
+    RestartRule,
+    SteeringEmitter,
+)
+from newton_qd.qd.scoring.gradient_scores import normalize
+
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
+
+
+def test_omg_mega_steps_along_the_gradients() -> None:
+    emitter = OMGMEGAEmitter(64, sigma_g=0.3)
+    repertoire, state = begin(emitter, 1)
+    steps = np.asarray(emit(emitter, repertoire, state) - start()[:1])
+    gradients = normalize(score(start()[:1], jax.random.key(0))[2]["gradients"][0].T)
+    coefficients, residual, _, _ = np.linalg.lstsq(gradients.T, steps.T, rcond=None)
+    assert np.max(residual) < 1e-9
+    assert np.all(coefficients[0] > 0)
+    assert 0.2 < np.std(coefficients[1:]) < 0.4
+
+
+def test_variation_climbs_as_gradient_ascent_does() -> None:
+    emitter = GradientVariationEmitter(
+        4, optax.sgd(0.1), steps=3, scoring_function=score
+    )
+    genotypes = emit(emitter, *begin(emitter, 1))
+    expected = np.asarray(start()[0], np.float64)
+    for _ in range(3):
+        gradient = 0.5 - expected
+        expected += 0.1 * gradient / np.linalg.norm(gradient)
+    np.testing.assert_allclose(genotypes, np.tile(expected, (4, 1)), atol=1e-5)
+
+
+def test_steering_lands_in_empty_cells() -> None:
+    # Descriptors are linear here: one step reaches the target.
+    emitter = SteeringEmitter(32, max_step=100.0)
+    repertoire, state = begin(emitter)
+    genotypes = emit(emitter, repertoire, state)
+    descriptors = score(genotypes, jax.random.key(0))[1]
+    cells = get_cells_indices(descriptors, centroids())
+    assert jnp.all(repertoire.fitnesses[cells, 0] == -jnp.inf)
+    short = emit(SteeringEmitter(32, max_step=0.1), repertoire, state)
+    steps = np.asarray(short)[:, None] - np.asarray(repertoire.genotypes)
+    lengths = np.linalg.norm(steps, axis=-1).min(axis=1)
+    assert np.all(lengths <= 0.1 * (1 + 1e-5))
+
+
+def test_lines_climb_and_steer() -> None:
+    emitter = GradientLineEmitter(
+        along(score), parents=4, branches=3, shortest=0.1, longest=0.8
+    )
+    repertoire, state = begin(emitter, count=1)
+    parent = np.asarray(start()[0])
+    steps = np.asarray(emit(emitter, repertoire, state)).reshape(4, 3, SIZE) - parent
+    lengths = np.linalg.norm(steps, axis=2)
+    edges = 0.1 * 8 ** (np.arange(4) / 3)
+    assert np.all((lengths >= edges[:-1] - 1e-5) & (lengths <= edges[1:] + 1e-5))
+    ways = steps / lengths[..., None]
+    gradients = np.asarray(score(start()[:1], jax.random.key(0))[2]["gradients"][0])
+    uphill = gradients[:, 0] / np.linalg.norm(gradients[:, 0])
+    np.testing.assert_allclose(ways[:2], np.broadcast_to(uphill, (2, 3, SIZE)), 1e-4)
+    # The others change the descriptors alone, which are means of halves.
+    for way in ways[2:]:
+        np.testing.assert_allclose(way, np.broadcast_to(way[0], way.shape), atol=1e-5)
+        halves = way[0].reshape(2, -1)
+        np.testing.assert_allclose(halves, halves[:, :1] * np.ones(10), atol=1e-5)
+
+
+def unbeatable(genotypes: jax.Array, key: jax.Array) -> tuple:
+    """One cell, whose elite nobody beats."""
+    _, descriptors, extra = score(genotypes, key)
+    penalty = jnp.linalg.norm(genotypes - start()[0], axis=1)
+    return -penalty, 0 * descriptors, extra
+
+
+@pytest.mark.parametrize(
+    ("rule", "period", "expected"),
+    [
+        (RestartRule.BASIC, 3, [1, 2, 0, 1, 2, 0]),
+        (RestartRule.NO_IMPROVEMENT, None, [0, 0, 0, 0, 0, 0]),
+        ("no_improvement", None, [0, 0, 0, 0, 0, 0]),
+    ],
+)
+def test_points_restart_from_elites(
+    rule: Any, period: int | None, expected: list[int]
+) -> None:
+    emitter = CMAMEGAEmitter(
+        unbeatable, sigma_g=0.5, batch_size=8, restart_rule=rule, restart_period=period
+    )
+    search = algorithm(emitter, unbeatable)
+
+    def run(initial: jax.Array) -> Any:
+        key = jax.random.key(0)
+        carry = (*search.init(initial, centroids(), key)[:2], key)
+
+        def step(carry: Any, _: None) -> tuple:
+            carry, _ = search.scan_update(carry, None)
+            repertoire, state, _ = carry
+            elite = jnp.any(jnp.all(state.points[0] == repertoire.genotypes, axis=-1))
+            return carry, (state.age[0], elite, state.cma_es.mean[0])
+
+        return jax.lax.scan(step, carry, None, length=6)[1]
+
+    ages, elite, mean = compiled(run)(start())
+    assert ages.tolist() == expected
+    restarted = np.asarray(ages) == 0
+    assert np.all(np.asarray(elite)[restarted])
+    np.testing.assert_array_equal(np.all(np.asarray(mean) == 0, axis=1), restarted)
+
+
+def test_emitting_and_updating_agree() -> None:
+    # What QDax 0.5.0 gets wrong: the point must move by what was emitted.
+    emitter = CMAMEGAEmitter(score, sigma_g=0.5, batch_size=9)
+    search = algorithm(emitter)
+    repertoire, state = begin(emitter)
+    genotypes = emit(emitter, repertoire, state)
+    fitnesses, descriptors, _ = score(genotypes, jax.random.key(2))
+    _, after, _ = compiled(search.tell)(
+        genotypes, fitnesses, descriptors, repertoire, state
+    )
+    cells = get_cells_indices(descriptors, centroids())[1:]
+    bars = np.asarray(state.bars)[cells]
+    new = bars == -np.inf
+    worth = np.asarray(fitnesses)[1:] - np.where(new, 0, bars)
+    order = np.lexsort((-worth, -np.where(new, 2, worth > 0)))
+    weights = np.log(4.5) - np.log(np.arange(1, 5))
+    parents = np.asarray(genotypes)[1:][order[:4]]
+    expected = (weights / weights.sum()) @ parents
+    assert int(after.restarts) == 0
+    np.testing.assert_allclose(after.points[0], expected, atol=1e-5)

@@ -1,0 +1,105 @@
+"""Settings of a run, config files, and packages that are missing."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from point_runs import SMALL, run
+
+from newton_qd.errors import MissingExtra, UnknownEnvironment
+from newton_qd.qd.config import ConfigError, EvolveConfig, read_config
+from newton_qd.qd.scoring.task import make_task
+
+# QDax and what it imports warn about their own use of other packages.
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"seed": -1}, "seed must be an integer, 0 to 4294967295; got -1"),
+        ({"seed": 2**32}, "seed"),
+        ({"seed": True}, "seed"),
+        ({"iterations": -1}, "iterations must be an integer, at least 0; got -1"),
+        ({"batch_size": 0}, "batch_size"),
+        ({"batch_size": 2.0}, "batch_size"),
+        ({"episode_length": 0}, "episode_length"),
+        ({"hidden": (8, 0)}, "hidden"),
+        ({"hidden": 8}, "hidden"),
+        ({"grid": ()}, "grid"),
+        ({"grid": (1, 1)}, "grid"),
+        ({"grid": (5, -5)}, "grid"),
+        ({"grid": (2000, 2000)}, "grid's number of cells"),
+        ({"centroids": 1, "grid": None}, "centroids"),
+        ({"centroids": 10, "grid": (5, 5)}, "exclude"),
+        ({"iso_sigma": float("nan")}, "iso_sigma"),
+        ({"line_sigma": -0.1}, "line_sigma must be a finite number"),
+        ({"env_name": ""}, "env_name"),
+        ({"algorithm": 3}, "algorithm must be a name, got 3"),
+        ({"options": 3}, "options must be names with values, got 3"),
+        ({"colour": "red"}, "unknown setting 'colour'; known: algorithm, batch_size"),
+    ],
+)
+def test_bad_settings_are_named(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        EvolveConfig().replace(**settings)
+
+
+def test_a_grid_must_fit_the_descriptor(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    with pytest.raises(ConfigError, match=r"5x5x5 has 3 dimensions.*'point' has 2"):
+        run(SMALL.replace(grid=(5, 5, 5)), out=out)
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "not valid JSON"),
+        ("[]", "no 'settings'"),
+        ('{"format": 9, "settings": {}}', "format 9"),
+        ('{"format": 1, "settings": []}', "must be an object"),
+        ('{"format": 1, "settings": {"seed": "a"}}', "seed must be an integer"),
+        ('{"format": 1, "settings": {"sed": 1}}', "unknown setting 'sed'"),
+        ('{"format": 1, "settings": {"seed": 1}}', "env_name is missing"),
+        (
+            '{"format": 1, "settings": {}, "environment": {"packages": null}}',
+            "'environment' must be facts by name",
+        ),
+    ],
+)
+def test_bad_config_files(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "config.json"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=message) as caught:
+        read_config(path)
+    assert str(path) in str(caught.value)
+
+
+def test_missing_config_file(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"cannot read .*No such file"):
+        read_config(tmp_path / "config.json")
+
+
+@pytest.mark.parametrize(
+    ("package", "extra"),
+    [("qdax", "qd"), ("matplotlib", "viz"), ("tensorboardX", "tensorboard")],
+)
+def test_missing_extras(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, package: str, extra: str
+) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    out = tmp_path / "run"
+    with pytest.raises(MissingExtra, match=rf"{package}.*newton_qd\[{extra}\]"):
+        run(out=out, tensorboard=True)
+    assert not out.exists()
+
+
+def test_names_that_are_no_task() -> None:
+    with pytest.raises(UnknownEnvironment, match=r"'ant_unicorn'.*ant_uni"):
+        make_task(EvolveConfig(env_name="ant_unicorn"))
+    with pytest.raises(ConfigError, match=r"'ant' has no descriptor.*ant_uni"):
+        make_task(EvolveConfig(env_name="ant"))
