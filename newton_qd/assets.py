@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from newton_qd.checks import Fact, listed, message
+
 _PACKAGE = Path(__file__).resolve().parent
 
 
@@ -46,14 +48,14 @@ def find_urdf(name: str | os.PathLike[str]) -> Path:
     if not isinstance(name, str) or any(mark in text for mark in separators):
         path = Path(text).expanduser()
         if not path.is_file():
-            raise AssetNotFoundError(f"urdf {text!r}: no such file ({path.absolute()})")
+            given = Fact(f"{text!r}, where no file is ({path.absolute()})")
+            raise AssetNotFoundError(message("urdf", given, "a file that exists"))
         return path
     folder = urdf_directory()
     path = folder / text
     if not text or not path.is_file():
-        known = ", ".join(sorted(file.name for file in folder.glob("*.urdf")))
-        raise AssetNotFoundError(
-            f"urdf {text!r}: no such file in {folder}; allowed: {known}, or a path "
-            "with a folder in it, such as './mine.urdf'"
-        )
+        known = listed(sorted(file.name for file in folder.glob("*.urdf")))
+        allowed = f"{known}, or a path with a folder in it, such as './mine.urdf'"
+        why = f"which is no file in {folder}"
+        raise AssetNotFoundError(message("urdf", text, allowed, why=why))
     return path

@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import math
 import numbers
-import sys
 from collections.abc import Collection
-from typing import Any, TypeVar
+from typing import Any, TypeGuard, TypeVar
 
 import numpy as np
 
@@ -69,12 +68,12 @@ def is_array(value: Any) -> bool:
     return hasattr(value, "shape") and hasattr(value, "dtype")
 
 
-def is_number(value: Any) -> bool:
+def is_number(value: object) -> TypeGuard[float]:
     """Returns whether a value is a real number; ``True`` and ``False`` are none."""
     return isinstance(value, numbers.Real) and not isinstance(value, bool)
 
 
-def is_integer(value: Any) -> bool:
+def is_integer(value: object) -> TypeGuard[int]:
     """Returns whether a value is of an integer type; ``True`` and ``False`` are not."""
     return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
 
@@ -113,7 +112,7 @@ def number(
     numeric = is_number(value)
     if (
         numeric
-        and (abs(value) <= sys.float_info.max or (endless and not math.isnan(value)))
+        and (_finite(value) or (endless and not math.isnan(value)))
         and (least is None or value >= least)
         and (above is None or value > above)
         and (most is None or value <= most)
@@ -358,6 +357,13 @@ def array(
         batch = " (for a batch, use jax.vmap or create(..., batch_size=...))"
         raise ValueError(message(name, found, allowed + batch))
     return found.astype(dtype)
+
+
+def _finite(value: float) -> bool:
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # an integer beyond the floating-point numbers
+        return False
 
 
 def _none(optional: bool) -> str:

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import functools
 import inspect
-import math
-import numbers
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from newton_qd import brax_views as brax
-from newton_qd import tasks
+from newton_qd import checks, tasks
+from newton_qd.checks import Fact, listed, message
 from newton_qd.envs.base import Env
-from newton_qd.envs.options import check_flag
 from newton_qd.errors import UnknownEnvironment
 from newton_qd.moved import moved_name
 from newton_qd.robots import Material, RobotSpec
@@ -85,18 +83,14 @@ def register(
             not finite.
     """
     _check_names(env_name, base_name)
-    if not callable(base):
-        raise TypeError(f"base={base!r}: allowed: a class or a function")
-    if descriptor_extractor is not None and not callable(descriptor_extractor):
-        raise TypeError(
-            f"descriptor_extractor={descriptor_extractor!r}: allowed: None, or a "
-            "function of (data, mask)"
-        )
-    if robot is not None and not isinstance(robot, RobotSpec):
-        raise TypeError(
-            f"robot={robot!r}: allowed: None, or a newton_qd.robots.RobotSpec"
-        )
-    _check_offset(reward_offset)
+    checks.function("base", base, "a class or a function")
+    allowed = "a function of (data, mask)"
+    checks.function(
+        "descriptor_extractor", descriptor_extractor, allowed, optional=True
+    )
+    allowed = "a newton_qd.robots.RobotSpec"
+    checks.instance("robot", robot, RobotSpec, allowed, optional=True)
+    checks.number("reward_offset", reward_offset, optional=True)
     _check_wrappers(wrappers)
     described = _descriptor_specs(descriptor)
     if descriptor_extractor is None and described:
@@ -123,16 +117,12 @@ def _check_names(env_name: object, base_name: object) -> None:
     Raises:
         ValueError: A name is none, or taken.
     """
-    if not isinstance(env_name, str) or not env_name:
-        raise ValueError(f"env_name={env_name!r}: allowed: a string that is not empty")
+    checks.text("env_name", env_name)
     if env_name in tasks.ENVIRONMENTS:
-        taken = ", ".join(registered_envs())
-        raise ValueError(f"env_name={env_name!r}: taken; allowed: any but {taken}")
+        allowed = f"any name but {listed(registered_envs())}"
+        raise ValueError(message("env_name", env_name, allowed, why="which is taken"))
     # A spec is read by every table: one that is wrong would break them all.
-    if base_name is not None and (not isinstance(base_name, str) or not base_name):
-        raise ValueError(
-            f"base_name={base_name!r}: allowed: None, or a string that is not empty"
-        )
+    checks.text("base_name", base_name, optional=True)
 
 
 def _descriptor_specs(
@@ -146,11 +136,8 @@ def _descriptor_specs(
     if descriptor is None:
         return ()
     if not isinstance(descriptor, WrapperSpec):
-        if not callable(descriptor):
-            raise TypeError(
-                f"descriptor={descriptor!r}: allowed: None, a class such as "
-                "FeetContactWrapper, or a WrapperSpec of one"
-            )
+        allowed = "None, a class such as FeetContactWrapper, or a WrapperSpec of one"
+        checks.function("descriptor", descriptor, allowed)
         descriptor = WrapperSpec(descriptor)
     _check_wrappers((descriptor,))
     return (descriptor,)
@@ -162,22 +149,6 @@ def _takes_robot(base: Callable[..., Env]) -> bool:
     return parameter is not None and parameter.default is parameter.empty
 
 
-def _check_offset(reward_offset: object) -> None:
-    """Checks the ``reward_offset`` of ``register``.
-
-    Raises:
-        TypeError: It is no number.
-        ValueError: It is not finite.
-    """
-    allowed = "allowed: None, or a finite number"
-    if reward_offset is None:
-        return
-    if not isinstance(reward_offset, numbers.Real) or isinstance(reward_offset, bool):
-        raise TypeError(f"reward_offset={reward_offset!r}: {allowed}")
-    if not math.isfinite(reward_offset):
-        raise ValueError(f"reward_offset={reward_offset!r}: {allowed}")
-
-
 def _check_wrappers(wrappers: object) -> None:
     """Checks the ``wrappers`` of ``register``.
 
@@ -185,26 +156,16 @@ def _check_wrappers(wrappers: object) -> None:
         TypeError: They are not specs of wrappers.
     """
     if not isinstance(wrappers, Sequence) or isinstance(wrappers, str):
-        raise TypeError(
-            f"wrappers={wrappers!r}: allowed: a tuple or list of WrapperSpec, such as "
-            "(WrapperSpec(FeetContactWrapper),)"
-        )
+        allowed = "a tuple or list of WrapperSpec, such as "
+        allowed += "(WrapperSpec(FeetContactWrapper),)"
+        raise TypeError(message("wrappers", wrappers, allowed))
     for index, spec in enumerate(wrappers):
-        if not isinstance(spec, WrapperSpec):
-            raise TypeError(
-                f"wrappers[{index}]={spec!r}: allowed: a WrapperSpec, such as "
-                "WrapperSpec(FeetContactWrapper)"
-            )
-        if not callable(spec.wrapper):
-            raise TypeError(
-                f"wrappers[{index}].wrapper={spec.wrapper!r}: allowed: a class or a "
-                "function"
-            )
-        if not isinstance(spec.options, Mapping):
-            raise TypeError(
-                f"wrappers[{index}].options={spec.options!r}: allowed: a mapping of "
-                "keyword arguments"
-            )
+        name = f"wrappers[{index}]"
+        allowed = "a WrapperSpec, such as WrapperSpec(FeetContactWrapper)"
+        checks.instance(name, spec, WrapperSpec, allowed)
+        checks.function(f"{name}.wrapper", spec.wrapper, "a class or a function")
+        allowed = "a mapping of keyword arguments"
+        checks.instance(f"{name}.options", spec.options, Mapping, allowed)
 
 
 def create(
@@ -246,16 +207,17 @@ def create(
         ValueError: A value or a combination is not allowed.
     """
     spec = _spec(env_name)
-    check_flag("auto_reset", auto_reset)
-    check_flag("eval_metrics", eval_metrics)
-    check_flag("fixed_init_state", fixed_init_state)
-    check_flag("brax_views", brax_views)
+    checks.flag("auto_reset", auto_reset)
+    checks.flag("eval_metrics", eval_metrics)
+    checks.flag("fixed_init_state", fixed_init_state)
+    checks.flag("brax_views", brax_views)
     options = _wrapper_options(env_name, spec, qdax_wrappers_kwargs)
     if episode_length is None and (action_repeat != 1 or eval_metrics):
-        raise ValueError(
-            f"episode_length=None with action_repeat={action_repeat!r}, eval_metrics="
-            f"{eval_metrics!r}; allowed: 1 and False, or an episode length"
+        given = Fact(
+            f"None with action_repeat={action_repeat!r}, eval_metrics={eval_metrics!r}"
         )
+        allowed = "an episode length, or None with 1 and False"
+        raise ValueError(message("episode_length", given, allowed))
     env = _base(env_name, spec, material, kwargs)
     if fixed_init_state:
         fixed = (
@@ -305,10 +267,8 @@ def _base(
     Raises:
         TypeError: ``material`` is none, or the environment does not take an option.
     """
-    if material is not None and not isinstance(material, Material):
-        raise TypeError(
-            f"material={material!r}: allowed: None, newton_qd.robots.Material"
-        )
+    allowed = "newton_qd.robots.Material"
+    checks.instance("material", material, Material, allowed, optional=True)
     _require_keywords(env_name, spec.base, options)
     env = spec.base(**options)
     return env if material is None else env.with_material(material)
@@ -328,10 +288,9 @@ def _require_keywords(
     allowed = [p.name for p in parameters if p.kind is not p.POSITIONAL_ONLY]
     for name in given:
         if name not in allowed:
-            raise TypeError(
-                f"{name}={given[name]!r}: not an argument of {env_name!r}; allowed: "
-                f"those of create, and {', '.join(allowed) or 'no other'}"
-            )
+            why = f"which is not an argument of {env_name!r}"
+            known = f"those of create, and {listed(allowed, 'no other')}"
+            raise TypeError(message(name, given[name], known, why=why))
 
 
 def _wrapper_options(
@@ -348,17 +307,15 @@ def _wrapper_options(
     if given is None:
         return [wrapper_spec.options for wrapper_spec in spec.wrappers]
     if isinstance(given, Mapping) or not all(isinstance(x, Mapping) for x in given):
-        raise TypeError(
-            f"qdax_wrappers_kwargs={given!r}: allowed: None, or a sequence of "
-            "dictionaries, one for each wrapper"
-        )
+        allowed = "None, or a sequence of dictionaries, one for each wrapper"
+        raise TypeError(message("qdax_wrappers_kwargs", given, allowed))
     if len(given) != len(spec.wrappers):
-        names = ", ".join(
+        names = [
             getattr(wrapper_spec.wrapper, "__name__", repr(wrapper_spec.wrapper))
             for wrapper_spec in spec.wrappers
-        )
-        raise ValueError(
-            f"qdax_wrappers_kwargs has {len(given)} entries; allowed: None, or "
-            f"{len(spec.wrappers)} for {env_name!r} ({names or 'no wrapper'})"
-        )
+        ]
+        allowed = f"None, or {len(names)} for {env_name!r} "
+        allowed += f"({listed(names, 'no wrapper')})"
+        count = Fact(f"{len(given)} entries")
+        raise ValueError(message("qdax_wrappers_kwargs", count, allowed))
     return list(given)

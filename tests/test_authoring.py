@@ -145,31 +145,31 @@ def test_a_pose_of_ones_own(page: dict[str, Any]) -> None:
             "observe",
             {},
             TypeError,
-            r"Bad.observe: returned \{\}; allowed: a dictionary",
+            r"Bad.observe: got \{\}; allowed: a dictionary",
         ),
         (
             "observe",
             {"x": jnp.zeros(())},
             ValueError,
-            r"'x' has shape \(\); allowed: \(n",
+            r"'x': got shape \(\); allowed: shape \(n",
         ),
         (
             "outcome",
             jnp.zeros(()),
             TypeError,
-            r"Bad.outcome: returned .*; allowed: rew",
+            r"Bad.outcome: got .*; allowed: rew",
         ),
         (
             "outcome",
             (jnp.zeros(1), False, {}),
             ValueError,
-            r"Bad.outcome: 'reward' has shape \(1,\); allowed: \(\)",
+            r"Bad.outcome: 'reward': got shape \(1,\); allowed: shape \(\)",
         ),
         (
             "outcome",
             (0.0, False, {"lean": jnp.zeros(2)}),
             ValueError,
-            r"Bad.outcome: 'lean' has shape \(2,\); allowed: \(\)",
+            r"Bad.outcome: 'lean': got shape \(2,\); allowed: shape \(\)",
         ),
     ],
 )
@@ -253,9 +253,13 @@ def test_register_gives_the_robot_and_options(names: None) -> None:
     assert env.state_descriptor_limits[1].tolist() == [1, 1]
     env = nq.create("mine", healthy_reward=4.0)
     assert env.unwrapped._healthy_reward == 4.0
-    with pytest.raises(TypeError, match=r"heatlhy=1: not an argument of 'other'; allo"):
+    with pytest.raises(
+        TypeError, match=r"heatlhy: got 1, .* not an argument of 'other'; a"
+    ):
         nq.register("other", nq.Locomotion, robot=robot, heatlhy=1)
-    with pytest.raises(TypeError, match="descriptor=3: allowed: None, a class such as"):
+    with pytest.raises(
+        TypeError, match="descriptor: got 3; allowed: None, a class such as"
+    ):
         nq.register("other", nq.Locomotion, descriptor=3)  # pyright: ignore
     assert "other" not in nq.registered_envs()
 

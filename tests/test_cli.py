@@ -136,8 +136,14 @@ def test_bad_arguments_write_nothing(
         ([], "COMMAND"),
         (["fly"], "invalid choice: 'fly'"),
         (["evolve", "ant_uni", "--seed", "one"], "invalid int value: 'one'"),
-        (["evolve", "ant_uni", "--grid", "5,5"], "expected integers like 8x8"),
-        (["evolve", "ant_uni", "--hidden", "8x8"], "expected integers like 8,8"),
+        (
+            ["evolve", "ant_uni", "--grid", "5,5"],
+            "got '5,5'; allowed: integers like 8x8",
+        ),
+        (
+            ["evolve", "ant_uni", "--hidden", "8x8"],
+            "got '8x8'; allowed: integers like 8,8",
+        ),
         (["evolve", "a", "--grid", "5x5", "--centroids", "9"], "not allowed with"),
         (["evolve", "ant_uni", "--bogus"], "--bogus"),
     ],

@@ -51,7 +51,7 @@ def test_installing_twice_is_installing_once() -> None:
     env = first.create("pointmaze", legacy_spring=True)
     assert isinstance(env, first.QDEnv) or isinstance(env.unwrapped, first.QDEnv)
     assert first.create_fn("pointmaze", episode_length=7)().episode_length == 7
-    with pytest.raises(ValueError, match="legacy_spring=False: allowed: True"):
+    with pytest.raises(ValueError, match="legacy_spring: got False; allowed: True"):
         first.create("ant_uni", legacy_spring=False)
     with pytest.raises(NotImplementedError, match="does not exist"):
         first.create("no_such_env")

@@ -187,13 +187,13 @@ def test_state_descriptor_follows_the_auto_reset() -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"scale_action_space": 0.0}, r"scale_action_space=0.0.*above 0"),
-        ({"zone_width": -1.0}, r"zone_width=-1.0.*above 0"),
-        ({"wall_width_ratio": np.nan}, r"wall_width_ratio=nan.*finite"),
-        ({"x_min": 2.0}, r"x_min=2.0, x_max=1.0.*x_min below x_max"),
-        ({"y_min": -0.5}, r"y_min=-0.5.*below -0.7"),
-        ({"upper_wall_height_offset": -0.6}, r"upper_wall_height_offset=-0.6"),
-        ({"dtype": "float16"}, r"dtype='float16'.*'float32', 'float64'"),
+        ({"scale_action_space": 0.0}, r"scale_action_space: got 0.0.*above 0"),
+        ({"zone_width": -1.0}, r"zone_width: got -1.0.*above 0"),
+        ({"wall_width_ratio": np.nan}, r"wall_width_ratio: got nan.*finite"),
+        ({"x_min": 2.0}, r"x_min, x_max: got \(2.0, 1.0\).*x_min below"),
+        ({"y_min": -0.5}, r"y_min, y_max: got \(-0.5.*below -0.7"),
+        ({"upper_wall_height_offset": -0.6}, r"upper_wall_height_offset: got .*-0.6"),
+        ({"dtype": "float16"}, r"dtype: got 'float16'.*float32, float64"),
     ],
 )
 def test_settings_that_make_no_maze(settings: dict[str, Any], message: str) -> None:

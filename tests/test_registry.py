@@ -158,10 +158,11 @@ def test_keywords_reach_the_environment() -> None:
     env = newton_qd.create("ant", exclude_current_positions_from_observation=False)
     assert env.observation_size == 89
     with pytest.raises(
-        TypeError, match=r"legacy_spring=True: .*'ant'; allowed: .*ctrl_cost_weight, "
+        TypeError,
+        match=r"legacy_spring: got True, .*'ant'; allowed: .*ctrl_cost_weight, ",
     ):
         newton_qd.create("ant", legacy_spring=True)
-    with pytest.raises(TypeError, match=r"zone=1: .*'pointmaze'; .*zone_width, "):
+    with pytest.raises(TypeError, match=r"zone: got 1, .*'pointmaze'; .*zone_width, "):
         newton_qd.create("pointmaze", zone=1)
 
 
@@ -193,7 +194,7 @@ def test_wrapper_kwargs_must_match_the_wrappers() -> None:
 
 @pytest.mark.parametrize("options", [{"eval_metrics": True}, {"action_repeat": 2}])
 def test_no_episode_with_what_needs_one(options: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match="episode_length=None with"):
+    with pytest.raises(ValueError, match="episode_length: got None with"):
         newton_qd.create("ant", episode_length=None, **options)
 
 
@@ -285,44 +286,56 @@ def test_register(rows: None) -> None:
     assert newton_qd.registered_envs()[-1] == "my_ant"
     assert newton_qd.tables.reward_offset["my_ant"] == 0.0
     assert layers(newton_qd.create("my_ant"))[2] is FeetContactWrapper
-    with pytest.raises(ValueError, match="env_name='my_ant': taken"):
+    with pytest.raises(ValueError, match=r"env_name: got 'my_ant', .* taken"):
         newton_qd.register("my_ant", Ant)
-    with pytest.raises(ValueError, match="env_name=''"):
+    with pytest.raises(ValueError, match="env_name: got ''"):
         newton_qd.register("", Ant)
-    with pytest.raises(TypeError, match="base=3"):
+    with pytest.raises(TypeError, match="base: got 3"):
         newton_qd.register("three", 3)  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [
-        ({"base_name": 3}, ValueError, r"base_name=3: allowed: None, or a string"),
-        ({"base_name": ""}, ValueError, r"base_name='': allowed"),
-        ({"robot": "ant"}, TypeError, r"robot='ant': allowed: None, or .*Robot"),
-        ({"reward_offset": "x"}, TypeError, r"reward_offset='x': .* finite number"),
-        ({"reward_offset": True}, TypeError, r"reward_offset=True: allowed"),
-        ({"reward_offset": np.nan}, ValueError, r"reward_offset=nan: allowed"),
-        ({"descriptor_extractor": 3}, TypeError, r"descriptor_extractor=3: allowed"),
-        ({"wrappers": None}, TypeError, r"wrappers=None: allowed: a tuple or list"),
+        ({"base_name": 3}, ValueError, r"base_name: got 3; allowed: None, or text"),
+        ({"base_name": ""}, ValueError, r"base_name: got ''; allowed"),
+        ({"robot": "ant"}, TypeError, r"robot: got 'ant'; allowed: None, or .*Robot"),
+        (
+            {"reward_offset": "x"},
+            TypeError,
+            r"reward_offset: got 'x'; .* finite number",
+        ),
+        ({"reward_offset": True}, TypeError, r"reward_offset: got True; allowed"),
+        ({"reward_offset": np.nan}, ValueError, r"reward_offset: got nan; allowed"),
+        (
+            {"descriptor_extractor": 3},
+            TypeError,
+            r"descriptor_extractor: got 3; allowed",
+        ),
+        (
+            {"wrappers": None},
+            TypeError,
+            r"wrappers: got None; allowed: a tuple or list",
+        ),
         (
             {"wrappers": tasks.WrapperSpec(FeetContactWrapper)},
             TypeError,
-            r"wrappers=WrapperSpec\(.*allowed: a tuple or list of WrapperSpec",
+            r"wrappers: got WrapperSpec\(.*allowed: a tuple or list of WrapperSpec",
         ),
         (
             {"wrappers": (FeetContactWrapper,)},
             TypeError,
-            r"wrappers\[0\]=<class .*FeetContactWrapper'>: allowed: a WrapperSpec",
+            r"wrappers\[0\]: got <class .*FeetContactWrapper'>; allowed: a WrapperSpec",
         ),
         (
             {"wrappers": [tasks.WrapperSpec(3)]},  # pyright: ignore
             TypeError,
-            r"wrappers\[0\].wrapper=3: allowed: a class or a function",
+            r"wrappers\[0\].wrapper: got 3; allowed: a class or a function",
         ),
         (
             {"wrappers": [tasks.WrapperSpec(FeetContactWrapper, 3)]},  # pyright: ignore
             TypeError,
-            r"wrappers\[0\].options=3: allowed: a mapping",
+            r"wrappers\[0\].options: got 3; allowed: a mapping",
         ),
     ],
 )

@@ -45,7 +45,7 @@ def test_bad_softness() -> None:
             softened(Material(), factor)
     maze = newton_qd.create("pointmaze")
     with pytest.raises(
-        NotImplementedError, match="env: got pointmaze, not a simulated robot"
+        NotImplementedError, match="env: got pointmaze, which is not a simulated robot"
     ):
         soft_to_stiff(maze)
     with pytest.raises(NotImplementedError, match="pointmaze is not a simulated robot"):

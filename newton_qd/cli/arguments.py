@@ -33,6 +33,5 @@ def integers(text: str, separator: str) -> tuple[int, ...]:
         return tuple(int(part) for part in text.split(separator))
     except ValueError as error:
         example = separator.join(("8", "8"))
-        raise argparse.ArgumentTypeError(
-            f"expected integers like {example}, got {text!r}"
-        ) from error
+        given = f"got {text!r}; allowed: integers like {example}"
+        raise argparse.ArgumentTypeError(given) from error

@@ -65,7 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
     quiet()
     out = arguments.out
     if out is not None and out.exists() and not out.is_dir():  # before minutes of work
-        refused = f"--out {out}: is no folder; allowed: a folder, or a new name"
+        refused = f"--out: got {out}, a file; allowed: a folder, or a new name"
         return complain(arguments, refused, BAD_ARGUMENTS)
     try:
         report = newton_qd.diagnose_gradients(

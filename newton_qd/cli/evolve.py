@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from newton_qd import checks
 from newton_qd.cli.arguments import FAILED, OK, Commands, complain, integers, widths
 from newton_qd.qd.algorithms import ALGORITHMS
 from newton_qd.qd.config import (
@@ -149,7 +150,7 @@ def _option(text: str) -> tuple[str, Any]:
     except (SyntaxError, ValueError):
         pass
     raise argparse.ArgumentTypeError(
-        f"expected a name and a value like discount=0.95, got {text!r}"
+        f"got {text!r}; allowed: a name and a value like discount=0.95"
     )
 
 
@@ -167,11 +168,10 @@ def run(
         ConfigError: A setting is missing or wrong.
     """
     config, out = _settle(arguments)
-    if not arguments.checkpoint_seconds >= 0:
-        raise ConfigError(
-            "checkpoint_seconds must be at least 0, got "
-            f"{arguments.checkpoint_seconds!r}"
-        )
+    seconds = arguments.checkpoint_seconds
+    checks.number(
+        "checkpoint_seconds", seconds, least=0, endless=True, error=ConfigError
+    )
     # Imports JAX and the physics: an argument error above does not wait for it. An
     # exception in the middle of an extension module's import could end in a crash.
     with graceful_stop(b"\nstopping\n") as stop:

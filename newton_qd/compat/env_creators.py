@@ -9,6 +9,7 @@ from typing import Any
 import jax
 
 from newton_qd import registry, tables
+from newton_qd.checks import message
 from newton_qd.compat.scoring import (
     Scores,
     default_task,
@@ -52,10 +53,11 @@ def create(env_name: str, *args: Any, legacy_spring: bool = True, **kwargs: Any)
         ValueError: ``legacy_spring`` is false.
     """
     if not legacy_spring:
-        raise ValueError(
-            f"legacy_spring={legacy_spring!r}: allowed: True; brax's position-based "
-            "dynamics are not in this library, which has one physics"
+        allowed = (
+            "True; brax's position-based dynamics are not in this library, which has "
+            "one physics"
         )
+        raise ValueError(message("legacy_spring", legacy_spring, allowed))
     return registry.create(env_name, *args, **{"brax_views": True, **kwargs})
 
 

@@ -12,11 +12,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from newton_qd import physics
+from newton_qd import checks, physics
+from newton_qd.checks import listed, message
 from newton_qd.envs import inputs
 from newton_qd.envs.env import Env, QDEnv
 from newton_qd.envs.joints import joint_indices
-from newton_qd.envs.options import checked_options, float_type
+from newton_qd.envs.options import checked_options
 from newton_qd.envs.state import State, select
 from newton_qd.physics.system import Kinematics, PhysicsState, System
 from newton_qd.robots import Material, RobotSpec
@@ -96,7 +97,7 @@ class PhysicsEnv(Env):
             FileNotFoundError: A URDF file is missing.
         """
         self.robot = robot
-        self._dtype = float_type(dtype)
+        self._dtype = checks.precision(dtype)
         self._angle_noise = self._velocity_noise = reset_noise_scale
         if reset_velocity_noise_scale is not None:
             self._velocity_noise = reset_velocity_noise_scale
@@ -240,10 +241,9 @@ class PhysicsEnv(Env):
         """
         system = self.system
         if not name or name not in system.joint_names:
-            known = ", ".join(known for known in system.joint_names if known)
-            raise ValueError(
-                f"name={name!r}: no joint of {self.name}; allowed: {known}"
-            )
+            known = listed([known for known in system.joint_names if known])
+            why = f"which is no joint of {self.name}"
+            raise ValueError(message("name", name, known, why=why))
         body = system.joint_names.index(name)
         parts = []
         for starts, size in ((system.q_start, system.nq), (system.v_start, system.nv)):
@@ -268,7 +268,7 @@ class PhysicsEnv(Env):
         Raises:
             ValueError: The environment is float64 and JAX x64 is off.
         """
-        inputs.require_precision(self._dtype)
+        checks.x64(self._dtype)
         root_key, angle_key, velocity_key = jax.random.split(rng, 3)
         rest = self._rest()
         q = self.reset_pose(root_key, rest.q)
@@ -286,7 +286,7 @@ class PhysicsEnv(Env):
         Raises:
             ValueError: The environment is float64 and JAX x64 is off.
         """
-        inputs.require_precision(self._dtype)
+        checks.x64(self._dtype)
         return self._first_state(self._rest())
 
     def step(self, state: State, action: Action, params: Params = None) -> State:
@@ -298,7 +298,7 @@ class PhysicsEnv(Env):
                 shape, ``params`` are not those of this robot, or the environment is
                 float64 and JAX x64 is off.
         """
-        inputs.require_precision(self._dtype)
+        checks.x64(self._dtype)
         inputs.require_state(state, "fault")
         action = inputs.checked_action(action, self.action_size, self._dtype)
         # The physics freezes a world at fault and passes no gradient through it; a
@@ -335,7 +335,7 @@ class PhysicsEnv(Env):
         Raises:
             ValueError: The environment is float64 and JAX x64 is off.
         """
-        inputs.require_precision(self._dtype)
+        checks.x64(self._dtype)
         return physics.default_params(self.system)
 
     @property

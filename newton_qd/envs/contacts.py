@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax
 import numpy as np
 
+from newton_qd.checks import message
 from newton_qd.physics.system import PhysicsState, System
 
 
@@ -64,8 +65,7 @@ def isotropic_inertia(system: System, bodies: np.ndarray, reader: str) -> np.nda
     if np.any(refused):
         index = int(np.argmax(refused))
         name = system.body_names[bodies[index]]
-        raise ValueError(
-            f"{reader}: link {name!r} of {system.robot.urdf!r} has the inertia "
-            f"{inertia[index].tolist()}; allowed: positive and equal about every axis"
-        )
+        field = f"{reader}: inertia of link {name!r} of {system.robot.urdf!r}"
+        allowed = "positive and equal about every axis"
+        raise ValueError(message(field, inertia[index].tolist(), allowed))
     return moment

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
+from newton_qd.checks import message
 from newton_qd.envs.state import State, no_brax_view
 from newton_qd.robots import Material
 from newton_qd.scenes import Scene
@@ -107,10 +108,7 @@ class Env(abc.ABC):
         Raises:
             NotImplementedError: The environment inside is not a simulated robot.
         """
-        raise NotImplementedError(
-            f"scene={scene!r}: {self.name} is not a simulated robot; allowed: "
-            "environments whose unwrapped is a PhysicsEnv"
-        )
+        raise NotImplementedError(not_simulated("scene", scene, self))
 
     def with_material(self, material: Material) -> Env:
         """Returns the same wrappers around the same robot with other softness.
@@ -122,10 +120,7 @@ class Env(abc.ABC):
         Raises:
             NotImplementedError: The environment inside is not a simulated robot.
         """
-        raise NotImplementedError(
-            f"material={material!r}: {self.name} is not a simulated robot; allowed: "
-            "environments whose unwrapped is a PhysicsEnv"
-        )
+        raise NotImplementedError(not_simulated("material", material, self))
 
     if not TYPE_CHECKING:
 
@@ -172,3 +167,16 @@ class QDEnv(Env):
 
     behavior_descriptor_length = descriptor_length
     behavior_descriptor_limits = descriptor_limits
+
+
+def not_simulated(name: str, value: object, env: Env) -> str:
+    """Returns the message where something needs a simulated robot.
+
+    Args:
+        name: Argument that needs it.
+        value: Its value.
+        env: The environment, which is none.
+    """
+    why = f"and {env.name} is not a simulated robot"
+    allowed = "environments whose unwrapped is a PhysicsEnv"
+    return message(name, value, allowed, why=why)

@@ -2,26 +2,14 @@
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
+from newton_qd import checks
+from newton_qd.checks import Fact, message
 from newton_qd.envs.state import State
 from newton_qd.physics.system import System
 from newton_qd.types import Action, Params
-
-
-def require_precision(dtype: np.dtype) -> None:
-    """Raises where JAX would round a float64 environment to float32 without an error.
-
-    Raises:
-        ValueError: ``dtype`` is float64 and JAX x64 is off.
-    """
-    if dtype == np.float64 and not jax.config.read("jax_enable_x64"):
-        raise ValueError(
-            "dtype='float64': JAX x64 is off; allowed: 'float32', or "
-            "jax.config.update('jax_enable_x64', True) before the environment"
-        )
 
 
 def require_actuators(system: System) -> None:
@@ -31,10 +19,10 @@ def require_actuators(system: System) -> None:
         ValueError: The spec of the system's robot has no actuators.
     """
     if not system.nu:
-        raise ValueError(
-            f"robot {system.robot.name!r}, actuators=(): an environment has actions; "
-            'allowed: at least one (joint, gear), such as (("hip", 30.0),)'
-        )
+        name = f"robot {system.robot.name!r}, actuators"
+        allowed = 'at least one (joint, gear), such as (("hip", 30.0),)'
+        why = "and an environment has actions"
+        raise ValueError(message(name, system.robot.actuators, allowed, why=why))
 
 
 def refuse_params(params: Params) -> None:
@@ -44,10 +32,8 @@ def refuse_params(params: Params) -> None:
         ValueError: ``params`` is not ``None``.
     """
     if params is not None:
-        raise ValueError(
-            f"params: {type(params).__name__} given, and this environment has no "
-            "physical parameters; allowed: None"
-        )
+        why = "and this environment has no physical parameters"
+        raise ValueError(message("params", params, "None", why=why))
 
 
 def require_state(state: State, *keys: str) -> None:
@@ -61,17 +47,15 @@ def require_state(state: State, *keys: str) -> None:
         TypeError: It is no ``State``.
         ValueError: Its ``info`` lacks a key.
     """
-    if not isinstance(state, State):
-        raise TypeError(
-            f"state: type {type(state).__name__} given; allowed: a State that reset or "
-            "step returned"
-        )
+    checks.instance("state", state, State, "a State that reset or step returned")
     for key in keys:
         if key not in state.info:
-            raise ValueError(
-                f"state: info has no {key!r}; allowed: a state that reset or step of "
-                "this environment returned, wrappers included"
+            allowed = (
+                "a state that reset or step of this environment returned, wrappers "
+                "included"
             )
+            given = Fact(f"info without {key!r}")
+            raise ValueError(message("state", given, allowed))
 
 
 def checked_action(action: Action, size: int, dtype: np.dtype) -> Action:
@@ -86,19 +70,7 @@ def checked_action(action: Action, size: int, dtype: np.dtype) -> Action:
         TypeError: It is no array, or of another type.
         ValueError: It has another shape.
     """
-    expected = f"allowed: an array of shape {(size,)}, {dtype}"
-    if not isinstance(action, (jax.Array, np.ndarray)):
-        raise TypeError(f"action: type {type(action).__name__} given; {expected}")
-    values = jnp.asarray(action)
-    weak = jnp.issubdtype(values.dtype, jnp.floating) and values.weak_type
-    if values.dtype != dtype and not weak:
-        raise TypeError(f"action: dtype {values.dtype} given; {expected}")
-    if values.shape != (size,):
-        raise ValueError(
-            f"action: shape {values.shape} given; {expected} (for a batch, use "
-            "jax.vmap or create(..., batch_size=...))"
-        )
-    return values.astype(dtype)
+    return checks.array("action", action, (size,), dtype)
 
 
 def checked_layout(env: str, blocks: object) -> tuple[tuple[str, int], ...]:
@@ -113,15 +85,13 @@ def checked_layout(env: str, blocks: object) -> tuple[tuple[str, int], ...]:
         ValueError: A block has not one axis.
     """
     if not isinstance(blocks, dict) or not blocks:
-        raise TypeError(
-            f"{env}.observe: returned {blocks!r}; allowed: a dictionary of arrays (n,)"
-        )
+        allowed = "a dictionary of arrays (n,)"
+        raise TypeError(message(f"{env}.observe", blocks, allowed))
     for name, block in blocks.items():
         if jnp.ndim(block) != 1:
-            raise ValueError(
-                f"{env}.observe: {name!r} has shape {jnp.shape(block)}; allowed: (n,), "
-                "such as state.q[2:3] for one number"
-            )
+            given = Fact(f"shape {jnp.shape(block)}")
+            allowed = "shape (n,), such as state.q[2:3] for one number"
+            raise ValueError(message(f"{env}.observe: {name!r}", given, allowed))
     return tuple((name, block.shape[0]) for name, block in blocks.items())
 
 
@@ -141,14 +111,11 @@ def checked_outcome(env: str, found: object) -> tuple[str, ...]:
         or len(found) != 3
         or not isinstance(found[2], dict)
     ):
-        raise TypeError(
-            f"{env}.outcome: returned {found!r}; allowed: reward, done and a "
-            "dictionary of metrics"
-        )
+        allowed = "reward, done and a dictionary of metrics"
+        raise TypeError(message(f"{env}.outcome", found, allowed))
     reward, done, metrics = found
     for name, value in {"reward": reward, "done": done, **metrics}.items():
         if jnp.shape(value) != ():
-            raise ValueError(
-                f"{env}.outcome: {name!r} has shape {jnp.shape(value)}; allowed: ()"
-            )
+            given = Fact(f"shape {jnp.shape(value)}")
+            raise ValueError(message(f"{env}.outcome: {name!r}", given, "shape ()"))
     return tuple(metrics)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from newton_qd.checks import Fact, message
 from newton_qd.envs.base import PhysicsEnv
 from newton_qd.envs.options import checked_options
 from newton_qd.envs.vectors import ordered_sum
@@ -64,10 +65,9 @@ class Locomotion(PhysicsEnv):
         )
         kind = JointKind(self.system.joint_kind[0])
         if kind != JointKind.FREE:
-            raise ValueError(
-                f"robot={robot.name!r}: its first joint is {kind.name.lower()}; "
-                "allowed: a robot whose root link moves freely"
-            )
+            why = f"whose first joint is {kind.name.lower()}"
+            allowed = "a robot whose root link moves freely"
+            raise ValueError(message("robot", Fact(robot.name), allowed, why=why))
 
     def observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
         """Returns the blocks of the observation."""

@@ -8,14 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from newton_qd import checks
+from newton_qd.checks import message
 from newton_qd.envs.base import QDEnv
 from newton_qd.envs.inputs import (
     checked_action,
     refuse_params,
-    require_precision,
     require_state,
 )
-from newton_qd.envs.options import float_type
 from newton_qd.envs.state import State
 from newton_qd.envs.vectors import length, rounded
 from newton_qd.types import Action, Params, RNGKey
@@ -73,18 +73,17 @@ class PointMaze(QDEnv):
             ValueError: A number is not finite, a border or a wall leaves no way, or
                 ``dtype`` is float64 and JAX x64 is off.
         """
-        _require_numbers(
-            zone_width_offset_from_x_min=zone_width_offset_from_x_min,
-            zone_height_offset_from_y_max=zone_height_offset_from_y_max,
-            wall_width_ratio=wall_width_ratio,
-        )
-        _require_numbers(
-            positive=True, scale_action_space=scale_action_space, zone_width=zone_width
-        )
+        for name, value in (
+            ("zone_width_offset_from_x_min", zone_width_offset_from_x_min),
+            ("zone_height_offset_from_y_max", zone_height_offset_from_y_max),
+            ("wall_width_ratio", wall_width_ratio),
+        ):
+            checks.number(name, value)
+        checks.number("scale_action_space", scale_action_space, above=0)
+        checks.number("zone_width", zone_width, above=0)
         walls = lower_wall_height_offset, upper_wall_height_offset
         _require_box((x_min, x_max), (y_min, y_max), walls)
-        self._dtype = float_type(dtype)
-        require_precision(self._dtype)
+        self._dtype = checks.precision(dtype)
         self._scale = scale_action_space
         self._low = (x_min, y_min)
         self._high = (x_max, y_max)
@@ -104,7 +103,7 @@ class PointMaze(QDEnv):
         Raises:
             ValueError: The environment is float64 and JAX x64 is off.
         """
-        require_precision(self._dtype)
+        checks.x64(self._dtype)
         _, x_key, y_key = jax.random.split(rng, 3)
         (left, bottom), (right, _) = self._low, self._high
         x = jax.random.uniform(x_key, (), self._dtype, left, right) / _START_FRACTION
@@ -117,7 +116,7 @@ class PointMaze(QDEnv):
         Raises:
             ValueError: The environment is float64 and JAX x64 is off.
         """
-        require_precision(self._dtype)
+        checks.x64(self._dtype)
         return self._first_state(self._start())
 
     def step(self, state: State, action: Action, params: Params = None) -> State:
@@ -129,7 +128,7 @@ class PointMaze(QDEnv):
                 shape, ``params`` are given, or the environment is float64 and JAX x64
                 is off.
         """
-        require_precision(self._dtype)
+        checks.x64(self._dtype)
         require_state(state, "fault")
         refuse_params(params)
         action = checked_action(action, self.action_size, self._dtype)
@@ -298,18 +297,6 @@ def _crossing(
     return rounded((height - y_old) / rise * (x - x_old)) + x_old
 
 
-def _require_numbers(positive: bool = False, **settings: float) -> None:
-    """Checks settings.
-
-    Raises:
-        ValueError: One is not finite, or not above 0.
-    """
-    for name, value in settings.items():
-        if not math.isfinite(value) or (positive and value <= 0):
-            allowed = "finite, above 0" if positive else "finite numbers"
-            raise ValueError(f"{name}={value!r}: allowed: {allowed}")
-
-
 def _require_box(
     x: tuple[float, float], y: tuple[float, float], walls: tuple[float, float]
 ) -> None:
@@ -319,17 +306,12 @@ def _require_box(
         ValueError: They leave no way from the start to the top.
     """
     if not -math.inf < x[0] < x[1] < math.inf:
-        raise ValueError(
-            f"x_min={x[0]!r}, x_max={x[1]!r}: allowed: finite, x_min below x_max"
-        )
+        allowed = "finite, x_min below x_max"
+        raise ValueError(message("x_min, x_max", x, allowed))
     if not -math.inf < y[0] < _HIGHEST_START < y[1] < math.inf:
-        raise ValueError(
-            f"y_min={y[0]!r}, y_max={y[1]!r}: allowed: finite, y_min below "
-            f"{_HIGHEST_START}, y_max above it"
-        )
+        allowed = f"finite, y_min below {_HIGHEST_START}, y_max above it"
+        raise ValueError(message("y_min, y_max", y, allowed))
     if not y[0] < walls[0] < walls[1] < y[1]:
-        raise ValueError(
-            f"lower_wall_height_offset={walls[0]!r}, upper_wall_height_offset="
-            f"{walls[1]!r}: allowed: between {y[0]!r} and {y[1]!r}, the lower below "
-            "the upper"
-        )
+        name = "lower_wall_height_offset, upper_wall_height_offset"
+        allowed = f"between {y[0]!r} and {y[1]!r}, the lower below the upper"
+        raise ValueError(message(name, walls, allowed))

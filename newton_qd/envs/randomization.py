@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
+from newton_qd import checks
+from newton_qd.checks import Fact, message
 from newton_qd.envs.base import Env
-from newton_qd.envs.options import check_count
 from newton_qd.physics.parameters import FIELDS, PhysicsParams, check_bounds
 from newton_qd.types import RNGKey
 
@@ -87,15 +88,12 @@ def _default(env: Env, worlds: int | None) -> PhysicsParams:
         TypeError: ``env`` is no environment.
         ValueError: It has no physical parameters, or ``worlds`` is no number of worlds.
     """
-    if not hasattr(env, "unwrapped"):
-        raise TypeError(f"env={env!r}; allowed: an environment, as create() makes it")
+    checks.environment(env, needs="unwrapped")
     default = env.unwrapped.default_params
     if not isinstance(default, PhysicsParams):
-        raise ValueError(
-            f"env: {env.name} has no physical parameters; allowed: simulated robots"
-        )
-    if worlds is not None:
-        check_count("worlds", worlds)
+        given = Fact(f"{env.name}, which has no physical parameters")
+        raise ValueError(message("env", given, "simulated robots"))
+    checks.integer("worlds", worlds, optional=True)
     return default
 
 
@@ -105,17 +103,18 @@ def _bounds(name: str, limits: Range, default: jax.Array) -> tuple[np.ndarray, .
     Raises:
         ValueError: The range is not one.
     """
-    allowed = f"allowed: (low, high), numbers or arrays of shape {default.shape}"
+    allowed = f"(low, high), numbers or arrays of shape {default.shape}"
     try:
         low, high = (
             np.broadcast_to(np.asarray(end, default.dtype), default.shape)
             for end in limits
         )
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{name}={limits!r}; {allowed}") from error
+        raise ValueError(message(name, limits, allowed)) from error
     check_bounds(name, np.stack([low, high]))
     if np.any(low > high):
-        raise ValueError(f"{name}={limits!r}: low is above high; {allowed}")
+        why = "where low is above high"
+        raise ValueError(message(name, limits, allowed, why=why))
     return low, high
 
 

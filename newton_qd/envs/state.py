@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from newton_qd.checks import Fact, message
 from newton_qd.errors import FaultError
 from newton_qd.types import Info, Metrics, Observation
 
@@ -63,10 +64,9 @@ def no_brax_view(thing: object, name: str, views: tuple[str, ...]) -> str:
         views: Attributes that are there for code written for brax v1.
     """
     if name in views:
-        return (
-            f"{name}: {type(thing).__name__} without bodies as brax v1 shows them; "
-            "allowed: simulated robots, with newton_qd.create(..., brax_views=True)"
-        )
+        given = Fact(f"{type(thing).__name__} without bodies as brax v1 shows them")
+        allowed = "simulated robots, with newton_qd.create(..., brax_views=True)"
+        return message(name, given, allowed)
     return f"{type(thing).__name__!r} object has no attribute {name!r}"
 
 
@@ -112,10 +112,11 @@ def check(state: State) -> None:
         TypeError: ``state`` is traced.
     """
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(state)):
-        raise TypeError(
-            "state: traced values given; allowed: the concrete state that a jitted "
-            "function has returned (inside jit, read info['fault'])"
+        allowed = (
+            "the concrete state that a jitted function has returned (inside jit, read "
+            "info['fault'])"
         )
+        raise TypeError(message("state", Fact("traced values"), allowed))
     info: Mapping[str, Any] = state.info
     faulty = np.asarray(info["fault"]) != 0
     for leaf in jax.tree.leaves((state.pipeline_state, state.obs, state.reward)):

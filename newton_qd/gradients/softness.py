@@ -61,7 +61,7 @@ def soft_to_stiff(env: Env, factors: Sequence[float] = (4, 2, 1)) -> tuple[Any, 
                 "env",
                 Fact(env.name),
                 "environments whose unwrapped is a PhysicsEnv",
-                why="not a simulated robot",
+                why="which is not a simulated robot",
             )
         )
     material = base.robot.material

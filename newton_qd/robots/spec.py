@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import dataclasses
 
+from newton_qd.checks import message
+
 DEGREE = 3.141592653589793 / 180.0
 
 
@@ -106,7 +108,8 @@ class RobotSpec:
 
     def __post_init__(self, original_names: tuple[()]) -> None:
         if original_names:
-            raise TypeError(
-                f"original_names={original_names!r}: allowed: none; names of bodies go "
-                "to newton_qd.brax_views.BraxViewsWrapper(env, body_names=...)"
+            allowed = (
+                "none; names of bodies go to "
+                "newton_qd.brax_views.BraxViewsWrapper(env, body_names=...)"
             )
+            raise TypeError(message("original_names", original_names, allowed))
