@@ -112,7 +112,7 @@ def number(
     numeric = is_number(value)
     if (
         numeric
-        and (_finite(value) or (endless and not math.isnan(value)))
+        and (_finite(value) or (endless and abs(value) == math.inf))
         and (least is None or value >= least)
         and (above is None or value > above)
         and (most is None or value <= most)
