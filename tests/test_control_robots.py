@@ -17,7 +17,8 @@ from newton_qd.assets import find_urdf
 from newton_qd.brax_views import BraxViewsWrapper
 from newton_qd.envs import Acrobot
 from newton_qd.physics import reference
-from newton_qd.physics.model.description import Shape, read_description
+from newton_qd.physics.model.description import read_description
+from newton_qd.physics.model.elements import Shape
 from newton_qd.physics.model.xml_reader import RobotDescriptionError
 from newton_qd.physics.system import JointKind
 from newton_qd.robots import HUMANOID_STANDUP, REACHERANGLE, ROBOTS

@@ -8,7 +8,7 @@ through DLPack. No other module knows both libraries.
 import contextlib
 import functools
 from collections.abc import Callable, Iterator
-from typing import Any, Protocol
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
@@ -29,14 +29,26 @@ def _launcher(system: System, alias: str, parametric: bool) -> Launcher:
     return Launcher(system, wp.get_device(alias), parametric)
 
 
-def launcher(system: System, device: Any, parametric: bool = False) -> Launcher:
+def _default_device() -> wp.Device:
+    """The Warp device of JAX's first."""
+    device = wp.device_from_jax(jax.devices()[0])
+    assert device is not None  # Warp reads it from the kind and number of JAX's
+    return device
+
+
+def launcher(system: System, device: wp.Device, parametric: bool = False) -> Launcher:
     """The launcher of ``system`` on a Warp device; made once."""
     return _launcher(system, device.alias, parametric)
 
 
 @contextlib.contextmanager
 def _errors_contained() -> Iterator[None]:
-    """Turn what Warp would let through XLA's frames into an error that it reports."""
+    """Turn what Warp would let through XLA's frames into an error that it reports.
+
+    Raises:
+        RuntimeError: Something else than an ``Exception`` was raised, such as an
+            interrupt.
+    """
     # notebooks put Python's own SIGINT handler back before every cell
     interrupts.install()
     try:
@@ -47,7 +59,21 @@ def _errors_contained() -> Iterator[None]:
         raise RuntimeError(f"interrupted inside the physics: {error!r}") from error
 
 
-def _row_call(name: str, dtype: str, module: Any, launch: Callable[..., None]) -> Any:
+class RowCall(Protocol):
+    """A kernel as a function of contiguous rows, one world's each."""
+
+    def __call__(self, *rows: jax.Array, output_dims: int) -> tuple[jax.Array, ...]:
+        """A tuple of one row of length ``output_dims``."""
+        ...
+
+
+Differentiable = Callable[[jax.Array], jax.Array]
+"""Reverse-mode function of one world's row of inputs; returns its row of outputs."""
+
+
+def _row_call(
+    name: str, dtype: str, module: wp.Module, launch: Callable[..., None]
+) -> RowCall:
     """A launch as a function of contiguous rows.
 
     Args:
@@ -90,8 +116,8 @@ def _row_call(name: str, dtype: str, module: Any, launch: Callable[..., None]) -
 
 
 def _differentiable(
-    call: Callable[[str], Any], name: str, size: int, output_size: int
-) -> Any:
+    call: Callable[[str], RowCall], name: str, size: int, output_size: int
+) -> Differentiable:
     """Reverse-mode function of one row; the adjoint is compiled when first traced.
 
     Args:
@@ -116,7 +142,9 @@ def _differentiable(
 
 
 @functools.cache
-def _kernel_call(system: System, name: str, size: int, parametric: bool = False) -> Any:
+def _kernel_call(
+    system: System, name: str, size: int, parametric: bool = False
+) -> RowCall:
     """A kernel of a system as a function of rows; see :func:`_row_call`.
 
     Args:
@@ -126,12 +154,13 @@ def _kernel_call(system: System, name: str, size: int, parametric: bool = False)
         parametric: Whether that row ends with the world's parameters.
     """
 
-    def launch(x: Any, *arrays: Any) -> None:
+    def launch(x: wp.array, *arrays: wp.array) -> None:
         worlds, adjoint = x.shape[0] // size, name.endswith("_backward")
+        assert x.device is not None
         own = launcher(system, x.device, parametric)
         own.launch(name, worlds, x, *arrays, adjoint=adjoint)
 
-    default = launcher(system, wp.device_from_jax(jax.devices()[0]), parametric)
+    default = launcher(system, _default_device(), parametric)
     return _row_call(name, system.dtype, default.prepare(name), launch)
 
 
@@ -175,7 +204,13 @@ class Step(Protocol):
         control: jax.Array,
         params: jax.Array | None = None,
     ) -> tuple[PhysicsState, jax.Array]:
-        """Next state, and the fault ()."""
+        """Next state, and the fault ().
+
+        Raises:
+            TypeError: An array has another type than the system.
+            ValueError: An array has another shape, or ``NEWTON_QD_THREADS`` is not
+                allowed.
+        """
         ...
 
 
@@ -225,7 +260,11 @@ def control_step(system: System) -> Step:
 
 @functools.cache
 def kinematics(system: System) -> Callable[[jax.Array, jax.Array], Kinematics]:
-    """Differentiable bodies of one world, as a function of ``q`` and ``v``."""
+    """Differentiable bodies of one world, as a function of ``q`` and ``v``.
+
+    The function raises TypeError for another type than the system's, and ValueError for
+    another shape.
+    """
     read, written = layout.coordinates(system), layout.bodies(system)
     call = functools.partial(_kernel_call, system, size=read.size)
     views = _differentiable(call, "kinematics", read.size, written.size)
@@ -238,7 +277,12 @@ def kinematics(system: System) -> Callable[[jax.Array, jax.Array], Kinematics]:
 
 
 def dynamics(system: System, q: jax.Array, v: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Mass matrix (nv, nv) and bias forces (nv,) of one world."""
+    """Mass matrix (nv, nv) and bias forces (nv,) of one world.
+
+    Raises:
+        TypeError: ``q`` or ``v`` has another type than the system.
+        ValueError: ``q`` or ``v`` has another shape.
+    """
     read, written = layout.coordinates(system), layout.dynamics(system)
     call = _kernel_call(system, "dynamics_forward", read.size)
     row = _row(system, read.shapes, q=q, v=v)
@@ -247,7 +291,12 @@ def dynamics(system: System, q: jax.Array, v: jax.Array) -> tuple[jax.Array, jax
 
 
 def contact_gaps(system: System, q: jax.Array) -> jax.Array:
-    """Gaps (nc,) of one world."""
+    """Gaps (nc,) of one world.
+
+    Raises:
+        TypeError: ``q`` has another type than the system.
+        ValueError: ``q`` has another shape.
+    """
     read, written = layout.coordinates(system), layout.gaps(system)
     call = _kernel_call(system, "contact_gaps", read.size)
     row = _row(system, read.shapes, q=q, v=jnp.zeros((system.nv,), q.dtype))
@@ -255,21 +304,23 @@ def contact_gaps(system: System, q: jax.Array) -> jax.Array:
 
 
 @functools.cache
-def _episode_call(name: str, dtype: str, steps: int, nd: int) -> Any:
+def _episode_call(name: str, dtype: str, steps: int, nd: int) -> RowCall:
     """A kernel of ``kernels.episodes`` as a function of one episode's row."""
     kernel = getattr(build_kernels(Variant(dtype, 1)).episodes, name)
 
-    def launch(x: Any, *arrays: Any) -> None:
+    def launch(x: wp.array, *arrays: wp.array) -> None:
         episodes = x.shape[0] // (steps * (nd + 1))
         inputs = [steps, nd, x, *arrays]
         wp.launch(kernel, dim=episodes * nd, inputs=inputs, device=x.device)
 
-    kernel.module.load(wp.device_from_jax(jax.devices()[0]))
+    kernel.module.load(_default_device())
     return _row_call(name, dtype, kernel.module, launch)
 
 
 @functools.cache
-def _episode_reduction(name: str, dtype: str, steps: int, nd: int, size: int) -> Any:
+def _episode_reduction(
+    name: str, dtype: str, steps: int, nd: int, size: int
+) -> Differentiable:
     """Reverse-mode function of one episode's row; the mask has no gradient."""
     call = functools.partial(_episode_call, dtype=dtype, steps=steps, nd=nd)
     return _differentiable(call, name, steps * (nd + 1), size)
@@ -296,6 +347,10 @@ def episode_proportion(state_desc: jax.Array, mask: jax.Array) -> jax.Array:
 
     Returns:
         (nd,) proportions [-]; differentiable in reverse mode in ``state_desc``.
+
+    Raises:
+        TypeError: ``state_desc`` has a type that the kernels do not have.
+        ValueError: ``state_desc`` or ``mask`` has another shape, or no step.
     """
     row = _episode_row(state_desc, mask)
     steps, nd = state_desc.shape
@@ -315,6 +370,10 @@ def episode_final(state_desc: jax.Array, mask: jax.Array) -> jax.Array:
 
     Returns:
         (nd,) descriptor; differentiable in reverse mode in ``state_desc``.
+
+    Raises:
+        TypeError: ``state_desc`` has a type that the kernels do not have.
+        ValueError: ``state_desc`` or ``mask`` has another shape, or no step.
     """
     row = _episode_row(state_desc, mask)
     steps, nd = state_desc.shape
@@ -324,7 +383,7 @@ def episode_final(state_desc: jax.Array, mask: jax.Array) -> jax.Array:
 interrupts.protect(ffi_callback())
 
 
-def to_jax(array: Any) -> jax.Array:
+def to_jax(array: wp.array) -> jax.Array:
     """View a Warp array as a JAX array without a copy.
 
     The view is read-only by contract: later Warp writes to the memory show through.
@@ -340,7 +399,7 @@ def to_jax(array: Any) -> jax.Array:
     return wp.to_jax(array)
 
 
-def from_jax(array: jax.Array, dtype: Any = None) -> Any:
+def from_jax(array: jax.Array, dtype: type | None = None) -> wp.array:
     """View a JAX array as a Warp array without a copy.
 
     JAX arrays are immutable: never write to the view.

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from types import SimpleNamespace
-from typing import Any
+import dataclasses
+from collections.abc import Callable, Iterable
+from types import ModuleType
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
 from newton_qd.physics import layout, reference
 from newton_qd.physics.layout import Layout
@@ -33,6 +35,17 @@ _PER_READING += ("position", "com", "com_velocity")
 _REPORTED = ("impulse", "angular_impulse", "normal_impulse")
 
 
+# Copies a table to an array of the model by that name.
+Put = Callable[[str, ArrayLike], None]
+
+
+class _RowStruct(Protocol):
+    size: int
+
+
+Row = TypeVar("Row", bound=_RowStruct)
+
+
 def _with_world(table: np.ndarray) -> np.ndarray:
     """Prepend the world's row to a body table; it is never read."""
     return np.concatenate([table[:1], table])
@@ -42,7 +55,7 @@ def _iterations_and_solves(system: System) -> tuple[int, int]:
     return _TOUCHING if len(system.contact_body) else _FREE
 
 
-def kernels_of(system: System, device: Any, parametric: bool = False) -> Kernels:
+def kernels_of(system: System, device: wp.Device, parametric: bool = False) -> Kernels:
     """The kernels for a system on a device, with what it needs and no more.
 
     Args:
@@ -54,7 +67,7 @@ def kernels_of(system: System, device: Any, parametric: bool = False) -> Kernels
     return build_kernels(Variant(system.dtype, width, parametric, system.has_boxes))
 
 
-def build_model(system: System, device: Any, parametric: bool = False) -> Any:
+def build_model(system: System, device: wp.Device, parametric: bool = False) -> Any:
     """Copy a system to a device as a ``Model`` struct.
 
     Args:
@@ -70,7 +83,7 @@ def build_model(system: System, device: Any, parametric: bool = False) -> Any:
     model = space.structs.Model()
     robot, material = system.robot, system.robot.material
 
-    def put(name: str, values: Any) -> None:
+    def put(name: str, values: ArrayLike) -> None:
         dtype = field_dtype(space.structs.Model, name)
         setattr(model, name, wp.array(np.asarray(values), dtype=dtype, device=device))
 
@@ -107,7 +120,7 @@ def build_model(system: System, device: Any, parametric: bool = False) -> Any:
     return model
 
 
-def fill_row(struct: Any, fields: Layout, names: Iterable[str] | None = None) -> Any:
+def fill_row(struct: Row, fields: Layout, names: Iterable[str] | None = None) -> Row:
     """Tell the kernels where the fields of a row begin.
 
     Args:
@@ -124,7 +137,9 @@ def fill_row(struct: Any, fields: Layout, names: Iterable[str] | None = None) ->
     return struct
 
 
-def _put_rows(model: Any, structs: Any, system: System, parametric: bool) -> None:
+def _put_rows(
+    model: Any, structs: ModuleType, system: System, parametric: bool
+) -> None:
     rows: dict[str, tuple[Any, Layout]] = {
         "inputs": (structs.Inputs(), layout.inputs(system, parametric)),
         "coordinates": (structs.Coordinates(), layout.coordinates(system)),
@@ -141,7 +156,7 @@ def _put_rows(model: Any, structs: Any, system: System, parametric: bool) -> Non
         model.reported = fill_row(structs.Bodies(), written, seen)
 
 
-def _put_bodies(put: Any, system: System, tree: Tree) -> None:
+def _put_bodies(put: Put, system: System, tree: Tree) -> None:
     put("body_parent", tree.body_parent)
     put("joint_kind", _with_world(system.joint_kind))
     put("q_start", _with_world(system.q_start))
@@ -165,7 +180,7 @@ def _put_bodies(put: Any, system: System, tree: Tree) -> None:
     put("child", tree.child[1])
 
 
-def _put_dofs(put: Any, system: System) -> None:
+def _put_dofs(put: Put, system: System) -> None:
     control = np.full(system.nv, -1, np.int32)
     control[system.control_dof] = np.arange(system.nu)
     gear = np.zeros(system.nv)
@@ -187,7 +202,7 @@ def _put_dofs(put: Any, system: System) -> None:
         put(name, values)
 
 
-def _put_contacts(put: Any, system: System, tree: Tree) -> None:
+def _put_contacts(put: Put, system: System, tree: Tree) -> None:
     put("contact_start", tree.contact)
     put("contact_body", system.contact_body + 1)
     put("contact_position", system.contact_position)
@@ -238,14 +253,27 @@ def _entries(system: System, adjoint: bool) -> dict[str, int]:
     }
 
 
+@dataclasses.dataclass(frozen=True)
+class Memory:
+    """Intermediates in device memory.
+
+    Attributes:
+        values: A ``Scratch`` struct.
+        adjoints: Another one for their adjoints; ``values`` itself without.
+    """
+
+    values: Any
+    adjoints: Any
+
+
 def build_scratch(
     system: System,
     slots: int,
-    device: Any,
+    device: wp.Device,
     *,
     adjoint: bool,
     parametric: bool = False,
-) -> SimpleNamespace:
+) -> Memory:
     """Allocate the intermediates of ``slots`` packs of worlds in flight.
 
     Args:
@@ -257,24 +285,16 @@ def build_scratch(
         parametric: As in :func:`build_model`.
 
     Returns:
-        ``values`` and ``adjoints`` (the latter ``values`` itself without adjoint),
-        two ``Scratch`` structs, and ``bytes_per_slot``.
+        The structs that kernels take.
     """
     space = kernels_of(system, device, parametric)
     values, adjoints = space.structs.Scratch(), space.structs.Scratch()
-    size = 0
     for name, count in _entries(system, adjoint).items():
         dtype = field_dtype(space.structs.Scratch, name)
         array = wp.zeros(
             slots * count, dtype=dtype, device=device, requires_grad=adjoint
         )
         setattr(values, name, array)
-        size += array.capacity // slots
         if adjoint:
             setattr(adjoints, name, array.grad)
-            size += array.capacity // slots
-    return SimpleNamespace(
-        values=values,
-        adjoints=adjoints if adjoint else values,
-        bytes_per_slot=size,
-    )
+    return Memory(values, adjoints if adjoint else values)

@@ -52,6 +52,9 @@ def seen_bodies(system: System, state: PhysicsState) -> Kinematics:
 
     Returns:
         The kinematics; differentiable in reverse mode.
+
+    Raises:
+        ValueError: ``q`` or ``v`` of the state has another shape.
     """
     if state.bodies is not None:
         return state.bodies
@@ -123,6 +126,9 @@ def lowest_contact(system: System, q: jax.Array) -> jax.Array:
 
     Returns:
         () height above z = 0 [m].
+
+    Raises:
+        ValueError: ``q`` has another shape, or nothing of the robot touches the ground.
     """
     still = jnp.zeros((system.nv,), q.dtype)
     kinematics = forward_kinematics(system, q, still)

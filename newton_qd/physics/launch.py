@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import os
 import threading
-from typing import Any
 
 import warp as wp
 
@@ -14,6 +13,8 @@ from newton_qd.physics import buffers, layout
 from newton_qd.physics.precision import pack_width
 from newton_qd.physics.system import System
 from newton_qd.physics.workers import Worker
+
+Arrays = tuple[wp.array, ...]
 
 LANES = (1, 2, 4, 8, 16, 32)
 # Kernel modules other than ``inspect``; each is compiled as a whole.
@@ -75,12 +76,12 @@ def output_size(system: System) -> int:
 class _Command:
     """A recorded launch, and the position of its first array among its arguments."""
 
-    launch: Any
+    launch: wp.Launch
     first_array: int
 
     def send(
         self,
-        arrays: tuple[Any, ...],
+        arrays: Arrays,
         first: int,
         worlds: int,
         threads: int,
@@ -103,7 +104,9 @@ class Launcher:
     and reused; launches of one stream follow each other, so they can share it.
     """
 
-    def __init__(self, system: System, device: Any, parametric: bool = False) -> None:
+    def __init__(
+        self, system: System, device: wp.Device, parametric: bool = False
+    ) -> None:
         """Copies the system to the device.
 
         Args:
@@ -118,24 +121,27 @@ class Launcher:
         self.kernels = buffers.kernels_of(system, device, parametric)
         self.model = buffers.build_model(system, device, parametric)
         self._block = 1 if device.is_cpu else _GPU_BLOCK
-        self._scratch: dict[tuple[bool, Any], tuple[int, Any]] = {}
-        self._commands: dict[tuple[str, Any], _Command] = {}
+        self._scratch: dict[tuple[bool, int], tuple[int, buffers.Memory]] = {}
+        self._commands: dict[tuple[str, int], _Command] = {}
         self._workers: list[Worker] = []
         self._lock = threading.Lock()
 
-    def prepare(self, name: str) -> Any:
+    def prepare(self, name: str) -> wp.Module:
         """Compile a kernel now, rather than inside a callback; returns its module."""
         module = self._kernel(name).module
         module.load(self.device, self._block)
         return module
 
-    def forward(self, worlds: int, x: Any, y: Any) -> None:
-        """One control step; rows as :mod:`~newton_qd.physics.kernels.world` says.
+    def forward(self, worlds: int, x: wp.array, y: wp.array) -> None:
+        """One control step; rows as :mod:`~newton_qd.physics.layout` says.
 
         Args:
             worlds: Number of worlds.
             x: (worlds * inputs,) Warp array to read.
             y: (worlds * outputs,) Warp array to write.
+
+        Raises:
+            ValueError: ``NEWTON_QD_THREADS`` or ``NEWTON_QD_LANES`` is not allowed.
         """
         self.launch("step_forward", worlds, x, y)
 
@@ -143,7 +149,7 @@ class Launcher:
         self,
         name: str,
         worlds: int,
-        *arrays: Any,
+        *arrays: wp.array,
         adjoint: bool = False,
     ) -> None:
         """Run a kernel, or its adjoint, on all worlds.
@@ -154,6 +160,9 @@ class Launcher:
             worlds: Number of worlds.
             *arrays: Warp arrays with a contiguous row per world.
             adjoint: Whether the kernel's adjoint is run.
+
+        Raises:
+            ValueError: ``NEWTON_QD_THREADS`` or ``NEWTON_QD_LANES`` is not allowed.
         """
         if worlds == 0:
             return
@@ -170,11 +179,15 @@ class Launcher:
             command = self._command(kernel, owner, resident, arrays, adjoint)
             command.send(arrays, first, count, count * lanes, 1, lanes)
 
-    def _kernel(self, name: str) -> Any:
+    def _kernel(self, name: str) -> wp.Kernel:
         return getattr(getattr(self.kernels, _MODULES.get(name, "inspect")), name)
 
     def _launch_threads(
-        self, kernel: Any, worlds: int, arrays: tuple[Any, ...], adjoint: bool
+        self,
+        kernel: wp.Kernel,
+        worlds: int,
+        arrays: Arrays,
+        adjoint: bool,
     ) -> None:
         """Split the packs over threads; each walks through its share in one slot."""
         packs = -(-worlds // self.width)
@@ -188,7 +201,8 @@ class Launcher:
             for thread in range(threads)
         ]
         for n, worker in enumerate(self._workers[: threads - 1], 1):
-            worker.start(self._send_share, commands[n], arrays, *bounds[n : n + 2])
+            first, end = bounds[n : n + 2]
+            worker.start(self._send_share, commands[n], arrays, first, end)
         try:
             self._send_share(commands[0], arrays, *bounds[:2])
         finally:
@@ -196,17 +210,17 @@ class Launcher:
                 worker.wait()
 
     def _send_share(
-        self, command: _Command, arrays: tuple[Any, ...], first: int, end: int
+        self, command: _Command, arrays: Arrays, first: int, end: int
     ) -> None:
         worlds = end - first
         command.send(arrays, first, worlds, -(-worlds // self.width), 0, 1)
 
     def _command(
         self,
-        kernel: Any,
-        owner: Any,
+        kernel: wp.Kernel,
+        owner: int,
         slots: int,
-        arrays: tuple[Any, ...],
+        arrays: Arrays,
         adjoint: bool,
     ) -> _Command:
         """The recorded launch of ``kernel`` in an owner's scratch."""
@@ -228,7 +242,11 @@ class Launcher:
         return command
 
     def _record(
-        self, kernel: Any, scratch: Any, arrays: tuple[Any, ...], adjoint: bool
+        self,
+        kernel: wp.Kernel,
+        scratch: buffers.Memory,
+        arrays: Arrays,
+        adjoint: bool,
     ) -> _Command:
         structs = self.kernels.structs
         held = [scratch.values, *([scratch.adjoints] if adjoint else [])]
@@ -246,4 +264,5 @@ class Launcher:
             block_dim=self._block,
             record_cmd=True,
         )
+        assert isinstance(launch, wp.Launch)  # as record_cmd asks for
         return _Command(launch, len(before))

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jax.typing import ArrayLike
 
 from newton_qd import checks
 from newton_qd.checks import message
@@ -50,7 +50,7 @@ class PhysicsParams:
     damping_scale: jax.Array
     gear_scale: jax.Array
 
-    def replace(self, **changes: Any) -> PhysicsParams:
+    def replace(self, **changes: ArrayLike) -> PhysicsParams:
         """Returns a copy with some fields replaced."""
         return dataclasses.replace(self, **changes)
 
@@ -99,7 +99,7 @@ def check_bounds(name: str, values: np.ndarray) -> None:
 
 
 def _checked(
-    name: str, value: Any, shape: tuple[int, ...], dtype: np.dtype
+    name: str, value: object, shape: tuple[int, ...], dtype: np.dtype
 ) -> jax.Array:
     """Returns one parameter, strongly typed; weakly typed numbers are converted."""
     array = checks.array(f"params.{name}", value, shape, dtype, scalars=True)

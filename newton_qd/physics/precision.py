@@ -15,7 +15,6 @@ import importlib.util
 import sys
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 import warp as wp
 
@@ -45,7 +44,7 @@ class Variant:
     boxes: bool = False
 
     @property
-    def scalar(self) -> Any:
+    def scalar(self) -> type:
         """Warp's type of a number."""
         return SCALARS[self.dtype]
 
@@ -71,14 +70,14 @@ class Kernels:
         episodes: Descriptors of episodes.
     """
 
-    package: Any
-    structs: Any
-    world: Any
-    forward: Any
-    backward: Any
-    inspect: Any
-    gaps: Any
-    episodes: Any
+    package: ModuleType
+    structs: ModuleType
+    world: ModuleType
+    forward: ModuleType
+    backward: ModuleType
+    inspect: ModuleType
+    gaps: ModuleType
+    episodes: ModuleType
 
 
 # The template under its own name is a variant too: of one world, with boxes. Tools
@@ -138,7 +137,7 @@ def _run_template(name: str) -> ModuleType:
     return package
 
 
-def pack_width(dtype: str, device: Any) -> int:
+def pack_width(dtype: str, device: wp.Device) -> int:
     """Worlds that one thread of a device computes side by side.
 
     Args:

@@ -6,7 +6,6 @@ import dataclasses
 import functools
 import math
 import warnings
-from typing import Any
 
 import newton
 import numpy as np
@@ -104,6 +103,10 @@ class NewtonQDSolver(SolverBase):
 
         Raises:
             ValueError: ``model`` is something else; names the array that differs.
+            TypeError: ``robot`` is something else.
+            AssetNotFoundError: The robot's URDF file does not exist.
+            RobotDescriptionError: The file or the robot is not one that physics can
+                run.
         """
         super().__init__(model)
         self.robot = robot
@@ -149,7 +152,9 @@ class NewtonQDSolver(SolverBase):
             observables: This solver has none.
 
         Raises:
-            ValueError: ``dt`` is not positive, or an array has another size.
+            ValueError: ``dt`` is not positive, an array has another size, or an
+                environment variable is wrong.
+            NotImplementedError: ``observables`` has any.
             RuntimeError: A ``wp.Tape`` is recording.
         """
         self.validate_observables(observables)
@@ -214,7 +219,7 @@ def _launcher(system: System, device: wp.Device, dt: float) -> Launcher:
     return Launcher(dataclasses.replace(system, robot=robot), device)
 
 
-def _one_world(robot: RobotSpec, device: Any) -> newton.Model:
+def _one_world(robot: RobotSpec, device: wp.Device) -> newton.Model:
     """Returns what Newton makes of the robot alone, as its users would build it."""
     path = find_urdf(robot.urdf)
     floating = read_description(path).floating

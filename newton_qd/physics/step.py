@@ -22,6 +22,9 @@ def initial_state(system: System, q: jax.Array, v: jax.Array) -> PhysicsState:
 
     Returns:
         The state.
+
+    Raises:
+        ValueError: ``q`` or ``v`` has another shape, where the bodies are computed.
     """
     dtype = jnp.dtype(system.dtype)
     q, v = jnp.asarray(q, dtype), jnp.asarray(v, dtype)

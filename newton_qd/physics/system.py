@@ -81,6 +81,9 @@ class System:
         reports_bodies: Whether a step reports where the bodies are.
         torso: Body index of the torso.
         rest_q: (nq,) coordinates of the default pose, ``v`` being 0.
+
+    Raises:
+        ValueError: A contact table has another length than ``contact_body``.
     """
 
     robot: RobotSpec

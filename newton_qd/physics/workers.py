@@ -11,14 +11,16 @@ import queue
 import threading
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import TypeVar, TypeVarTuple
 
 _AWAKE_SECONDS = 1e-3
 
-Job = tuple[Callable[..., None], tuple[Any, ...]]
+Job = tuple[Callable[..., None], tuple[object, ...]]
+Item = TypeVar("Item")
+Arguments = TypeVarTuple("Arguments")
 
 
-def _take(source: queue.SimpleQueue) -> Any:
+def _take(source: queue.SimpleQueue[Item]) -> Item:
     """Next item: looked for at once, then waited for."""
     deadline = time.perf_counter() + _AWAKE_SECONDS
     while time.perf_counter() < deadline:
@@ -49,12 +51,18 @@ class Worker:
             del function, arguments
             self._ends.put(error)
 
-    def start(self, function: Callable[..., None], *arguments: Any) -> None:
+    def start(
+        self, function: Callable[[*Arguments], None], *arguments: *Arguments
+    ) -> None:
         """Begin a job."""
         self._jobs.put((function, arguments))
 
     def wait(self) -> None:
-        """Wait for the job's end; raises what it raised."""
+        """Wait for the job's end.
+
+        Raises:
+            BaseException: What the job raised.
+        """
         error = _take(self._ends)
         if error is not None:
             raise error

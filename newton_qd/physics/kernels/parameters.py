@@ -216,6 +216,28 @@ def return_one(
 
 
 @wp.func
+def return_shared(
+    m: Model,
+    g: Scratch,
+    offsets: Offsets,
+    x_bar: wp.array[scalar],
+    at: int,
+    count: int,
+    fault: real,
+):
+    """Adjoint of the parameters that a world has one of."""
+    held = offsets.parameter + m.parameters.contact_stiffness
+    store(g.parameter, held, m.contact_stiffness * load(g.parameter, held))
+    given = at + m.inputs.contact_stiffness_scale
+    return_one(m, g, x_bar, held, given, count, fault)
+    held = offsets.parameter + m.parameters.gravity
+    return_one(m, g, x_bar, held, at + m.inputs.gravity, count, fault)
+    held = offsets.parameter + m.parameters.friction
+    return_one(m, g, x_bar, held, at + m.inputs.friction, count, fault)
+    store(g.parameter, offsets.parameter + m.parameters.total_mass, real())
+
+
+@wp.func
 def return_parameters(
     m: Model,
     g: Scratch,
@@ -275,13 +297,4 @@ def return_parameters(
     # every lane has read the adjoint of the total mass
     sync(lane)
     if lane == 0:
-        held = start + m.parameters.contact_stiffness
-        store(g.parameter, held, m.contact_stiffness * load(g.parameter, held))
-        return_one(
-            m, g, x_bar, held, at + m.inputs.contact_stiffness_scale, count, fault
-        )
-        held = start + m.parameters.gravity
-        return_one(m, g, x_bar, held, at + m.inputs.gravity, count, fault)
-        held = start + m.parameters.friction
-        return_one(m, g, x_bar, held, at + m.inputs.friction, count, fault)
-        store(g.parameter, start + m.parameters.total_mass, zero)
+        return_shared(m, g, offsets, x_bar, at, count, fault)

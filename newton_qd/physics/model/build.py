@@ -18,13 +18,8 @@ from newton_qd.assets import find_urdf
 from newton_qd.checks import Fact, listed, message
 from newton_qd.physics import reference
 from newton_qd.physics.model.contacts import body_of, contact_tables, pair_shares
-from newton_qd.physics.model.description import (
-    UNLIMITED,
-    Body,
-    Description,
-    Shape,
-    read_description,
-)
+from newton_qd.physics.model.description import Body, Description, read_description
+from newton_qd.physics.model.elements import UNLIMITED, Shape
 from newton_qd.physics.model.rest import rest_coordinates
 from newton_qd.physics.model.robot_checks import check_robot, index_of
 from newton_qd.physics.model.scene import obstacle_tables, read_scene
@@ -218,8 +213,9 @@ def build_system(robot: RobotSpec, dtype: str, scene: Scene | None = None) -> Sy
         scene: What stands on the flat ground; ``None``: nothing.
 
     Raises:
-        AssetNotFoundError: A row's URDF file does not exist.
-        RobotDescriptionError: A file or a row is not one that physics can run.
+        TypeError: ``robot`` or ``scene`` is something else.
+        AssetNotFoundError: A URDF file does not exist.
+        RobotDescriptionError: A file or a robot is not one that physics can run.
         ModelMismatchError: Newton's model differs from the file.
         ValueError: ``dtype`` is not allowed, or needs JAX's 64-bit mode.
     """
@@ -303,8 +299,10 @@ def load_system(
         reports_bodies: Whether a step reports where the bodies are.
 
     Raises:
-        AssetNotFoundError: A row's URDF file does not exist.
-        RobotDescriptionError: A file or a row is not one that physics can run.
+        TypeError: ``robot`` or ``scene`` is something else.
+        AssetNotFoundError: A URDF file does not exist.
+        RobotDescriptionError: A file or a robot is not one that physics can run.
+        ModelMismatchError: Newton's model differs from the file.
         ValueError: ``dtype`` is not allowed, or needs JAX's 64-bit mode; or
             ``feet_width`` is not above 0.
     """

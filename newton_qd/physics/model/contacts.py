@@ -8,7 +8,8 @@ import numpy as np
 
 from newton_qd.checks import Fact, listed
 from newton_qd.physics import reference
-from newton_qd.physics.model.description import Body, Shape
+from newton_qd.physics.model.description import Body
+from newton_qd.physics.model.elements import Shape
 from newton_qd.physics.model.robot_checks import index_of, refusal
 from newton_qd.physics.model.scene import (
     TOUCHING,
@@ -22,7 +23,11 @@ from newton_qd.scenes import Scene
 
 
 def body_of(robot: RobotSpec, field: str, link: str, bodies: list[Body]) -> int:
-    """Returns the body that holds a link which the row's field names."""
+    """Returns the body that holds a link which the robot's field names.
+
+    Raises:
+        RobotDescriptionError: No body does.
+    """
     links = {name: i for i, body in enumerate(bodies) for name in body.links}
     index_of(robot, field, link, tuple(links))
     return links[link]

@@ -52,7 +52,12 @@ def grounding_coordinate(system: System) -> tuple[int, float] | None:
 
 
 def rest_coordinates(system: System) -> np.ndarray:
-    """Returns the coordinates (nq,) of the row's default pose."""
+    """Returns the coordinates (nq,) of the robot's default pose.
+
+    Raises:
+        RobotDescriptionError: The pose is not one that the joints can take, or names
+            joints that are not there.
+    """
     robot = system.robot
     q = np.array(system.rest_q)
     free = system.q_start[system.joint_kind == JointKind.FREE]

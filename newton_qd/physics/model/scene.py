@@ -11,15 +11,8 @@ from newton_qd import checks
 from newton_qd.assets import find_urdf
 from newton_qd.checks import Fact, listed, message
 from newton_qd.physics import reference
-from newton_qd.physics.model.description import (
-    WORLD,
-    Link,
-    Shape,
-    by_name,
-    find_root,
-    read_joints,
-    read_link,
-)
+from newton_qd.physics.model.description import WORLD, find_root, read_joints
+from newton_qd.physics.model.elements import Link, Shape, by_name, read_link
 from newton_qd.physics.model.xml_reader import (
     IDENTITY,
     RobotDescriptionError,
@@ -73,6 +66,7 @@ def read_scene(scene: Scene) -> tuple[SceneLink, ...]:
     A root link called ``world`` stands for the world and is left out.
 
     Raises:
+        TypeError: ``scene`` is something else.
         AssetNotFoundError: The URDF file does not exist.
         RobotDescriptionError: The file is malformed, something in it moves or has
             mass, or a collider is of a kind that contacts do not have.

@@ -12,7 +12,8 @@ import dataclasses
 import numpy as np
 from numpy.typing import ArrayLike
 
-from newton_qd.physics.model.description import Body, Description, Shape
+from newton_qd.physics.model.description import Body, Description
+from newton_qd.physics.model.elements import Shape
 from newton_qd.physics.model.xml_reader import IDENTITY, RobotDescriptionError
 from newton_qd.physics.system import JointKind
 

@@ -21,7 +21,12 @@ class RobotDescriptionError(ValueError):
 
 
 class XmlReader:
-    """Reads attributes of one file; its errors name the file, line and element."""
+    """Reads attributes of one file; its errors name the file, line and element.
+
+    Raises:
+        RobotDescriptionError: The file is not XML.
+        OSError: The file cannot be read.
+    """
 
     def __init__(self, path: Path):
         self.path = path
@@ -75,14 +80,22 @@ class XmlReader:
         return self.error(element, message(name, value, allowed))
 
     def text(self, element: ElementTree.Element, key: str) -> str:
-        """Returns an attribute that must be there and not be empty."""
+        """Returns an attribute that must be there and not be empty.
+
+        Raises:
+            RobotDescriptionError: It is not.
+        """
         value = element.get(key)
         if not value:
             raise self.error(element, f"attribute {key!r} is missing")
         return value
 
     def child(self, element: ElementTree.Element, tag: str) -> ElementTree.Element:
-        """Returns the first child element of a tag; there must be one."""
+        """Returns the first child element of a tag; there must be one.
+
+        Raises:
+            RobotDescriptionError: There is none.
+        """
         found = element.find(tag)
         if found is None:
             raise self.error(element, f"element <{tag}> is missing")
@@ -97,7 +110,11 @@ class XmlReader:
         *,
         finite: bool = True,
     ) -> np.ndarray:
-        """Returns the ``count`` numbers of an attribute."""
+        """Returns the ``count`` numbers of an attribute.
+
+        Raises:
+            RobotDescriptionError: They are missing, of another count or not finite.
+        """
         text = element.get(key, default)
         if text is None:
             raise self.error(element, f"attribute {key!r} is missing")
@@ -113,20 +130,32 @@ class XmlReader:
     def number(
         self, element: ElementTree.Element, key: str, default: str | None = None
     ) -> float:
-        """Returns an attribute that is one finite number."""
+        """Returns an attribute that is one finite number.
+
+        Raises:
+            RobotDescriptionError: It is not.
+        """
         return float(self.numbers(element, key, 1, default)[0])
 
     def positive(
         self, element: ElementTree.Element, key: str, count: int
     ) -> np.ndarray:
-        """Returns the ``count`` numbers of an attribute, all above zero."""
+        """Returns the ``count`` numbers of an attribute, all above zero.
+
+        Raises:
+            RobotDescriptionError: They are missing, of another count or not above zero.
+        """
         values = self.numbers(element, key, count)
         if not (values > 0).all():
             raise self.refused(element, key, element.get(key), "positive numbers")
         return values
 
     def frame(self, element: ElementTree.Element) -> np.ndarray:
-        """Returns the frame (7,) of the element's ``<origin>``."""
+        """Returns the frame (7,) of the element's ``<origin>``.
+
+        Raises:
+            RobotDescriptionError: Its numbers are malformed.
+        """
         origin = element.find("origin")
         if origin is None:
             return IDENTITY
