@@ -1,13 +1,11 @@
 """The one door between JAX and Warp.
 
-Traced code calls the kernels through XLA's foreign function interface; a batch of
-any nesting arrives as one launch with a leading world axis. Eager code shares memory
-through DLPack. No other module knows both libraries.
+Traced code calls the kernels as :mod:`newton_qd.physics.row_calls` wraps them. Eager
+code shares memory through DLPack. No third module knows both libraries.
 """
 
-import contextlib
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Protocol
 
 import jax
@@ -20,8 +18,13 @@ from newton_qd.physics import interrupts, layout
 from newton_qd.physics.launch import Launcher, thread_count
 from newton_qd.physics.layout import Layout
 from newton_qd.physics.precision import SCALARS, Variant, build_kernels
+from newton_qd.physics.row_calls import (
+    Differentiable,
+    RowCall,
+    differentiable,
+    row_call,
+)
 from newton_qd.physics.system import Kinematics, PhysicsState, System
-from newton_qd.physics.warp_internals import ffi_callback
 
 
 @functools.cache
@@ -41,111 +44,11 @@ def launcher(system: System, device: wp.Device, parametric: bool = False) -> Lau
     return _launcher(system, device.alias, parametric)
 
 
-@contextlib.contextmanager
-def _errors_contained() -> Iterator[None]:
-    """Turn what Warp would let through XLA's frames into an error that it reports.
-
-    Raises:
-        RuntimeError: Something else than an ``Exception`` was raised, such as an
-            interrupt.
-    """
-    # notebooks put Python's own SIGINT handler back before every cell
-    interrupts.install()
-    try:
-        yield
-    except Exception:
-        raise
-    except BaseException as error:
-        raise RuntimeError(f"interrupted inside the physics: {error!r}") from error
-
-
-class RowCall(Protocol):
-    """A kernel as a function of contiguous rows, one world's each."""
-
-    def __call__(self, *rows: jax.Array, output_dims: int) -> tuple[jax.Array, ...]:
-        """A tuple of one row of length ``output_dims``."""
-        ...
-
-
-Differentiable = Callable[[jax.Array], jax.Array]
-"""Reverse-mode function of one world's row of inputs; returns its row of outputs."""
-
-
-def _row_call(
-    name: str, dtype: str, module: wp.Module, launch: Callable[..., None]
-) -> RowCall:
-    """A launch as a function of contiguous rows.
-
-    Args:
-        name: Kernel; one that ends in ``_backward`` takes the adjoints of the outputs
-            as a second argument.
-        dtype: Type of the rows.
-        module: Warp module of the kernel; Warp loads it when a call is traced.
-        launch: Runs the kernel on Warp arrays of rows: the inputs, then the outputs.
-
-    Returns:
-        Function of one world's rows that returns a tuple of one row; its
-        ``output_dims`` says how long. Under ``vmap`` the worlds share one launch.
-    """
-    real = SCALARS[dtype]
-
-    def forward(x: wp.array(dtype=real), y: wp.array(dtype=real)):
-        with _errors_contained():
-            launch(x, y)
-
-    def backward(
-        x: wp.array(dtype=real),
-        y_bar: wp.array(dtype=real),
-        x_bar: wp.array(dtype=real),
-    ):
-        with _errors_contained():
-            launch(x, y_bar, x_bar)
-
-    function = backward if name.endswith("_backward") else forward
-    function.__name__ = function.__qualname__ = name
-    function.__module__ = module.name
-    call = wp.jax_callable(
-        function,
-        num_outputs=1,
-        vmap_method="broadcast_all",
-        graph_mode=wp.JaxCallableGraphMode.NONE,
-    )
-    # Warp numbers and keeps every call that it traces, and XLA compiles each number:
-    # without jit that would be every eager call
-    return jax.jit(call, static_argnames="output_dims", inline=True)
-
-
-def _differentiable(
-    call: Callable[[str], RowCall], name: str, size: int, output_size: int
-) -> Differentiable:
-    """Reverse-mode function of one row; the adjoint is compiled when first traced.
-
-    Args:
-        call: Makes the function of a kernel, as :func:`_row_call`, from its name.
-        name: Kernels, without ``_forward`` and ``_backward``.
-        size: Length of a row of inputs.
-        output_size: Length of a row of outputs.
-    """
-
-    @jax.custom_vjp
-    def run(x: jax.Array) -> jax.Array:
-        return call(f"{name}_forward")(x, output_dims=output_size)[0]
-
-    def run_forward(x: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return run(x), x
-
-    def run_backward(x: jax.Array, y_bar: jax.Array) -> tuple[jax.Array]:
-        return (call(f"{name}_backward")(x, y_bar, output_dims=size)[0],)
-
-    run.defvjp(run_forward, run_backward)
-    return run
-
-
 @functools.cache
 def _kernel_call(
     system: System, name: str, size: int, parametric: bool = False
 ) -> RowCall:
-    """A kernel of a system as a function of rows; see :func:`_row_call`.
+    """A kernel of a system as a function of rows, as ``row_call`` makes them.
 
     Args:
         system: The system.
@@ -161,7 +64,7 @@ def _kernel_call(
         own.launch(name, worlds, x, *arrays, adjoint=adjoint)
 
     default = launcher(system, _default_device(), parametric)
-    return _row_call(name, system.dtype, default.prepare(name), launch)
+    return row_call(name, system.dtype, default.prepare(name), launch)
 
 
 def _row(
@@ -234,10 +137,10 @@ def control_step(system: System) -> Step:
     shapes = read.shapes | {"params": (count,)}
     seen = tuple(field.name for field in layout.bodies(system))
     call = functools.partial(_kernel_call, system, size=read.size)
-    step = _differentiable(call, "step", read.size, written.size)
+    step = differentiable(call, "step", read.size, written.size)
     size = layout.inputs(system, parametric=True).size
     call = functools.partial(_kernel_call, system, size=size, parametric=True)
-    own_step = _differentiable(call, "step", size, written.size)
+    own_step = differentiable(call, "step", size, written.size)
 
     def run(
         q: jax.Array, v: jax.Array, control: jax.Array, params: jax.Array | None = None
@@ -267,7 +170,7 @@ def kinematics(system: System) -> Callable[[jax.Array, jax.Array], Kinematics]:
     """
     read, written = layout.coordinates(system), layout.bodies(system)
     call = functools.partial(_kernel_call, system, size=read.size)
-    views = _differentiable(call, "kinematics", read.size, written.size)
+    views = differentiable(call, "kinematics", read.size, written.size)
 
     def run(q: jax.Array, v: jax.Array) -> Kinematics:
         row = _row(system, read.shapes, q=q, v=v)
@@ -314,7 +217,7 @@ def _episode_call(name: str, dtype: str, steps: int, nd: int) -> RowCall:
         wp.launch(kernel, dim=episodes * nd, inputs=inputs, device=x.device)
 
     kernel.module.load(_default_device())
-    return _row_call(name, dtype, kernel.module, launch)
+    return row_call(name, dtype, kernel.module, launch)
 
 
 @functools.cache
@@ -323,7 +226,7 @@ def _episode_reduction(
 ) -> Differentiable:
     """Reverse-mode function of one episode's row; the mask has no gradient."""
     call = functools.partial(_episode_call, dtype=dtype, steps=steps, nd=nd)
-    return _differentiable(call, name, steps * (nd + 1), size)
+    return differentiable(call, name, steps * (nd + 1), size)
 
 
 def _episode_row(state_desc: jax.Array, mask: jax.Array) -> jax.Array:
@@ -378,9 +281,6 @@ def episode_final(state_desc: jax.Array, mask: jax.Array) -> jax.Array:
     row = _episode_row(state_desc, mask)
     steps, nd = state_desc.shape
     return _episode_reduction("final", state_desc.dtype.name, steps, nd, nd)(row)
-
-
-interrupts.protect(ffi_callback())
 
 
 def to_jax(array: wp.array) -> jax.Array:

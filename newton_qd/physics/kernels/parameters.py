@@ -225,7 +225,11 @@ def return_shared(
     count: int,
     fault: real,
 ):
-    """Adjoint of the parameters that a world has one of."""
+    """Adjoint of the parameters that a world has one of.
+
+    Reads: m.contact_stiffness, m.inputs, m.parameters, g.parameter.
+    Writes: g.parameter, x_bar.
+    """
     held = offsets.parameter + m.parameters.contact_stiffness
     store(g.parameter, held, m.contact_stiffness * load(g.parameter, held))
     given = at + m.inputs.contact_stiffness_scale
@@ -252,8 +256,8 @@ def return_parameters(
 ):
     """Adjoint of ``load_parameters``; leaves that of the controls as they came in.
 
-    Reads: m.nb, m.nv, m.mass, m.damping, m.contact_stiffness, m.inputs,
-        m.parameters, g.ctrl, g.parameter, x.
+    Reads: m.nb, m.nv, m.mass, m.damping, m.inputs, m.parameters, g.ctrl,
+        g.parameter, x.
     Writes: g.ctrl, g.parameter, x_bar.
 
     Args:
