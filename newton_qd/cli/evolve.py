@@ -166,6 +166,7 @@ def run(
 
     Raises:
         ConfigError: A setting is missing or wrong.
+        KeyboardInterrupt: A signal came while the packages were imported.
     """
     config, out = _settle(arguments)
     seconds = arguments.checkpoint_seconds

@@ -95,7 +95,11 @@ _HOME = {
 
 
 def __getattr__(name: str) -> Any:
-    """Loads a name of this package when it is first used."""
+    """Loads a name of this package when it is first used.
+
+    Raises:
+        AttributeError: The package has no such name.
+    """
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)

@@ -57,6 +57,9 @@ class EvolveConfig:
         algorithm: Name of one of ``newton_qd.qd.algorithms.ALGORITHMS``.
         options: Settings that this algorithm alone has, as ``(name, value)`` in the
             order of their names; may be given as a dictionary.
+
+    Raises:
+        ConfigError: A value is wrong, or both ``grid`` and ``centroids`` are given.
     """
 
     env_name: str = "ant_uni"
@@ -117,6 +120,10 @@ class EvolveConfig:
 
         Returns:
             Settings in which exactly one of ``grid`` and ``centroids`` is given.
+
+        Raises:
+            ConfigError: There is no default grid for the descriptor, or the grid has
+                another number of dimensions.
         """
         if self.centroids is not None:
             return self
@@ -136,7 +143,11 @@ class EvolveConfig:
         return self
 
     def replace(self, **changes: Any) -> EvolveConfig:
-        """Returns a copy with some settings changed."""
+        """Returns a copy with some settings changed.
+
+        Raises:
+            ConfigError: No setting has such a name, or a value is wrong.
+        """
         known = {field.name for field in dataclasses.fields(self)}
         unknown = sorted(set(changes) - known)
         if unknown:
@@ -155,7 +166,11 @@ class EvolveConfig:
 
 
 def _pairs(options: Any) -> tuple[tuple[str, Any], ...]:
-    """Brings options into the order of their names; lists become tuples."""
+    """Brings options into the order of their names; lists become tuples.
+
+    Raises:
+        ConfigError: They are no names with values.
+    """
     items = options.items() if isinstance(options, dict) else options
     try:
         pairs = {
@@ -170,7 +185,11 @@ def _pairs(options: Any) -> tuple[tuple[str, Any], ...]:
 
 
 def check_number(name: str, value: Any) -> None:
-    """Raises ``ConfigError`` for what is not a finite number of at least 0."""
+    """Checks a finite number of at least 0.
+
+    Raises:
+        ConfigError: The value is something else.
+    """
     number = isinstance(value, int | float) and not isinstance(value, bool)
     if not number or not math.isfinite(value) or value < 0:
         raise ConfigError(
@@ -179,7 +198,11 @@ def check_number(name: str, value: Any) -> None:
 
 
 def check_integer(name: str, value: Any, low: int, high: int | None = None) -> None:
-    """Raises ``ConfigError`` for what is not an integer from low to high."""
+    """Checks an integer from low to high.
+
+    Raises:
+        ConfigError: The value is something else.
+    """
     bad_type = not isinstance(value, int) or isinstance(value, bool)
     if bad_type or value < low or (high is not None and value > high):
         allowed = f"at least {low}" if high is None else f"{low} to {high}"
@@ -187,7 +210,11 @@ def check_integer(name: str, value: Any, low: int, high: int | None = None) -> N
 
 
 def check_integers(name: str, values: Any, low: int) -> None:
-    """Raises ``ConfigError`` for what is not a tuple of integers from low on."""
+    """Checks a tuple of integers from low on.
+
+    Raises:
+        ConfigError: The values are something else.
+    """
     if not isinstance(values, tuple):
         raise ConfigError(f"{name} must be a tuple of integers, got {values!r}")
     for value in values:

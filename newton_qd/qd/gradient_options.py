@@ -7,7 +7,11 @@ from typing import Any
 
 
 def __getattr__(name: str) -> Any:
-    """Gathers the defaults of all algorithms."""
+    """Gathers the defaults of all algorithms.
+
+    Raises:
+        AttributeError: The module never had the name.
+    """
     if name != "TUNED":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from newton_qd.qd.algorithms import ALGORITHMS

@@ -24,7 +24,11 @@ class CMAMEOptions(Options):
 
 
 def _make(context: EmitterContext, options: CMAMEOptions) -> Any:
-    """CMA-ME with improvement emitters; its memory grows with size squared."""
+    """CMA-ME with improvement emitters; its memory grows with size squared.
+
+    Raises:
+        ConfigError: ``sigma_g`` is not positive.
+    """
     from qdax.core.emitters.cma_improvement_emitter import CMAImprovementEmitter
     from qdax.core.emitters.cma_pool_emitter import CMAPoolEmitter
 

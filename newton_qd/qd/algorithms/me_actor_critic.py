@@ -46,7 +46,11 @@ class ActorCriticOptions(DifferentiableOptions, ActorCriticSettings):
 
 
 def _make(context: EmitterContext, options: ActorCriticOptions) -> Any:
-    """MAP-Elites with the policies of actors that learn over short horizons."""
+    """MAP-Elites with the policies of actors that learn over short horizons.
+
+    Raises:
+        ConfigError: The actors have more offspring than a generation has room for.
+    """
     from newton_qd.qd.emitters import ActorCritic, ActorCriticEmitter
     from newton_qd.qd.emitters.actor_critic_learner import measure_of
 

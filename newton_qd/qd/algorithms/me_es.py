@@ -66,7 +66,11 @@ class _FromOne:
 
 
 def _make(context: EmitterContext, options: MEESOptions) -> Any:
-    """ME-ES: evolution strategies from elites (Colas et al. 2020)."""
+    """ME-ES: evolution strategies from elites (Colas et al. 2020).
+
+    Raises:
+        ConfigError: The options or the size of a generation do not fit together.
+    """
     from qdax.core.emitters.mees_emitter import MEESConfig, MEESEmitter
 
     samples = context.config.batch_size

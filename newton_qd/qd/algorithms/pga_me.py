@@ -27,7 +27,11 @@ class PGAMEOptions(CriticOptions):
 
 
 def _make(context: EmitterContext, options: PGAMEOptions) -> Any:
-    """PGA-ME: half of the variations follow a critic (Nilsson and Cully 2021)."""
+    """PGA-ME: half of the variations follow a critic (Nilsson and Cully 2021).
+
+    Raises:
+        ConfigError: The options do not fit the size of a generation.
+    """
     from newton_qd import compat
 
     compat.install()  # QDax's file imports environments that JAX of today refuses

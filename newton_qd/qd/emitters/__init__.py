@@ -66,7 +66,11 @@ _HOME = {
 
 
 def __getattr__(name: str) -> Any:
-    """Loads a name of this package when it is first used."""
+    """Loads a name of this package when it is first used.
+
+    Raises:
+        AttributeError: The package has no such name.
+    """
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     require_extra("qdax", "qd")

@@ -22,6 +22,9 @@ class ActorCriticSettings:
         trace: Lambda of the critic's TD(lambda) targets [-].
         epochs: Times that the critic sees a window.
         batches: Optimizer steps of the critic in each epoch.
+
+    Raises:
+        ValueError: A value is out of its range.
     """
 
     worlds: int = 16
@@ -37,7 +40,11 @@ class ActorCriticSettings:
     batches: int = 4
 
     def __post_init__(self) -> None:
-        """Checks every value."""
+        """Checks every value.
+
+        Raises:
+            ValueError: A value is out of its range.
+        """
         object.__setattr__(self, "critic", tuple(self.critic))
         for name in ("worlds", "window", "epochs", "batches"):
             if getattr(self, name) < 1:

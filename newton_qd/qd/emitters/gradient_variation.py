@@ -125,7 +125,11 @@ class GradientVariationEmitter(EliteGradientEmitter):
         return carry[0], {}
 
     def _draw(self, key: jax.Array, gradients: jax.Array) -> jax.Array:
-        """(N, 1 + D) a direction for each of gradients (N, 1 + D, size)."""
+        """(N, 1 + D) a direction for each of gradients (N, 1 + D, size).
+
+        Raises:
+            ValueError: A direction has another length than 1 + D.
+        """
         count, rows = gradients.shape[:2]
         directions = self._directions
         if directions is None:

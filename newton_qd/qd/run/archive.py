@@ -95,7 +95,11 @@ def load_archive(folder: str | os.PathLike[str]) -> Archive:
 
 
 def _from_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> Archive:
-    """Makes an archive of the arrays of a file of format 1."""
+    """Makes an archive of the arrays of a file of format 1.
+
+    Raises:
+        ArchiveError: The arrays are not those of an archive.
+    """
     names = [field.name for field in dataclasses.fields(Archive)]
     if sorted(arrays) != sorted(names):
         raise ArchiveError(

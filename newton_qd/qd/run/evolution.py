@@ -132,7 +132,12 @@ def evolve(
 def _folder(
     out: str | os.PathLike[str] | None, resume: bool, tensorboard: bool
 ) -> RunFolder | None:
-    """Checks folder and packages before anything takes time."""
+    """Checks folder and packages before anything takes time.
+
+    Raises:
+        ConfigError: The folder is not free, or TensorBoard's files have no folder.
+        MissingExtra: QDax, matplotlib or tensorboardX is not installed.
+    """
     require_extra("qdax", "qd")
     if out is None:
         if tensorboard:
@@ -147,7 +152,11 @@ def _folder(
 
 
 def _mesh(devices: int | None, resume: bool) -> Mesh | None:
-    """Devices that share the evaluations; ``None`` for the default one."""
+    """Devices that share the evaluations; ``None`` for the default one.
+
+    Raises:
+        ConfigError: There are fewer devices, or several processes resume a run.
+    """
     if resume and jax.process_count() > 1:
         raise ConfigError(
             f"resume: a run of {jax.process_count()} processes cannot be resumed, "

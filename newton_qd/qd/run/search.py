@@ -193,7 +193,11 @@ class Search:
         )
 
     def restore(self, checkpoint: Checkpoint) -> SearchState:
-        """Makes the state that a checkpoint describes."""
+        """Makes the state that a checkpoint describes.
+
+        Raises:
+            CheckpointError: It holds other arrays than this version of the algorithm.
+        """
         from qdax.core.containers.mapelites_repertoire import MapElitesRepertoire
 
         repertoire = MapElitesRepertoire(
@@ -212,7 +216,11 @@ class Search:
         )
 
     def _restore_emitter(self, leaves: tuple[np.ndarray, ...]) -> PyTree:
-        """Puts the leaves of a checkpoint where they belong."""
+        """Puts the leaves of a checkpoint where they belong.
+
+        Raises:
+            CheckpointError: They are not those of this algorithm.
+        """
         shape = (self._config.batch_size, self._policy.size)
         genotypes = jax.ShapeDtypeStruct(shape, jnp.float32)
         score = self._scoring()

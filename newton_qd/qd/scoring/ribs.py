@@ -163,7 +163,11 @@ def from_ribs(archive: Any) -> Any:
 
 
 def _centroids(archive: Any) -> np.ndarray:
-    """(cells, D) centres of the cells, in the order of their indices."""
+    """(cells, D) centres of the cells, in the order of their indices.
+
+    Raises:
+        TypeError: The archive is another one, or its solutions are not vectors.
+    """
     from ribs.archives import CVTArchive, GridArchive
 
     # Others have grid indices, too, but cells that move.
