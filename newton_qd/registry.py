@@ -78,7 +78,7 @@ def register(
         **options: Keyword arguments of ``base``, which ``create`` may replace.
 
     Raises:
-        TypeError: An argument is of another type, or ``base`` does not take an option.
+        TypeError: An argument has the wrong type, or ``base`` does not take an option.
         ValueError: The name is taken, a name is not a name, or ``reward_offset`` is
             not finite.
     """

@@ -34,7 +34,7 @@ class FixedInitialStateWrapper(fixed_initial_state.FixedInitialStateWrapper):
 
         Args:
             env: The environment, with or without wrappers; it is not changed.
-            base_env_name: Its name, for the error.
+            base_env_name: Its name, used in errors.
             get_obs_fn: Makes the observation of a reset from ``(qp, info, action)``:
                 the bodies, what ``env.sys.info(qp)`` reports, and a zero action.
                 ``None``: that of the environment.

@@ -14,16 +14,16 @@ from newton_qd.types import Action, Metrics
 
 
 class Acrobot(PhysicsEnv):
-    """Two poles that hang from a mount, driven where they meet, to be swung upright.
+    """Two poles that hang from a mount. The joint between them is driven.
 
-    Observation: ``observation_layout``. Reward: 10, minus the squared joint angles,
-    which are 0 where the poles stand, minus a penalty for how fast they turn. Never
-    done.
+    The task is to swing them upright. Observation: ``observation_layout``. Reward: 10,
+    minus the squared joint angles, minus a penalty for the joint velocities. The angles
+    are 0 when the poles stand. Never done.
 
     Metrics:
         dist_penalty: Sum of the squared joint angles [rad^2].
-        vel_penalty: Penalty for how fast the poles turn [-].
-        alive_bonus: 0, as in the original; the reward has its 10.
+        vel_penalty: Penalty for the joint velocities [-].
+        alive_bonus: 0, as in the original; the 10 is in the reward only.
         r_tot: The reward [-].
     """
 
@@ -39,7 +39,7 @@ class Acrobot(PhysicsEnv):
             dtype: ``"float32"``, or ``"float64"`` with JAX x64 on.
 
         Raises:
-            TypeError: An option is of another type.
+            TypeError: An option has the wrong type.
             ValueError: An option has a value that is not allowed.
         """
         super().__init__(ACROBOT, reset_noise_scale=reset_noise_scale, dtype=dtype)

@@ -14,7 +14,7 @@ from newton_qd.physics.system import PhysicsState
 from newton_qd.robots import ANT
 from newton_qd.types import Action, Metrics
 
-_CONTACT_CLIP = 1.0  # contact velocity changes are seen up to this [m/s or rad/s]
+_CONTACT_CLIP = 1.0  # limit of observed contact velocity changes [m/s or rad/s]
 _ROOT_Q, _ROOT_V = 7, 6  # a free root has 7 coordinates and 6 velocities
 
 
@@ -32,9 +32,9 @@ class Ant(PhysicsEnv):
         reward_contact: Minus the cost of contact [-].
         x_position: x of the torso [m].
         y_position: y of the torso [m].
-        distance_from_origin: Length of its position, height included [m].
+        distance_from_origin: Distance of the torso from the origin, in 3D [m].
         x_velocity: Velocity of the torso along x [m/s].
-        y_velocity: That along y [m/s].
+        y_velocity: Velocity of the torso along y [m/s].
     """
 
     forward_reward_name = "reward_forward"
@@ -57,13 +57,14 @@ class Ant(PhysicsEnv):
 
         Args:
             ctrl_cost_weight: Cost of the sum of squared actions [-].
-            use_contact_forces: Whether the observation ends with the contact
-                velocity changes of every body, and of ground and walls (always 0).
+            use_contact_forces: Whether the observation ends with the contact velocity
+                changes of every body, of the ground and of the walls. Those of ground
+                and walls are always 0.
             contact_cost_weight: Cost of the sum of squared contact velocity changes,
                 clipped as in the observation [-].
-            healthy_reward: Bonus of a step [-].
+            healthy_reward: Bonus per step [-].
             terminate_when_unhealthy: Whether an unhealthy torso ends the episode;
-                if not, it loses the bonus instead.
+                if not, it only loses the bonus.
             healthy_z_range: Lowest and highest healthy height of the torso [m].
             reset_noise_scale: Half width of the uniform noise on joint angles [rad]
                 and joint velocities [rad/s] at a reset.
@@ -72,7 +73,7 @@ class Ant(PhysicsEnv):
             dtype: ``"float32"``, or ``"float64"`` with JAX x64 on.
 
         Raises:
-            TypeError: An option is of another type.
+            TypeError: An option has the wrong type.
             ValueError: An option has a value that is not allowed.
         """
         self._ctrl_cost_weight = ctrl_cost_weight
@@ -155,7 +156,7 @@ def _clipped(changes: jax.Array) -> jax.Array:
 
 
 def _rows(changes: jax.Array, still: int) -> jax.Array:
-    """Returns the rows of bodies (nb, 3) and of what never moves, one after another."""
-    # Those of ground and walls are zero, kept for the layout that policies know.
+    """Returns the rows of bodies (nb, 3), then zeros for obstacles, as one vector."""
+    # Ground and walls never move. Their zeros keep the layout that policies expect.
     zeros = jnp.zeros((still, 3), changes.dtype)
     return jnp.concatenate([changes, zeros]).reshape(-1)

@@ -1,4 +1,4 @@
-"""What all simulated robots share, and what each of them says itself."""
+"""The base class of all simulated robots."""
 
 from __future__ import annotations
 
@@ -35,29 +35,29 @@ _RENAMED = {
 
 
 class PhysicsEnv(Env):
-    """A simulated robot; the base class for environments of one's own.
+    """A simulated robot; the base class for your own environments.
 
-    A subclass overrides ``outcome``, which rewards a step, and what it wants to have
-    otherwise of ``observe``, ``reset_pose`` and ``control``. These are functions of one
-    world, traced by JAX: they use ``jax.numpy`` and change nothing in place.
-    ``joint`` and ``kinematics`` help to read a state.
+    A subclass overrides ``outcome``, which computes the reward of a step. It may also
+    override ``observe``, ``reset_pose`` and ``control``. JAX traces these methods, and
+    each works on one world: use ``jax.numpy``, and change nothing in place. ``joint``
+    and ``kinematics`` help to read a state.
 
-    A world that meets a value that is not finite, or a speed beyond 1,000 m/s or rad/s,
-    is frozen where it was: ``info["fault"]`` becomes 1 and stays until a reset, reward
-    and metrics are 0, done is 1, and no gradient passes. Other worlds do not notice.
+    A world has a fault if a value is not finite or a speed is above 1,000 m/s or rad/s.
+    It then keeps its last state. ``info["fault"]`` is 1 until the next reset, reward
+    and metrics are 0, done is 1, and the gradient is 0. Other worlds are not affected.
 
     Attributes:
         robot: Spec of the robot.
-        system: The robot as the physics knows it.
+        system: The robot in the form that the physics uses.
     """
 
     forward_reward_name: str | None = None
-    """Metric that is the forward part of the reward; ``None``: there is none."""
+    """Metric with the forward part of the reward; ``None``: no forward part."""
     reads_bodies: bool = False
-    """Whether a step is to report where the bodies are: ``kinematics`` costs less."""
+    """Whether a step returns the poses of bodies too; ``kinematics`` is then faster."""
 
     def __init_subclass__(cls, **options: Any) -> None:
-        """Lets methods that are overridden by their old names work."""
+        """Keeps methods working that are overridden by their old names."""
         super().__init_subclass__(**options)
         for old, new in _RENAMED.items():
             if old in vars(cls):
@@ -86,14 +86,15 @@ class PhysicsEnv(Env):
             robot: Spec of the robot.
             reset_noise_scale: Half width of the uniform noise on joint angles [rad]
                 and joint velocities [rad/s] at a reset.
-            reset_velocity_noise_scale: That of the velocities, where it differs.
+            reset_velocity_noise_scale: The same for velocities; ``None``: as for
+                angles.
             dtype: ``"float32"``, or ``"float64"`` with JAX x64 on.
-            scene: What stands on the ground; ``None``: nothing.
+            scene: Obstacles on the ground; ``None``: no obstacles.
 
         Raises:
-            TypeError: An argument is of another type.
-            ValueError: The robot or the scene cannot be built, has no actuators, or a
-                method returns another shape than it may; names it.
+            TypeError: An argument has the wrong type.
+            ValueError: The robot or the scene cannot be built, the robot has no
+                actuators, or an overridden method returns a wrong shape.
             FileNotFoundError: A URDF file is missing.
         """
         self.robot = robot
@@ -124,14 +125,14 @@ class PhysicsEnv(Env):
         self._metrics = inputs.checked_outcome(type(self).__name__, found)
 
     def with_scene(self, scene: Scene | None) -> PhysicsEnv:
-        """Returns the same environment in another scene; this one stays as it is.
+        """Returns the same environment in another scene; this one does not change.
 
         Args:
-            scene: What stands on the ground; ``None``: nothing.
+            scene: Obstacles on the ground; ``None``: no obstacles.
 
         Raises:
-            TypeError: ``scene`` is no scene.
-            ValueError: The scene cannot be built; names its file and line.
+            TypeError: ``scene`` is not a ``Scene``.
+            ValueError: The scene cannot be built. The error names the file and line.
             FileNotFoundError: Its URDF file is missing.
         """
         moved = copy.copy(self)
@@ -139,14 +140,14 @@ class PhysicsEnv(Env):
         return moved
 
     def with_material(self, material: Material) -> PhysicsEnv:
-        """Returns the same environment with other softness; this one stays as it is.
+        """Returns the same environment with another material; this one stays the same.
 
         Args:
             material: Softness of contacts and joint limits.
 
         Raises:
-            TypeError: ``material`` is no material.
-            ValueError: A number of the material is not allowed.
+            TypeError: ``material`` is not a ``Material``.
+            ValueError: A number of the material is out of its range.
         """
         changed = copy.copy(self)
         changed.robot = dataclasses.replace(self.robot, material=material)
@@ -154,10 +155,10 @@ class PhysicsEnv(Env):
         return changed
 
     def with_feet_width(self, width: float) -> PhysicsEnv:
-        """Returns the same environment with another smooth contact of the feet.
+        """Returns the same environment with another width of the smooth feet contact.
 
         Args:
-            width: Share of the robot's weight over which it rises [-], above 0.
+            width: Share of the robot's weight over which it rises from 0 to 1 [-].
 
         Raises:
             ValueError: ``width`` is not above 0.
@@ -168,15 +169,15 @@ class PhysicsEnv(Env):
         return changed
 
     def observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
-        """What a policy sees; the default is every coordinate and velocity.
+        """Returns the observation; by default all coordinates and velocities.
 
         Args:
-            state: Where the world is.
-            action: (nu,) the action that led there; zero after a reset.
+            state: State of the world.
+            action: (nu,) the action of the last step; zero after a reset.
 
         Returns:
-            The blocks (n,) of the observation by name, such as "root height [m]". They
-            follow one another in this order, converted to the environment's dtype.
+            The blocks (n,) of the observation by name, such as "root height [m]". The
+            observation joins them in this order, in the environment's dtype.
         """
         del action
         return {
@@ -188,53 +189,53 @@ class PhysicsEnv(Env):
     def outcome(
         self, before: PhysicsState, after: PhysicsState, action: Action
     ) -> tuple[jax.Array, jax.Array, Metrics]:
-        """What a step is worth, and whether the episode ends with it.
+        """Returns the reward of a step, whether the episode ends, and metrics.
 
         Args:
-            before: Where the world was.
-            after: Where it is ``dt`` later.
+            before: State at the start of the step.
+            after: State at its end, ``dt`` later.
             action: (nu,) the action.
 
         Returns:
-            Reward (), done () as a boolean or 0 and 1, and metrics () by name.
+            Reward (); done (), either a boolean or 0 and 1; metrics () by name.
         """
 
     def control(self, state: PhysicsState, action: Action) -> jax.Array:
-        """What drives the actuators in a step; the default is the action.
+        """Returns the control of the actuators in a step; by default the action.
 
         Args:
-            state: Where the step begins.
+            state: State at the start of the step.
             action: (nu,) the action.
 
         Returns:
-            (nu,) control: times the gear of each actuator it is a torque [N m] or a
-            force [N]; of a servo it is the target [rad or m].
+            (nu,) control. Control times gear is the torque [N m] or force [N] of an
+            actuator. The control of a servo is its target [rad or m].
         """
         del state
         return action
 
     def reset_pose(self, rng: RNGKey, q: jax.Array) -> jax.Array:
-        """Where an episode begins, before noise on the joints; the default pose.
+        """Returns the first pose of an episode, before noise; by default the rest pose.
 
         Args:
             rng: One key.
             q: (nq,) coordinates of the default pose [m or rad].
 
         Returns:
-            (nq,) coordinates [m or rad]. A robot whose spec has no ``rest_height`` is
-            raised or lowered afterwards until its lowest contact is on the ground.
+            (nq,) coordinates [m or rad]. A robot without ``rest_height`` is then moved
+            up or down until its lowest contact is on the ground.
         """
         del rng
         return q
 
     def joint(self, name: str) -> tuple[slice, slice]:
-        """Returns where a joint is in the coordinates and in the velocities.
+        """Returns the slices of a joint in the coordinates and in the velocities.
 
         Args:
-            name: Joint of the URDF file.
+            name: Name of the joint in the URDF file.
 
         Returns:
-            Its part of ``state.q`` [m or rad] and of ``state.v`` [m/s or rad/s].
+            Its slices of ``state.q`` [m or rad] and of ``state.v`` [m/s or rad/s].
 
         Raises:
             ValueError: The robot has no such joint.
@@ -252,10 +253,9 @@ class PhysicsEnv(Env):
         return parts[0], parts[1]
 
     def kinematics(self, state: PhysicsState) -> Kinematics:
-        """Returns where the bodies of a state are, and how they move.
+        """Returns the poses and velocities of the bodies of a state.
 
-        The rows are those of ``system.body_names``. Set ``reads_bodies = True`` in the
-        class where every step needs it.
+        Row i is body ``system.body_names[i]``. ``reads_bodies = True`` makes it faster.
 
         Args:
             state: State of one world.
@@ -290,20 +290,18 @@ class PhysicsEnv(Env):
         return self._first_state(self._rest())
 
     def step(self, state: State, action: Action, params: Params = None) -> State:
-        """Advances by one control step, or freezes a world at fault.
+        """Advances by one control step, or freezes a world that has a fault.
 
         Raises:
-            TypeError: The state or the action is of another type.
-            ValueError: The state is of another environment, the action of another
-                shape, ``params`` are not those of this robot, or the environment is
-                float64 and JAX x64 is off.
+            TypeError: The state or the action has the wrong type.
+            ValueError: The state, the action or ``params`` do not fit this robot, or
+                the environment is float64 and JAX x64 is off.
         """
         checks.x64(self._dtype)
         inputs.require_state(state, "fault")
         action = inputs.checked_action(action, self.action_size, self._dtype)
-        # The physics freezes a world at fault and passes no gradient through it; a
-        # world that was at fault before is handed over as one. The outcome sees numbers
-        # instead, so that its zero gradient is not 0 * nan (double where).
+        # NaN control tells the physics to freeze a world. ``outcome`` gets finite
+        # numbers instead, so that its gradient is 0 and not 0 * nan ("double where").
         start: PhysicsState = state.pipeline_state
         sound = jnp.all(jnp.isfinite(action)) & (state.info["fault"] == 0)
         control = self.control(start, action)
@@ -330,7 +328,7 @@ class PhysicsEnv(Env):
 
     @property
     def default_params(self) -> physics.PhysicsParams:
-        """Physical parameters of one world as in the robot's files.
+        """Physical parameters of one world, with the values of the robot's files.
 
         Raises:
             ValueError: The environment is float64 and JAX x64 is off.
@@ -375,7 +373,7 @@ class PhysicsEnv(Env):
         return physics.initial_state(self.system, q, v)
 
     def _record_layout(self, state: PhysicsState, action: Action) -> None:
-        # not a result of eval_shape: it would sort the names
+        # stored here because eval_shape would return the blocks sorted by name
         blocks = self.observe(state, action)
         self._layout = inputs.checked_layout(type(self).__name__, blocks)
 

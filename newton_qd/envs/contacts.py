@@ -1,4 +1,4 @@
-"""Velocity changes by contact, as observations and costs read them."""
+"""Velocity changes by contact, for observations and costs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from newton_qd.physics.system import PhysicsState, System
 def linear_changes(
     system: System, state: PhysicsState, bodies: np.ndarray
 ) -> jax.Array:
-    """Contact impulse over mass, friction included.
+    """Returns the contact impulse, friction included, divided by the mass.
 
     Args:
         system: The system.
@@ -29,13 +29,13 @@ def linear_changes(
 def angular_changes(
     system: System, state: PhysicsState, bodies: np.ndarray, reader: str
 ) -> jax.Array:
-    """Angular contact impulse about the centre of mass over inertia.
+    """Returns the angular contact impulse divided by the inertia.
 
     Args:
         system: The system.
         state: State after the control step; zero after a reset.
         bodies: (n,) bodies with mass.
-        reader: What reads the changes, for the error.
+        reader: Name of the caller, used in errors.
 
     Returns:
         (n, 3) world axes [rad/s].
@@ -48,12 +48,12 @@ def angular_changes(
 
 
 def isotropic_inertia(system: System, bodies: np.ndarray, reader: str) -> np.ndarray:
-    """Returns the one moment of inertia (n,) of each body [kg m^2].
+    """Returns the moment of inertia (n,) of each body, equal about all axes [kg m^2].
 
     Args:
         system: The system.
         bodies: (n,) bodies with mass.
-        reader: What reads the moments, for the error.
+        reader: Name of the caller, used in errors.
 
     Raises:
         ValueError: An inertia is not the same about every axis.

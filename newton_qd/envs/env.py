@@ -1,4 +1,4 @@
-"""What an environment is."""
+"""The base classes of all environments."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from newton_qd.types import Action, Params, RNGKey
 class Env(abc.ABC):
     """An environment: two pure functions and their sizes.
 
-    Environments are immutable, compare and hash by identity, and may be static
+    Environments are immutable. They compare and hash by identity, so they can be static
     arguments of jitted functions.
     """
 
@@ -39,15 +39,15 @@ class Env(abc.ABC):
         """Advances by one control step of ``dt``.
 
         Args:
-            state: Where to start; it is not changed and may be stepped again.
-            action: (nu,) array of the environment's dtype, meant for -1 to 1.
-            params: Physical parameters of the world, as ``default_params`` with fields
-                replaced; ``None``: as in its files.
+            state: State at the start. It does not change and can be stepped again.
+            action: (nu,) array of the environment's dtype, usually from -1 to 1.
+            params: Physical parameters of the world: ``default_params`` with some
+                fields replaced. ``None``: the values of the robot's files.
 
         Raises:
-            TypeError: The state or the action is of another type.
-            ValueError: The state is of another environment, the action of another
-                shape, ``params`` are not those of this robot, or the environment is
+            TypeError: The state or the action has the wrong type.
+            ValueError: The state comes from another environment, the action has the
+                wrong shape, ``params`` do not fit this robot, or the environment is
                 float64 and JAX x64 is off.
         """
 
@@ -78,9 +78,9 @@ class Env(abc.ABC):
 
     @property
     def default_params(self) -> Params:
-        """What a step takes for ``params``: as in the files, ``None`` without any.
+        """Default ``params`` of a step; ``None`` if there are no parameters.
 
-        In a batch every parameter has the batch axis in front.
+        In a batch, the first axis of every parameter is the batch axis.
         """
         return None
 
@@ -93,8 +93,8 @@ class Env(abc.ABC):
         """Returns the same wrappers around another environment.
 
         Args:
-            change: Makes the new inside from ``unwrapped``; this environment and its
-                wrappers stay as they are.
+            change: Makes the new inner environment from ``unwrapped``. This environment
+                and its wrappers do not change.
         """
         return change(self)
 
@@ -102,7 +102,7 @@ class Env(abc.ABC):
         """Returns the same wrappers around the same robot in another scene.
 
         Args:
-            scene: What stands on the ground; ``None``: nothing. This environment and
+            scene: Obstacles on the ground; ``None``: no obstacles. This environment and
                 its wrappers stay as they are.
 
         Raises:
@@ -111,11 +111,11 @@ class Env(abc.ABC):
         raise NotImplementedError(not_simulated("scene", scene, self))
 
     def with_material(self, material: Material) -> Env:
-        """Returns the same wrappers around the same robot with other softness.
+        """Returns the same wrappers around the same robot with another material.
 
         Args:
             material: Softness of contacts and joint limits. This environment and its
-                wrappers stay as they are.
+                wrappers do not change.
 
         Raises:
             NotImplementedError: The environment inside is not a simulated robot.
@@ -125,10 +125,10 @@ class Env(abc.ABC):
     if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any:
-            """Says where views of brax v1 are.
+            """Raises an error that names the wrapper for views of brax v1.
 
             Raises:
-                AttributeError: Always: what is there is found without this.
+                AttributeError: Always. Python calls this for missing attributes only.
             """
             raise AttributeError(no_brax_view(self, name, ("sys",)))
 
@@ -136,8 +136,8 @@ class Env(abc.ABC):
 class QDEnv(Env):
     """An environment that writes ``info["state_descriptor"]``.
 
-    The descriptor of an episode has the length and limits of the state descriptor,
-    under both names that QDax has used for them.
+    The descriptor of an episode has the same length and limits as the state descriptor.
+    Both names that QDax has used for them work.
     """
 
     @property
@@ -148,7 +148,7 @@ class QDEnv(Env):
     @property
     @abc.abstractmethod
     def state_descriptor_name(self) -> str:
-        """What a state descriptor measures."""
+        """Name of the quantity that a state descriptor measures."""
 
     @property
     @abc.abstractmethod

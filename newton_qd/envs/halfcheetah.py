@@ -23,7 +23,7 @@ class HalfCheetah(PhysicsEnv):
     Metrics:
         x_position: x of the trunk [m].
         x_velocity: Its velocity along x [m/s].
-        reward_run: That velocity, weighted.
+        reward_run: Velocity along x times its weight.
         reward_ctrl: Minus the cost of control [-].
     """
 
@@ -51,7 +51,7 @@ class HalfCheetah(PhysicsEnv):
             dtype: ``"float32"``, or ``"float64"`` with JAX x64 on.
 
         Raises:
-            TypeError: An option is of another type.
+            TypeError: An option has the wrong type.
             ValueError: An option has a value that is not allowed.
         """
         self._forward_reward_weight = forward_reward_weight

@@ -16,8 +16,8 @@ from newton_qd.robots import HUMANOID, RobotSpec
 from newton_qd.types import Action, Metrics
 
 _ROOT_V = 6  # a free root has 6 velocities
-_NEAR = 1e-7  # keeps the velocity about the centre of mass finite at it [m^2]
-# Joints as observed: first those of one axis, then those of two, then of three.
+_NEAR = 1e-7  # avoids a division by 0 at the centre of mass [m^2]
+# Order of the observed joints: with one axis, then with two, then with three.
 _OBSERVED = (
     *("abdomen_x", "right_knee", "left_knee", "right_elbow", "left_elbow"),
     *("abdomen_z", "abdomen_y"),
@@ -31,18 +31,18 @@ class Humanoid(PhysicsEnv):
 
     Observation: ``observation_layout``. Reward: velocity of the centre of mass along
     x, plus a bonus for being healthy, minus a cost of control. Done when unhealthy.
-    Only the shins touch the ground: the rest falls through it, as in the original.
+    Only the shins touch the ground. Other bodies pass through it, as in the original.
 
     Metrics:
-        forward_reward: Velocity of the centre of mass along x, weighted.
+        forward_reward: Velocity of the centre of mass along x times its weight.
         reward_linvel: The same.
         reward_quadctrl: Minus the cost of control [-].
         reward_alive: Bonus for being healthy [-].
         x_position: x of the robot's centre of mass [m].
         y_position: Its y [m].
-        distance_from_origin: Length of its position, height included [m].
+        distance_from_origin: Its distance from the origin, in 3D [m].
         x_velocity: Its velocity along x [m/s].
-        y_velocity: That along y [m/s].
+        y_velocity: Its velocity along y [m/s].
     """
 
     forward_reward_name: str | None = "reward_linvel"
@@ -67,9 +67,9 @@ class Humanoid(PhysicsEnv):
         Args:
             forward_reward_weight: Reward of a velocity along x [s/m].
             ctrl_cost_weight: Cost of the sum of squared actions [-].
-            healthy_reward: Bonus of a step [-].
+            healthy_reward: Bonus per step [-].
             terminate_when_unhealthy: Whether an unhealthy torso ends the episode;
-                if not, it loses the bonus instead.
+                if not, it only loses the bonus.
             healthy_z_range: Lowest and highest healthy height of the torso [m].
             reset_noise_scale: Half width of the uniform noise on joint angles [rad]
                 and joint velocities [rad/s] at a reset.
@@ -78,7 +78,7 @@ class Humanoid(PhysicsEnv):
             dtype: ``"float32"``, or ``"float64"`` with JAX x64 on.
 
         Raises:
-            TypeError: An option is of another type.
+            TypeError: An option has the wrong type.
             ValueError: An option has a value that is not allowed.
         """
         self._forward_reward_weight = forward_reward_weight
@@ -109,7 +109,7 @@ class Humanoid(PhysicsEnv):
         }
 
     def _observe_bodies(self, state: PhysicsState) -> dict[str, jax.Array]:
-        """Returns what each body adds to the motion about the centre of mass."""
+        """Returns inertia and velocities of each body about the centre of mass."""
         bodies = self._bodies
         seen = physics.seen_bodies(self.system, state)
         mass = jnp.asarray(self.system.mass[bodies], self.dtype)[:, None]
@@ -129,7 +129,7 @@ class Humanoid(PhysicsEnv):
     def _inertia_about_centre(
         self, mass: jax.Array, arm: jax.Array, square: jax.Array
     ) -> jax.Array:
-        """Returns how the bodies resist turning about the robot's centre of mass.
+        """Returns the inertias of the bodies about the robot's centre of mass.
 
         Args:
             mass: (n, 1) [kg].
@@ -137,14 +137,14 @@ class Humanoid(PhysicsEnv):
             square: (n, 1) squared length of ``arm`` [m^2].
 
         Returns:
-            (n, 3, 3) [kg m^2]. As in the original, the outer product of the arms
-            lacks the mass.
+            (n, 3, 3) [kg m^2]. The outer product of the arms is not multiplied by the
+            mass, as in the original.
         """
         products = arm[:, :, None] * arm[:, None, :]
         return self._rotational(mass * square) - rounded(products)
 
     def _rotational(self, added: jax.Array) -> jax.Array:
-        """Returns the bodies' own inertia plus ``added`` (n, 1), (n, 3, 3) [kg m^2]."""
+        """Returns the bodies' inertia plus ``added`` (n, 1), as (n, 3, 3) [kg m^2]."""
         moment = isotropic_inertia(self.system, self._bodies, "observed inertias")
         own = jnp.asarray(moment, self.dtype)[:, None]
         total = own + rounded(added)
@@ -189,5 +189,5 @@ class Humanoid(PhysicsEnv):
 
     @property
     def _bodies(self) -> np.ndarray:
-        """Bodies with mass (n,): not the links inside joints of several axes."""
+        """Bodies with mass (n,), without the links inside joints with several axes."""
         return np.flatnonzero(self.system.mass > 0).astype(np.int32)

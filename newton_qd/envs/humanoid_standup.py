@@ -16,12 +16,12 @@ from newton_qd.types import Action, Metrics
 class HumanoidStandup(Humanoid):
     """The humanoid on its back, rewarded for the height of its torso.
 
-    The observation is the humanoid's. Reward: height of the torso over the duration of
-    a step, plus 1, minus a cost of control. Never done. Torso, shins and lower arms
-    touch the ground.
+    The observation is that of ``Humanoid``. Reward: height of the torso divided by the
+    duration of a step, plus 1, minus a cost of control. Never done. Torso, shins and
+    lower arms touch the ground.
 
     Metrics:
-        reward_linup: Height of the torso over the duration of a step [m/s].
+        reward_linup: Height of the torso divided by the duration of a step [m/s].
         reward_quadctrl: Minus the cost of control [-].
     """
 
@@ -43,7 +43,7 @@ class HumanoidStandup(Humanoid):
             dtype: ``"float32"``, or ``"float64"`` with JAX x64 on.
 
         Raises:
-            TypeError: An option is of another type.
+            TypeError: An option has the wrong type.
             ValueError: An option has a value that is not allowed.
         """
         super().__init__(

@@ -1,4 +1,4 @@
-"""Humanoid as the trap task knows it: other inertias, costs and contacts."""
+"""Humanoid of the trap task: other inertias, costs and contacts."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from newton_qd.types import Action, Metrics
 
 
 class HumanoidTrap(Humanoid):
-    """The humanoid with its contacts in the observation and a cheaper control.
+    """The humanoid with contacts in the observation and a lower cost of control.
 
-    The robot is the humanoid, in front of a trap that its shins run into. Its
-    observation ends with contact velocity changes of every body, of the ground and of
-    the walls, unclipped.
+    The robot is the humanoid, in front of a trap. Its shins touch the walls. The
+    observation ends with the contact velocity changes of every body, of the ground and
+    of the walls. They are not clipped.
 
     Metrics:
-        reward_linvel: Velocity of the centre of mass along x, weighted.
-        reward_quadctrl: The cost of control [-]: above 0, as in the original.
+        reward_linvel: Velocity of the centre of mass along x times its weight.
+        reward_quadctrl: The cost of control [-]. It is positive, as in the original.
         reward_alive: Bonus for being healthy [-].
         reward_impact: 0, as in the original.
     """
@@ -44,9 +44,9 @@ class HumanoidTrap(Humanoid):
         """Loads the humanoid.
 
         Args:
-            forward_reward_weight: As for the humanoid, and so are the others.
+            forward_reward_weight: Reward of a velocity along x [s/m].
             ctrl_cost_weight: Cost of the sum of squared actions [-].
-            healthy_reward: Bonus of a step [-].
+            healthy_reward: Bonus per step [-].
             terminate_when_unhealthy: Whether an unhealthy torso ends the episode.
             healthy_z_range: Lowest and highest healthy height of the torso [m].
             reset_noise_scale: Half width of the noise on joint angles [rad] and
@@ -56,7 +56,7 @@ class HumanoidTrap(Humanoid):
             dtype: ``"float32"``, or ``"float64"`` with JAX x64 on.
 
         Raises:
-            TypeError: An option is of another type.
+            TypeError: An option has the wrong type.
             ValueError: An option has a value that is not allowed.
         """
         super().__init__(
@@ -90,7 +90,7 @@ class HumanoidTrap(Humanoid):
         }
 
     def _rows(self, changes: jax.Array) -> jax.Array:
-        """Returns the rows of the bodies (n, 3), the ground and the walls, flat."""
+        """Returns the rows of bodies (n, 3), ground and walls as one vector."""
         still = jnp.zeros((1 + len(self.system.scene_links), 3), changes.dtype)
         return jnp.concatenate([changes, still]).reshape(-1)
 
@@ -108,7 +108,7 @@ class HumanoidTrap(Humanoid):
         reward, done, found = super().outcome(before, after, action)
         metrics = {
             "reward_linvel": found["reward_linvel"],
-            # a cost, with its sign as in the original
+            # positive, as in the original
             "reward_quadctrl": -found["reward_quadctrl"],
             "reward_alive": found["reward_alive"],
             "reward_impact": jnp.zeros_like(reward),

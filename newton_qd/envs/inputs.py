@@ -1,4 +1,4 @@
-"""What environments refuse: the same words in every one of them."""
+"""Checks of inputs that all environments share."""
 
 from __future__ import annotations
 

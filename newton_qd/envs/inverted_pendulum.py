@@ -21,7 +21,7 @@ _WEIGHTS = (0.01, 1.0, 1e-3, 5e-3)
 
 
 class InvertedPendulum(PhysicsEnv):
-    """A pole on a cart that is pushed along x, rewarded for each step.
+    """A pole on a cart. The action pushes the cart along x. Each step is rewarded.
 
     Observation: ``observation_layout``. Reward: 1. Done when the pole leans more than
     0.2 rad.
@@ -39,7 +39,7 @@ class InvertedPendulum(PhysicsEnv):
             dtype: ``"float32"``, or ``"float64"`` with JAX x64 on.
 
         Raises:
-            TypeError: An option is of another type.
+            TypeError: An option has the wrong type.
             ValueError: An option has a value that is not allowed.
         """
         super().__init__(
@@ -67,11 +67,11 @@ class InvertedPendulum(PhysicsEnv):
 
 
 class InvertedDoublePendulum(PhysicsEnv):
-    """Two poles, one on the other, on a cart that is pushed along x.
+    """Two poles, one on the other, on a cart. The action pushes the cart along x.
 
-    Observation: ``observation_layout``. Reward: 10, minus penalties for where the tip
-    of the upper pole is and for how fast the joints turn. Done when the tip is no
-    higher than 1 m; upright it is at 1.3 m.
+    Observation: ``observation_layout``. Reward: 10, minus penalties for the position of
+    the upper pole's tip and for the joint velocities. Done when the tip is at a height
+    of 1 m or less. Its height is 1.3 m when the poles are upright.
     """
 
     @checked_options
@@ -86,7 +86,7 @@ class InvertedDoublePendulum(PhysicsEnv):
             dtype: ``"float32"``, or ``"float64"`` with JAX x64 on.
 
         Raises:
-            TypeError: An option is of another type.
+            TypeError: An option has the wrong type.
             ValueError: An option has a value that is not allowed.
         """
         super().__init__(

@@ -12,16 +12,16 @@ _LIGHTEST = 1e-5  # [kg]
 def solid_bodies(system: System) -> np.ndarray:
     """Returns the bodies (n,) of 1e-5 kg or more.
 
-    The others stand between the axes of one joint.
+    Lighter bodies are links between the axes of one joint.
     """
     return np.flatnonzero(system.mass >= _LIGHTEST).astype(np.int32)
 
 
 def joint_chains(system: System) -> list[list[int]]:
-    """Returns, for each joint of a robot, its axes from the parent on.
+    """Returns, for each joint of a robot, its axes in order from the parent.
 
-    Joints are between solid bodies, or hinges on the world; what slides or floats in
-    the world is a root.
+    A joint connects two solid bodies, or is a hinge between a body and the world. A
+    body that slides or floats in the world is a root.
     """
     solid = set(solid_bodies(system).tolist())
     chains = []

@@ -1,4 +1,4 @@
-"""Locomotion of any robot with a free root: a start for tasks of one's own."""
+"""Locomotion of any robot with a free root: a start for your own tasks."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class Locomotion(PhysicsEnv):
     """Any robot with a free root, rewarded for velocity along x.
 
     Reward: weighted velocity of the root along x, plus a bonus for being healthy, minus
-    a cost of control. Done when the root leaves the healthy heights. A subclass with
-    another ``outcome`` has other rewards.
+    a cost of control. Done when the height of the root is not healthy. For other
+    rewards, override ``outcome`` in a subclass.
     """
 
     forward_reward_name = "reward_forward"
@@ -46,12 +46,12 @@ class Locomotion(PhysicsEnv):
             robot: Spec of the robot; its first joint is free.
             forward_reward_weight: Weight of the velocity along x [s/m].
             ctrl_cost_weight: Cost of the sum of squared actions [-].
-            healthy_reward: Bonus of a step [-].
+            healthy_reward: Bonus per step [-].
             healthy_z_range: Lowest and highest healthy height of the root [m].
             reset_noise_scale: Half width of the uniform noise on joint angles [rad]
                 and joint velocities [rad/s] at a reset.
             dtype: ``"float32"``, or ``"float64"`` with JAX x64 on.
-            scene: What stands on the ground; ``None``: nothing.
+            scene: Obstacles on the ground; ``None``: no obstacles.
 
         Raises:
             ValueError: The robot's first joint is not free, or the range is empty.

@@ -1,4 +1,4 @@
-"""Options of environments: what their constructors refuse, by the types they state."""
+"""Checks of the options of environments, by their type annotations."""
 
 from __future__ import annotations
 

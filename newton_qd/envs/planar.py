@@ -1,6 +1,6 @@
-"""What the robots in a plane share: observation blocks, and running upright.
+"""Shared code of the robots in a plane: observation blocks, and running upright.
 
-Their root has the coordinates x, z and pitch, and its velocities are their rates.
+Their root has the coordinates x, z and pitch. Its velocities are their rates.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ def blocks(
 
     Args:
         state: The state.
-        orientation: How the torso is turned, as the robot's task sees it.
-        omit_x: Whether the position along x is left out.
+        orientation: The block of the torso's orientation.
+        omit_x: Whether to omit the position along x.
     """
     q, v = state.q, state.v
     first = {} if omit_x else {"torso position x [m]": q[X : X + 1]}
@@ -48,10 +48,10 @@ def forward_velocity(before: PhysicsState, after: PhysicsState, dt: float) -> ja
 
 
 def euler_pitch(angle: jax.Array) -> jax.Array:
-    """Returns the Euler angle about y of a turn by ``angle``, -pi/2 to pi/2 [rad].
+    """Returns the Euler angle about y of a rotation by ``angle``, -pi/2 to pi/2 [rad].
 
-    That is arcsin(sin(angle)), the reading of the original, by reflections: its
-    gradient is 1 or -1 everywhere.
+    This is arcsin(sin(angle)), as in the original. It is computed by reflections, so
+    its gradient is 1 or -1 everywhere.
     """
     half = np.asarray(np.pi, angle.dtype)
     angle = wrapped(angle)
@@ -66,9 +66,9 @@ class UprightRun:
     Attributes:
         forward_reward_weight: Weight of the velocity along x [s/m].
         ctrl_cost_weight: Cost of the sum of squared actions [-].
-        healthy_reward: Bonus of a step [-].
+        healthy_reward: Bonus per step [-].
         terminate_when_unhealthy: Whether an unhealthy torso ends the episode; if
-            not, it loses the bonus instead.
+            not, it only loses the bonus.
         healthy_z_range: Lowest and highest healthy height of the torso [m].
         healthy_angle_range: Lowest and highest healthy Euler pitch [rad].
     """

@@ -1,4 +1,4 @@
-"""PointMaze: a point on a plane that has to find its way round two walls."""
+"""PointMaze: a point on a plane that must move around two walls."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from newton_qd.envs.vectors import length, rounded
 from newton_qd.types import Action, Params, RNGKey
 
 _WALL_THICKNESS = 0.01
-_HIGHEST_START = -0.7  # y of a reset is below this
-_START_FRACTION = 10.0  # x of a reset is within the box over this
+_HIGHEST_START = -0.7  # highest y of a reset
+_START_FRACTION = 10.0  # x of a reset: from x_min / 10 to x_max / 10
 
 
 class PointMaze(QDEnv):
     """A point in a box with two walls, rewarded for being near the goal.
 
-    It has no physics: the observation, x and y of the point, is the whole state, and
-    ``pipeline_state`` is empty. The lower wall leaves a gap at the left, the upper one
-    at the right; a point that would cross a wall stops at its face and slides. Whether
-    it crosses is decided where its path meets the lower face of the wall. Lengths
-    have no unit. Actions are clipped to the borders of the box, x and y each. Reward:
-    minus the distance to the goal. Done in the goal zone.
+    There is no physics. The observation, x and y of the point, is the whole state, and
+    ``pipeline_state`` is empty. The lower wall has a gap at the left, the upper wall at
+    the right. A point that would cross a wall stops at its face and slides along it.
+    The path of the point is in the gap if it meets the height of the wall's lower face
+    there. Lengths have no unit. x and y of an action are clipped to the borders.
+    Reward: minus the distance to the goal. Done in the goal zone.
     """
 
     def __init__(
@@ -55,23 +55,24 @@ class PointMaze(QDEnv):
         """Sets up the maze.
 
         Args:
-            scale_action_space: An action, clipped to the borders of the box, moves the
-                point by itself over this.
+            scale_action_space: A step moves the point by the clipped action divided by
+                this number.
             x_min: Left border of the box.
             x_max: Right border.
-            y_min: Lower border, below -0.7: a reset puts the point between them.
+            y_min: Lower border, below -0.7. A reset puts the point between ``y_min``
+                and -0.7.
             y_max: Upper border.
             zone_width: Width and height of the goal zone.
             zone_width_offset_from_x_min: x of the goal, from the left border.
             zone_height_offset_from_y_max: y of the goal, from the upper border.
-            wall_width_ratio: Width of each wall over that of the box.
+            wall_width_ratio: Width of each wall divided by the width of the box.
             upper_wall_height_offset: y of the lower face of the upper wall.
             lower_wall_height_offset: y of the lower face of the lower wall.
             dtype: ``"float32"``, or ``"float64"`` with JAX x64 on.
 
         Raises:
-            ValueError: A number is not finite, a border or a wall leaves no way, or
-                ``dtype`` is float64 and JAX x64 is off.
+            ValueError: A number is not finite, borders or walls are in the wrong order,
+                or ``dtype`` is float64 and JAX x64 is off.
         """
         for name, value in (
             ("zone_width_offset_from_x_min", zone_width_offset_from_x_min),
@@ -98,7 +99,7 @@ class PointMaze(QDEnv):
         self._upper_ends = x_min + width
 
     def reset(self, rng: RNGKey) -> State:
-        """Begins an episode at a random place at the bottom of the box.
+        """Begins an episode at a random position at the bottom of the box.
 
         Raises:
             ValueError: The environment is float64 and JAX x64 is off.
@@ -111,7 +112,7 @@ class PointMaze(QDEnv):
         return self._first_state(jnp.stack([x, y]))
 
     def fixed_state(self) -> State:
-        """Returns the state of a reset without noise: the middle of the places.
+        """Returns the state of a reset without noise: the mean start position.
 
         Raises:
             ValueError: The environment is float64 and JAX x64 is off.
@@ -120,13 +121,13 @@ class PointMaze(QDEnv):
         return self._first_state(self._start())
 
     def step(self, state: State, action: Action, params: Params = None) -> State:
-        """Moves the point, or freezes it where something is not finite.
+        """Moves the point, or freezes it if a value is not finite.
 
         Raises:
-            TypeError: The state or the action is of another type.
-            ValueError: The state is of another environment, the action of another
-                shape, ``params`` are given, or the environment is float64 and JAX x64
-                is off.
+            TypeError: The state or the action has the wrong type.
+            ValueError: The state comes from another environment, the action has the
+                wrong shape, ``params`` are given, or the environment is float64 and
+                JAX x64 is off.
         """
         checks.x64(self._dtype)
         require_state(state, "fault")
@@ -135,8 +136,8 @@ class PointMaze(QDEnv):
         old = state.obs
         finite = jnp.all(jnp.isfinite(old))
         sound = finite & jnp.all(jnp.isfinite(action)) & (state.info["fault"] == 0)
-        # Double where: the move of a point at fault is reckoned with sound numbers,
-        # so that its gradient is 0 and not 0 * nan.
+        # "Double where": the move of a point that has a fault is computed with finite
+        # numbers, so that its gradient is 0 and not 0 * nan.
         frozen = jax.lax.stop_gradient(jnp.where(finite, old, self._start()))
         moved = self._moved(
             jnp.where(sound, old, frozen), jnp.where(sound, action, jnp.zeros_like(old))
@@ -156,7 +157,7 @@ class PointMaze(QDEnv):
         )
 
     def _moved(self, old: jax.Array, action: jax.Array) -> jax.Array:
-        """Returns where (2,) an action takes the point (2,)."""
+        """Returns the position (2,) of the point after an action (2,)."""
         low, high = self._array(self._low), self._array(self._high)
         move = rounded(jnp.clip(action, low, high) / self._scale)
         new = old + move
@@ -234,7 +235,7 @@ class PointMaze(QDEnv):
 
     @property
     def state_descriptor_name(self) -> str:
-        """What a state descriptor measures."""
+        """Name of the quantity that a state descriptor measures."""
         return "xy_position"
 
     @property
@@ -249,12 +250,12 @@ class PointMaze(QDEnv):
 
     @property
     def reach(self) -> float:
-        """How far an action of 1 moves the point."""
+        """Distance that an action of 1 moves the point."""
         return 1 / self._scale
 
     @property
     def goal(self) -> tuple[float, float]:
-        """Middle of the goal zone, x and y."""
+        """Centre of the goal zone, x and y."""
         return self._goal
 
     @property
@@ -274,7 +275,7 @@ class PointMaze(QDEnv):
 
     @property
     def dt(self) -> float:
-        """Duration of a step: the maze has no time but its steps."""
+        """Duration of a step, always 1: the maze counts time in steps."""
         return 1.0
 
     @property
@@ -288,11 +289,11 @@ def _crossing(
 ) -> jax.Array:
     """Returns x () at which the path from ``old`` to ``new`` (2,) meets a height.
 
-    Where it does not cross, what is returned is finite and means nothing.
+    If the path does not cross that height, the result is finite but has no meaning.
     """
     x_old, y_old = old
     x, y = new
-    # a path that keeps its y would divide 0 by 0
+    # without this, a horizontal path would divide 0 by 0
     rise = jnp.where(crosses, y - y_old, jnp.ones_like(y))
     return rounded((height - y_old) / rise * (x - x_old)) + x_old
 
@@ -303,7 +304,7 @@ def _require_box(
     """Checks borders and walls.
 
     Raises:
-        ValueError: They leave no way from the start to the top.
+        ValueError: They are not finite, or not in the right order.
     """
     if not -math.inf < x[0] < x[1] < math.inf:
         allowed = "finite, x_min below x_max"

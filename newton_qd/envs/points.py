@@ -12,7 +12,7 @@ from newton_qd.physics.inspection import Kinematics
 def point(
     seen: Kinematics, body: int, offset: tuple[float, float, float]
 ) -> tuple[jax.Array, jax.Array]:
-    """Where a point of a body is, and how it moves.
+    """Returns the position and velocity of a point of a body.
 
     Args:
         seen: Kinematics of one world.

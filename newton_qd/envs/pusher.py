@@ -14,24 +14,24 @@ from newton_qd.physics.system import PhysicsState
 from newton_qd.robots import PUSHER
 from newton_qd.types import Action, Metrics, RNGKey
 
-# Where a reset puts the object: drawn from a rectangle, then drawn in to a distance.
+# A reset draws the object's position from a rectangle, then limits its distance.
 _LOWEST, _HIGHEST = (-0.3, -0.2), (0.0, 0.2)  # x and y [m]
 _FARTHEST = 0.17  # from the origin [m]
 _NEAR, _CONTROL = 0.5, 0.1  # weights of the hand's distance [1/m] and of control [-]
 
 
 class Pusher(PhysicsEnv):
-    """An arm of seven hinges over a table, driven by torques, that pushes an object.
+    """An arm with seven hinges that pushes an object over a table, driven by torques.
 
     Observation: ``observation_layout``. Reward: minus the distance of the object from
-    its goal, minus half of its distance from the hand, both at the start of the step,
-    minus a cost of control. Never done. There is no friction: an object that was
-    pushed slides on.
+    its goal, minus half of its distance from the hand, minus a cost of control. Both
+    distances are those at the start of the step. Never done. There is no friction, so
+    a pushed object keeps sliding.
 
     Metrics:
         reward_dist: Minus the distance of the object from its goal [m].
-        reward_ctrl: Minus the sum of squared actions, before its weight of 0.1 [-].
-        reward_near: Minus the distance of the object from the hand, before its weight
+        reward_ctrl: Minus the sum of squared actions, without its weight of 0.1 [-].
+        reward_near: Minus the distance of the object from the hand, without its weight
             of 0.5 [m].
     """
 
@@ -50,11 +50,12 @@ class Pusher(PhysicsEnv):
         Args:
             reset_noise_scale: Half width of the uniform noise on joint angles at a
                 reset [rad].
-            reset_velocity_noise_scale: That of joint velocities [rad/s].
+            reset_velocity_noise_scale: Half width of the noise on joint velocities
+                [rad/s].
             dtype: ``"float32"``, or ``"float64"`` with JAX x64 on.
 
         Raises:
-            TypeError: An option is of another type.
+            TypeError: An option has the wrong type.
             ValueError: An option has a value that is not allowed.
         """
         super().__init__(
@@ -65,7 +66,7 @@ class Pusher(PhysicsEnv):
         )
 
     def reset_pose(self, rng: RNGKey, q: jax.Array) -> jax.Array:
-        """Returns the coordinates (nq,) with the object somewhere near the origin."""
+        """Returns the coordinates (nq,) with the object at random near the origin."""
         low, high = (jnp.asarray(ends, self.dtype) for ends in (_LOWEST, _HIGHEST))
         drawn = jax.random.uniform(rng, (2,), self.dtype, low, high)
         farthest = jnp.asarray(_FARTHEST, self.dtype)

@@ -32,32 +32,34 @@ def randomize_params(
     damping_scale: Range | None = None,
     gear_scale: Range | None = None,
 ) -> PhysicsParams:
-    """Draws physical parameters, each entry uniformly and independently.
+    """Draws physical parameters. Each entry is uniform and independent of the others.
 
-    A world's parameters depend on the key and its index, not on the number of worlds.
+    The parameters of a world depend on the key and on the index of the world, but not
+    on the number of worlds.
 
     Args:
         key: One key.
         env: A simulated robot, with or without wrappers.
-        worlds: Length of the batch axis; ``None``: that of ``env``, none if it is not
-            batched.
-        gravity: Lowest and highest value, two numbers or two arrays of the shape of
-            one world's parameter; ``None``: as in the files. So are the others, which
-            :class:`~newton_qd.physics.parameters.PhysicsParams` explains.
-        friction: As above.
-        contact_stiffness_scale: As above.
-        mass_scale: As above.
-        inertia_scale: As above.
-        damping_scale: As above.
-        gear_scale: As above.
+        worlds: Length of the batch axis; ``None``: the batch of ``env``, or no batch
+            axis if ``env`` has no batch.
+        gravity: Lowest and highest value: two numbers, or two arrays with the shape of
+            the parameter of one world. ``None``: the value of the robot's files.
+            :class:`~newton_qd.physics.parameters.PhysicsParams` explains each
+            parameter.
+        friction: Lowest and highest value, as for ``gravity``.
+        contact_stiffness_scale: Lowest and highest value, as for ``gravity``.
+        mass_scale: Lowest and highest value, as for ``gravity``.
+        inertia_scale: Lowest and highest value, as for ``gravity``.
+        damping_scale: Lowest and highest value, as for ``gravity``.
+        gear_scale: Lowest and highest value, as for ``gravity``.
 
     Returns:
-        Parameters for ``env.step``, or where ``worlds`` is given for its ``vmap``.
+        Parameters for ``env.step``, or for its ``vmap`` if ``worlds`` is given.
 
     Raises:
-        TypeError: ``env`` is no environment.
-        ValueError: The environment has no physical parameters, or a range is not one;
-            names it and what is allowed.
+        TypeError: ``env`` is not an environment.
+        ValueError: The environment has no physical parameters, ``worlds`` is not an
+            integer above 0, or a range is wrong.
     """
     default = _default(env, worlds)
     given = {
@@ -82,11 +84,12 @@ def randomize_params(
 
 
 def _default(env: Env, worlds: int | None) -> PhysicsParams:
-    """Returns the parameters of one world as in the files.
+    """Returns the parameters of one world, with the values of the robot's files.
 
     Raises:
-        TypeError: ``env`` is no environment.
-        ValueError: It has no physical parameters, or ``worlds`` is no number of worlds.
+        TypeError: ``env`` is not an environment.
+        ValueError: It has no physical parameters, or ``worlds`` is not an integer
+            above 0.
     """
     checks.environment(env, needs="unwrapped")
     default = env.unwrapped.default_params
@@ -98,10 +101,10 @@ def _default(env: Env, worlds: int | None) -> PhysicsParams:
 
 
 def _bounds(name: str, limits: Range, default: jax.Array) -> tuple[np.ndarray, ...]:
-    """Returns the checked ends of a range, in the type of the parameter.
+    """Returns the two ends of a range, in the dtype of the parameter.
 
     Raises:
-        ValueError: The range is not one.
+        ValueError: The range has the wrong shape, type or order.
     """
     allowed = f"(low, high), numbers or arrays of shape {default.shape}"
     try:
@@ -125,7 +128,7 @@ def _draw(
     """Returns the parameters of one world."""
     drawn = {}
     for name, (low, high) in bounds.items():
-        # by the place of the field: what one range gives does not depend on the others
+        # one key for each field, so that a draw does not depend on the other ranges
         own = jax.random.fold_in(key, FIELDS.index(name))
         like = getattr(default, name)
         drawn[name] = jax.random.uniform(own, like.shape, like.dtype, low, high)

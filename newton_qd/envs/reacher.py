@@ -1,4 +1,4 @@
-"""Reachers: bring the tip of an arm to a target that each reset places anew."""
+"""Reachers: bring the tip of an arm to a target that each reset draws at random."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from newton_qd.robots import REACHER, REACHERANGLE, RobotSpec
 from newton_qd.types import Action, Metrics, RNGKey
 
 _TIP = (0.11, 0.0, 0.0)  # centre of the tip in its link [m]
-_FARTHEST = 0.2  # of a target from the shoulder [m]
+_FARTHEST = 0.2  # largest distance of a target from the shoulder [m]
 
 
 class Reacher(PhysicsEnv):
@@ -25,7 +25,7 @@ class Reacher(PhysicsEnv):
 
     Observation: ``observation_layout``. Reward: minus the distance of the tip from the
     target, minus the sum of squared actions. Never done. The target is a body of the
-    simulation that nothing moves.
+    simulation that does not move.
 
     Metrics:
         reward_dist: Minus the distance of the tip from the target [m].
@@ -47,11 +47,12 @@ class Reacher(PhysicsEnv):
         Args:
             reset_noise_scale: Half width of the uniform noise on joint angles at a
                 reset [rad].
-            reset_velocity_noise_scale: That of joint velocities [rad/s].
+            reset_velocity_noise_scale: Half width of the noise on joint velocities
+                [rad/s].
             dtype: ``"float32"``, or ``"float64"`` with JAX x64 on.
 
         Raises:
-            TypeError: An option is of another type.
+            TypeError: An option has the wrong type.
             ValueError: An option has a value that is not allowed.
         """
         super().__init__(
@@ -62,7 +63,7 @@ class Reacher(PhysicsEnv):
         )
 
     def reset_pose(self, rng: RNGKey, q: jax.Array) -> jax.Array:
-        """Returns the coordinates (nq,) with the target somewhere within reach."""
+        """Returns the coordinates (nq,) with the target at random within reach."""
         share, turn = jax.random.uniform(rng, (2,), self.dtype)
         angle = np.asarray(2 * np.pi, self.dtype) * turn
         direction = jnp.stack([jnp.cos(angle), jnp.sin(angle)])
@@ -70,8 +71,8 @@ class Reacher(PhysicsEnv):
         return q.at[self._target].set(distance * direction)
 
     def _share_of_radius(self, share: jax.Array) -> jax.Array:
-        """Returns how far out () a target is, of a uniform number () from 0 to 1."""
-        # as the original: targets are denser near the shoulder
+        """Returns the relative radius () of a target from a uniform number ()."""
+        # as in the original, targets are denser near the shoulder
         return share
 
     @property
@@ -99,7 +100,7 @@ class Reacher(PhysicsEnv):
         return point(seen, self.system.body_names.index("body1"), _TIP)
 
     def _miss(self, seen: Kinematics) -> jax.Array:
-        """Returns the way from the target to the tip (3,) [m]."""
+        """Returns the vector from the target to the tip (3,) [m]."""
         target = self.system.body_names.index("target")
         return self._tip(seen)[0] - seen.position[target]
 
@@ -120,10 +121,10 @@ class Reacher(PhysicsEnv):
 
 
 class ReacherAngle(Reacher):
-    """The arm of the reacher, driven to angles.
+    """The arm of the reacher, with actions that are target angles.
 
-    An action from -1 to 1 is the angle that a joint is driven to, from one end of its
-    range to the other; beyond, it is clipped. Reward: minus the distance of the tip
+    An action from -1 to 1 is the target angle of a joint, from the lower to the upper
+    end of its range. Other actions are clipped. Reward: minus the distance of the tip
     from the target. Never done.
 
     Metrics:
@@ -134,11 +135,11 @@ class ReacherAngle(Reacher):
     _spec = REACHERANGLE
 
     def _share_of_radius(self, share: jax.Array) -> jax.Array:
-        """Returns how far out () a target is: uniform over the disk."""
+        """Returns the relative radius () of a target, uniform over the disk."""
         return jnp.sqrt(share)
 
     def control(self, state: PhysicsState, action: Action) -> jax.Array:
-        """Returns the angles that the joints are driven to (nu,) [rad]."""
+        """Returns the target angles of the joints (nu,) [rad]."""
         del state
         dofs = self.system.control_dof
         low = jnp.asarray(self.system.limit_lower[dofs], self.dtype)

@@ -1,4 +1,4 @@
-"""What ``reset`` and ``step`` return, and what is done with it world by world."""
+"""The state that ``reset`` and ``step`` return, and functions of it."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ Tree = TypeVar("Tree")
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, eq=False)
 class State:
-    """What ``reset`` and ``step`` return; a pytree that never changes its shape.
+    """The result of ``reset`` and ``step``; a pytree with constant shapes.
 
-    Every leaf of a batched state has the batch axis in front.
+    The first axis of every leaf of a batched state is the batch axis.
 
     Attributes:
-        pipeline_state: What the simulation needs to go on: a ``PhysicsState``.
+        pipeline_state: State of the simulation: a ``PhysicsState``.
         obs: (no,) observation.
         reward: () reward of the step that led here; 0 after a reset.
-        done: () 1 where the episode has ended, else 0.
-        metrics: Parts of the reward and other () readings, 0 after a reset.
-        info: What wrappers remember; ``newton_qd.types.INFO_KEYS`` lists the keys.
+        done: () 1 if the episode has ended, else 0.
+        metrics: Terms of the reward and other () quantities by name, 0 after a reset.
+        info: Data of the wrappers; ``newton_qd.types.INFO_KEYS`` lists the keys.
     """
 
     pipeline_state: Any
@@ -43,10 +43,10 @@ class State:
     if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any:
-            """Says where views of brax v1 are.
+            """Raises an error that names the wrapper for views of brax v1.
 
             Raises:
-                AttributeError: Always: what is there is found without this.
+                AttributeError: Always. Python calls this for missing attributes only.
             """
             raise AttributeError(no_brax_view(self, name, ("qp", "system")))
 
@@ -59,9 +59,9 @@ def no_brax_view(thing: object, name: str, views: tuple[str, ...]) -> str:
     """Returns the message for an attribute that is missing.
 
     Args:
-        thing: What was asked for it.
+        thing: Object that lacks the attribute.
         name: Name of the attribute.
-        views: Attributes that are there for code written for brax v1.
+        views: Attributes that exist for code written for brax v1 only.
     """
     if name in views:
         given = Fact(f"{type(thing).__name__} without bodies as brax v1 shows them")
@@ -74,9 +74,9 @@ def select(condition: jax.Array, chosen: Tree, other: Tree) -> Tree:
     """Chooses between two pytrees, world by world.
 
     Args:
-        condition: Booleans; the leading axes of every leaf.
-        chosen: Where ``condition`` is true.
-        other: Elsewhere.
+        condition: Booleans; their axes are the first axes of every leaf.
+        chosen: Values where ``condition`` is true.
+        other: Values where ``condition`` is false.
     """
 
     def leaf(a: jax.Array, b: jax.Array) -> jax.Array:
@@ -87,14 +87,14 @@ def select(condition: jax.Array, chosen: Tree, other: Tree) -> Tree:
 
 
 def per_world(read: Callable[[Any], Tree], state: State) -> Tree:
-    """Reads the simulation of every world of a state.
+    """Applies a function to the simulation state of every world.
 
     Args:
         read: Function of the ``pipeline_state`` of one world.
         state: State of one world or of any batch.
 
     Returns:
-        What ``read`` returns, with the batch axes in front.
+        The results of ``read``, with the batch axes in front.
     """
     for _ in range(jnp.ndim(state.done)):
         read = jax.vmap(read)
@@ -102,13 +102,14 @@ def per_world(read: Callable[[Any], Tree], state: State) -> Tree:
 
 
 def check(state: State) -> None:
-    """Raises where a world is at fault; for eager code, after a jitted rollout.
+    """Raises an error if a world has a fault; call it outside ``jax.jit``.
 
     Args:
         state: State of one world or of any batch.
 
     Raises:
-        FaultError: Names the worlds, and their steps where ``info`` has them.
+        FaultError: A world has a fault. The error names the worlds, and their steps if
+            ``info`` has them.
         TypeError: ``state`` is traced.
     """
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(state)):

@@ -1,4 +1,4 @@
-"""Swimmer: swim along x in a plane, by bending two joints."""
+"""Swimmer: swim along x in a plane by bending two joints."""
 
 from __future__ import annotations
 
@@ -19,8 +19,9 @@ from newton_qd.types import Action, Metrics
 _LINKS = ("torso", "mid", "back")
 _YAW, _JOINTS = 2, 3  # coordinates; x and y of the torso are before them
 
-# The water, and the inertia of the link that the original takes the drag of: a box with
-# the same moments is dragged (MuJoCo's inertia-box model, with sides of a sixth).
+# The water, and the inertia of the link for which the original computes the drag. The
+# drag is that of a box with the same moments of inertia (MuJoCo's inertia-box model,
+# but with sides of a sixth).
 _VISCOSITY, _DENSITY = 0.1, 10.0  # [N s/m^2], [kg/m^3]
 _MASS = 34.557519189487735  # [kg]
 _MOMENTS = np.array([0.1727875959474387, 3.5709436495803999, 3.5709436495803999])
@@ -34,19 +35,19 @@ class Swimmer(PhysicsEnv):
     """Three links in a row that float in water, rewarded for velocity along x.
 
     Observation: ``observation_layout``. Reward: velocity of the centre of mass along x,
-    minus a cost of control. Never done. The water drags each link at its centre of
-    mass: against its velocity, and more across the link than along it; the drag is
-    that of the start of a step.
+    minus a cost of control. Never done. The drag of the water acts at the centre of
+    mass of each link, against its velocity. It is larger across the link than along it.
+    It is computed once per step, from the state at the start.
 
     Metrics:
-        reward_fwd: Velocity of the centre of mass along x, weighted.
+        reward_fwd: Velocity of the centre of mass along x times its weight.
         reward_ctrl: Minus the cost of control [-].
         x_position: x of the centre of mass of all links [m].
         y_position: Its y [m].
         distance_from_origin: Distance of the first link's centre of mass from the
             origin [m].
         x_velocity: Velocity of the centre of mass along x [m/s].
-        y_velocity: That along y [m/s].
+        y_velocity: Velocity of the centre of mass along y [m/s].
         forward_reward: The same as ``reward_fwd``.
     """
 
@@ -74,7 +75,7 @@ class Swimmer(PhysicsEnv):
             dtype: ``"float32"``, or ``"float64"`` with JAX x64 on.
 
         Raises:
-            TypeError: An option is of another type.
+            TypeError: An option has the wrong type.
             ValueError: An option has a value that is not allowed.
         """
         self._forward_reward_weight = forward_reward_weight
@@ -84,7 +85,7 @@ class Swimmer(PhysicsEnv):
 
     @property
     def action_size(self) -> int:
-        """Length of an action: the drag of the water is none."""
+        """Length of an action, without the controls that apply the drag."""
         return self.system.nu - _JOINTS
 
     def observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
@@ -101,7 +102,7 @@ class Swimmer(PhysicsEnv):
         }
 
     def control(self, state: PhysicsState, action: Action) -> jax.Array:
-        """Returns the torques of the action and the drag, on every coordinate (5,)."""
+        """Returns the action plus the drag of the water, for all coordinates (5,)."""
         finite = jnp.all(jnp.isfinite(state.q)) & jnp.all(jnp.isfinite(state.v))
         state = select(finite, state, self._rest())  # its gradient too
         drag = self._drag(state)
@@ -118,7 +119,7 @@ class Swimmer(PhysicsEnv):
         centre, joint = seen.com[bodies, :2], seen.position[bodies, :2]
         torques = []
         for first in range(len(_LINKS)):
-            # a joint feels the forces on its own link and on those behind it
+            # the torque of a joint sums over its link and all links behind it
             arm, push = centre[first:] - joint[first], force[first:]
             left, right = arm[:, 0] * push[:, 1], arm[:, 1] * push[:, 0]
             torques.append(ordered_sum(rounded(left) - rounded(right)))
@@ -161,7 +162,7 @@ class Swimmer(PhysicsEnv):
         return forward - control, jnp.zeros_like(forward), metrics
 
     def _centre_of_mass(self, seen: Kinematics) -> jax.Array:
-        """Returns x and y of the centre of mass (2,) [m]; all links are as heavy."""
+        """Returns x and y of the centre of mass (2,) [m]; all links have equal mass."""
         return ordered_sum(seen.com[self._bodies, :2]) / len(_LINKS)
 
     @property

@@ -8,12 +8,12 @@ import numpy as np
 
 
 def rounded(product: jax.Array) -> jax.Array:
-    """Returns products (...) as they are, rounded before they are added to anything.
+    """Returns products (...) unchanged, but rounded before they are added.
 
-    A compiler may fuse a product with the sum that it goes into, which rounds once
-    instead of twice. Whether it does, and with which of two products, depends on the
-    batch. A selection between the two, here of every number that is not nan, is
-    what compilers cannot see through; a barrier is removed before they fuse.
+    A compiler may fuse a product and a sum into one operation that rounds once instead
+    of twice. Whether it does this, and with which of two products, depends on the
+    batch. It cannot fuse through the selection used here. An optimization barrier does
+    not help, because XLA removes barriers before it fuses.
     """
     return jnp.where(product == product, product, jnp.full_like(product, jnp.nan))
 
@@ -21,8 +21,8 @@ def rounded(product: jax.Array) -> jax.Array:
 def ordered_sum(terms: jax.Array) -> jax.Array:
     """Sums (n, ...) terms from the first to the last.
 
-    The order of ``jnp.sum`` depends on the batch; this one does not, so that one
-    world gives bitwise the same in any batch. For a few dozen terms.
+    The order of ``jnp.sum`` depends on the batch size. This order does not, so a world
+    gives bitwise the same result in any batch. Use it for at most a few dozen terms.
     """
     terms = rounded(terms)
     total = terms[0]
@@ -34,13 +34,13 @@ def ordered_sum(terms: jax.Array) -> jax.Array:
 def length(vector: jax.Array) -> jax.Array:
     """Returns the norm of (n,), with gradient 0 instead of nan at 0."""
     square = ordered_sum(jnp.square(vector))
-    zero = square == 0  # not "is not above": a nan stays one
+    zero = square == 0  # not "~(square > 0)", so that nan stays nan
     root = jnp.sqrt(jnp.where(zero, jnp.ones_like(square), square))
     return jnp.where(zero, jnp.zeros_like(root), root)
 
 
 def wrapped(angle: jax.Array) -> jax.Array:
-    """Returns angles (...) plus whole turns, between -pi and pi [rad]."""
+    """Returns angles (...) shifted by multiples of 2 pi to between -pi and pi [rad]."""
     turn = np.asarray(2 * np.pi, angle.dtype)
     return angle - turn * jnp.round(angle / turn)
 
@@ -53,7 +53,7 @@ def cross(a: jax.Array, b: jax.Array) -> jax.Array:
 
 
 def rotated(quaternion: jax.Array, vector: jax.Array) -> jax.Array:
-    """Returns the rows of vectors (n, 3) turned by quaternions xyzw (n, 4)."""
+    """Returns vectors (n, 3) rotated by quaternions xyzw (n, 4)."""
     axis, w = quaternion[:, :3], quaternion[:, 3:]
     turned = 2 * cross(axis, vector)
     return vector + rounded(w * turned) + cross(axis, turned)

@@ -19,7 +19,7 @@ class Walker2d(PhysicsEnv):
     being healthy, minus a cost of control. Done when unhealthy.
 
     Metrics:
-        reward_forward: Velocity of the torso along x, weighted.
+        reward_forward: Velocity of the torso along x times its weight.
         reward_ctrl: Minus the cost of control [-].
         reward_healthy: Bonus for being healthy [-].
         x_position: x of the torso [m].
@@ -47,9 +47,9 @@ class Walker2d(PhysicsEnv):
         Args:
             forward_reward_weight: Weight of the velocity along x [s/m].
             ctrl_cost_weight: Cost of the sum of squared actions [-].
-            healthy_reward: Bonus of a step [-].
+            healthy_reward: Bonus per step [-].
             terminate_when_unhealthy: Whether an unhealthy torso ends the episode;
-                if not, it loses the bonus instead.
+                if not, it only loses the bonus.
             healthy_z_range: Lowest and highest healthy height of the torso [m].
             healthy_angle_range: Lowest and highest healthy pitch of the torso, an
                 Euler angle between -pi/2 and pi/2 [rad].
@@ -60,7 +60,7 @@ class Walker2d(PhysicsEnv):
             dtype: ``"float32"``, or ``"float64"`` with JAX x64 on.
 
         Raises:
-            TypeError: An option is of another type.
+            TypeError: An option has the wrong type.
             ValueError: An option has a value that is not allowed.
         """
         self._task = planar.UprightRun(

@@ -70,7 +70,7 @@ def diagnose_gradients(
         The report: ``print`` it, or ``write`` it to a folder.
 
     Raises:
-        TypeError: A setting is of another type.
+        TypeError: A setting has the wrong type.
         ValueError: A setting is out of its range, or the environment in float32.
         FaultError: A world is at fault, or too many of its noisy samples are.
     """

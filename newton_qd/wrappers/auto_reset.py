@@ -42,9 +42,9 @@ class AutoResetWrapper(Wrapper):
         """Advances by one step, then returns the finished worlds.
 
         Raises:
-            TypeError: The state or the action is of another type.
-            ValueError: The state is of another environment, or the action of another
-                shape.
+            TypeError: The state or the action has the wrong type.
+            ValueError: The state comes from another environment, or the action has the
+                wrong shape.
         """
         require_state(state, "first_obs")
         begins = state.done > 0

@@ -56,9 +56,9 @@ class ClipRewardWrapper(Wrapper):
         """Advances by one step.
 
         Raises:
-            TypeError: The state or the action is of another type.
-            ValueError: The state is of another environment, or the action of another
-                shape.
+            TypeError: The state or the action has the wrong type.
+            ValueError: The state comes from another environment, or the action has the
+                wrong shape.
         """
         return self._clipped(self.env.step(state, action, params))
 

@@ -61,7 +61,7 @@ class CompletedEvalWrapper(Wrapper):
         """Advances by one step; an episode that ends is added to the completed.
 
         Raises:
-            TypeError: The state or the action is of another type.
+            TypeError: The state or the action has the wrong type.
             ValueError: The state has no sums of this wrapper, or the action has another
                 shape.
         """

@@ -19,7 +19,7 @@ from newton_qd.wrappers.base import Wrapper
 
 
 class DescriptorWrapper(Wrapper, QDEnv):
-    """Writes ``info["state_descriptor"]``; the base class for descriptors of one's own.
+    """Writes ``info["state_descriptor"]``; the base class for your own descriptors.
 
     A subclass overrides ``describe`` and ``limits``, and where it wants to
     ``descriptor_extractor``.
@@ -36,7 +36,7 @@ class DescriptorWrapper(Wrapper, QDEnv):
 
         Args:
             env: The environment.
-            env_name: Its name, for errors.
+            env_name: Its name, used in errors.
 
         Raises:
             ValueError: The class has no ``limits``, or they are not of one length with
@@ -73,7 +73,7 @@ class DescriptorWrapper(Wrapper, QDEnv):
         """Advances by one step.
 
         Raises:
-            TypeError: The state or the action is of another type.
+            TypeError: The state or the action has the wrong type.
             ValueError: The state or the action is of another environment.
         """
         return self._described(self.env.step(state, action, params))

@@ -59,9 +59,9 @@ class EpisodeWrapper(Wrapper):
         """Repeats the action; the rewards are summed, the rest is of the last.
 
         Raises:
-            TypeError: The state or the action is of another type.
-            ValueError: The state is of another environment, or the action of another
-                shape.
+            TypeError: The state or the action has the wrong type.
+            ValueError: The state comes from another environment, or the action has the
+                wrong shape.
         """
         require_state(state, "steps")
         nstate, steps = state, state.info["steps"]

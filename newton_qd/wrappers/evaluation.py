@@ -54,7 +54,7 @@ class EvalWrapper(Wrapper):
         """Advances by one step and adds its metrics while the episode lasts.
 
         Raises:
-            TypeError: The state or the action is of another type.
+            TypeError: The state or the action has the wrong type.
             ValueError: The state has no sums of this wrapper, or the action has another
                 shape.
         """

@@ -36,7 +36,7 @@ class FeetContactWrapper(DescriptorWrapper):
 
         Args:
             env: The environment.
-            env_name: Its name, for the error.
+            env_name: Its name, used in errors.
             smooth_width: ``None``: 0 or 1 without a gradient; else between them,
                 rising over this share of the robot's weight, above 0.
             straight_through: Whether the reading stays 0 or 1 and has the gradient

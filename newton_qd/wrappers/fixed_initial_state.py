@@ -26,7 +26,7 @@ class FixedInitialStateWrapper(Wrapper):
 
         Args:
             env: The environment, with or without wrappers; it is not changed.
-            base_env_name: Its name, for the error.
+            base_env_name: Its name, used in errors.
             get_obs_fn: Only that of ``newton_qd.brax_views`` takes one.
 
         Raises:

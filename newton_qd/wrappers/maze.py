@@ -31,7 +31,7 @@ class MazeWrapper(SceneTaskWrapper):
 
         Args:
             env: The environment, with or without wrappers.
-            env_name: Its name, for the error.
+            env_name: Its name, used in errors.
 
         Raises:
             NotImplementedError: The environment is no such robot.

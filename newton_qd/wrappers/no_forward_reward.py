@@ -18,7 +18,7 @@ class NoForwardRewardWrapper(Wrapper):
         Args:
             env: The environment; its class gives ``forward_reward_name``. Where it
                 repeats actions, this wrapper goes inside the ``EpisodeWrapper``.
-            env_name: Its name, for the error.
+            env_name: Its name, used in errors.
 
         Raises:
             NotImplementedError: The reward has no forward part.
@@ -47,9 +47,9 @@ class NoForwardRewardWrapper(Wrapper):
         """Advances by one step.
 
         Raises:
-            TypeError: The state or the action is of another type.
-            ValueError: The state is of another environment, or the action of another
-                shape.
+            TypeError: The state or the action has the wrong type.
+            ValueError: The state comes from another environment, or the action has the
+                wrong shape.
         """
         state = self.env.step(state, action, params)
         forward = state.metrics[self._forward_reward]

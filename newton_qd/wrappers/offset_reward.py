@@ -39,9 +39,9 @@ class OffsetRewardWrapper(Wrapper):
         """Advances by one step.
 
         Raises:
-            TypeError: The state or the action is of another type.
-            ValueError: The state is of another environment, or the action of another
-                shape.
+            TypeError: The state or the action has the wrong type.
+            ValueError: The state comes from another environment, or the action has the
+                wrong shape.
         """
         return self._shifted(self.env.step(state, action, params))
 

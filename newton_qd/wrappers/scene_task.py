@@ -36,7 +36,7 @@ class SceneTaskWrapper(Wrapper):
 
         Args:
             env: The environment, with or without wrappers.
-            env_name: Its name, for the error.
+            env_name: Its name, used in errors.
 
         Raises:
             NotImplementedError: The environment is no such robot.
@@ -69,9 +69,9 @@ class SceneTaskWrapper(Wrapper):
         """Advances by one step.
 
         Raises:
-            TypeError: The state or the action is of another type.
-            ValueError: The state is of another environment, or the action of another
-                shape.
+            TypeError: The state or the action has the wrong type.
+            ValueError: The state comes from another environment, or the action has the
+                wrong shape.
         """
         return self._judged(self.env.step(state, action, params))
 

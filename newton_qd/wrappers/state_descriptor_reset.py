@@ -36,9 +36,9 @@ class StateDescriptorResetWrapper(QDWrapper):
         """Advances by one step, then returns the descriptors of finished worlds.
 
         Raises:
-            TypeError: The state or the action is of another type.
-            ValueError: The state is of another environment, or the action of another
-                shape.
+            TypeError: The state or the action has the wrong type.
+            ValueError: The state comes from another environment, or the action has the
+                wrong shape.
         """
         state = self.env.step(state, action, params)
         first = state.info["first_state_descriptor"]

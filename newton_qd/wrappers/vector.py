@@ -59,7 +59,7 @@ class VectorWrapper(Wrapper):
             params: As for the environment inside, with the batch axis in front.
 
         Raises:
-            TypeError: The state or the action is of another type.
+            TypeError: The state or the action has the wrong type.
             ValueError: State, action or parameters do not have the same batch axis in
                 front.
         """

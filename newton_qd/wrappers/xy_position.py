@@ -41,7 +41,7 @@ class XYPositionWrapper(DescriptorWrapper):
 
         Args:
             env: The environment.
-            env_name: Its name, for the error.
+            env_name: Its name, used in errors.
             minval: Lowest x and y of a state descriptor [m]; ``None``: no limit.
             maxval: Highest x and y, above ``minval`` [m]; ``None``: no limit.
 

@@ -70,7 +70,7 @@ def read_options(
         **defaults: Defaults that differ from those of the dataclass.
 
     Raises:
-        ConfigError: There is no option of this name, or its value is of another type
+        ConfigError: There is no option of this name, or its value has the wrong type
             than the field, not finite, negative, less than ``least`` or refused by
             the dataclass.
     """
@@ -101,7 +101,7 @@ def _fitting(name: str, value: Any, wanted: Any, least: int) -> Any:
     """Returns the value of an option in the type of its field.
 
     Raises:
-        ConfigError: It is of another type, or out of its range.
+        ConfigError: It has the wrong type, or out of its range.
         TypeError: The dataclass has a field of a type that no option can have.
     """
     name = f"options: {name}"
