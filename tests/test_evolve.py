@@ -18,7 +18,7 @@ import pytest
 from point_runs import SMALL, PointEnv, compile_once, point_task, reference, run
 
 from newton_qd.qd.config import ConfigError
-from newton_qd.qd.run import search
+from newton_qd.qd.run import generation
 from newton_qd.qd.run.archive import load_archive
 from newton_qd.qd.run.evolution import evolve
 from newton_qd.qd.run.search import SearchError
@@ -206,7 +206,7 @@ def test_equal_individuals_of_a_cell_do_not_compete() -> None:
     descriptors = jnp.array([[0.1, 0.1], [0.9, 0.9], [0.1, 0.2], [0.2, 0.1]])
     fitnesses = jnp.array([1.0, 1.0, 1.0, 2.0])
     centroids = jnp.array([[0.2, 0.2], [0.8, 0.8]])
-    kept = search._break_ties(fitnesses, descriptors, centroids)
+    kept = generation._break_ties(fitnesses, descriptors, centroids)
     np.testing.assert_array_equal(kept, [1.0, 1.0, -np.inf, 2.0])
 
 

@@ -26,6 +26,7 @@ from qdax.core.containers.mapelites_repertoire import get_cells_indices
 from qdax.core.emitters.emitter import Emitter, EmitterState
 
 from newton_qd.qd.emitters.cma_es import CMAES, CMAESState
+from newton_qd.qd.emitters.ranking import best_of
 from newton_qd.qd.emitters.restarts import RestartRule
 from newton_qd.qd.scoring.gradient_scores import (
     GradientsError,
@@ -41,11 +42,6 @@ from newton_qd.types import (
     Repertoire,
     ScoringFunction,
 )
-
-# Ranks of offspring (pyribs' status); what failed comes last.
-NEW, IMPROVED, WORSE, FAILED = 2, 1, 0, -1
-# pyribs' limit for the spread of values in a batch.
-_FLAT = 1e-12
 
 
 class ArborescenceState(EmitterState):
@@ -369,16 +365,10 @@ class ArborescenceEmitter(Emitter, abc.ABC):
             The new distribution, whether any offspring would enter the archive, and
             whether all of them are equally good.
         """
-        classes, values = self._rank(fitnesses, bars)
-        classes = jnp.where(finite, classes, FAILED)
-        values = jnp.where(finite, values, 0)
-        best_first = jnp.lexsort((-values, -classes))
+        best_first, flat = best_of(*self._rank(fitnesses, bars), finite)
         # What failed pulls the distribution nowhere.
         pull = jnp.where(finite[:, None], coefficients, cma_es.mean)
         strategy = self._strategy(coefficients.shape[1] - 1)
-        flat = (jnp.max(classes) == jnp.min(classes)) & (
-            jnp.max(values) - jnp.min(values) < _FLAT
-        )
         improved = jnp.any(finite & (fitnesses > bars))
         return strategy.update(cma_es, pull[best_first]), improved, flat
 

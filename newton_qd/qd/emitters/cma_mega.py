@@ -5,12 +5,8 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from newton_qd.qd.emitters.arborescence import (
-    IMPROVED,
-    NEW,
-    WORSE,
-    ArborescenceEmitter,
-)
+from newton_qd.qd.emitters.arborescence import ArborescenceEmitter
+from newton_qd.qd.emitters.ranking import IMPROVED, NEW, WORSE
 from newton_qd.qd.emitters.restarts import RestartRule
 from newton_qd.types import Repertoire
 

@@ -19,6 +19,7 @@ from newton_qd.qd.run.archive import Archive
 from newton_qd.qd.run.cells import cell_centroids
 from newton_qd.qd.run.checkpoint import Checkpoint, CheckpointError
 from newton_qd.qd.run.folder import COLUMNS
+from newton_qd.qd.run.generation import Generation
 from newton_qd.qd.run.reevaluation import Reevaluated, reevaluate
 from newton_qd.qd.scoring.rollout import (
     make_policy,
@@ -27,8 +28,6 @@ from newton_qd.qd.scoring.rollout import (
 from newton_qd.qd.scoring.sharding import on_mesh, shard_scoring
 from newton_qd.qd.scoring.task import Task
 from newton_qd.types import (
-    ExtraScores,
-    Genotype,
     PyTree,
     Repertoire,
     ScoringFunction,
@@ -92,12 +91,11 @@ class Search:
         key_centroids, self._key_reset = keys[0], keys[1]
         self._key_initial, self._key_generations = keys[2], keys[3]
         self._key_reevaluations = jax.random.fold_in(self._key_reset, 1)
-        self._key_emitter = jax.random.fold_in(self._key_generations, 0)
         self._policy = make_policy(task.env, config.hidden)
         self._centroids = cell_centroids(config, task.limits, key_centroids)
         with refused_options():
             score = self._scoring()
-            self._emitter = self._algorithm.make(
+            emitter = self._algorithm.make(
                 EmitterContext(
                     config,
                     task,
@@ -108,11 +106,17 @@ class Search:
                 ),
                 self.options,
             )
+        self._generation = Generation(
+            emitter,
+            jax.random.fold_in(self._key_generations, 0),
+            self._algorithm.takes_faulty,
+            task.reward_offset * config.episode_length,
+        )
         learns_on_mesh = self._algorithm.evaluates
         self._score = self._compiled(score)
-        self._ask = jax.jit(self._proposed)
-        self._begin = self._compiled(self._begun, learns_on_mesh)
-        self._tell = self._compiled(self._told, learns_on_mesh)
+        self._ask = jax.jit(self._generation.propose)
+        self._begin = self._compiled(self._generation.begin, learns_on_mesh)
+        self._tell = self._compiled(self._generation.tell, learns_on_mesh)
         self._population = jax.jit(jax.vmap(self._initial))
 
     def empty(self) -> SearchState:
@@ -188,7 +192,7 @@ class Search:
             self._compiled(self._plain_scoring()),
             self._key_reevaluations,
             reevaluations=self._config.reevaluations,
-            offset=self._task.reward_offset * self._config.episode_length,
+            offset=self._generation.offset,
             stop=stop,
         )
 
@@ -226,7 +230,9 @@ class Search:
         score = self._scoring()
         scores = jax.eval_shape(score, genotypes, self._key_reset)
         repertoire = self.empty().repertoire
-        example = jax.eval_shape(self._begun, repertoire, genotypes, scores)[1]
+        example = jax.eval_shape(self._generation.begin, repertoire, genotypes, scores)[
+            1
+        ]
         expected, structure = jax.tree.flatten(example)
         if len(leaves) != len(expected):
             raise CheckpointError(
@@ -277,67 +283,6 @@ class Search:
             return jax.jit(function)
         return on_mesh(function, self._mesh)
 
-    def _proposed(
-        self, repertoire: Repertoire, emitter: PyTree, key: jax.Array
-    ) -> PyTree:
-        """Next genotypes (N, size), and what the emitter wants told with them."""
-        _, key = jax.random.split(key)
-        genotypes, remembered = self._emitter.emit(repertoire, emitter, key)
-        # Under x64 QDax draws its noise in double precision.
-        return genotypes.astype(jnp.float32), remembered
-
-    def _begun(
-        self, repertoire: Repertoire, genotypes: Genotype, scores: PyTree
-    ) -> PyTree:
-        """Archive, emitter's state and metrics after the initial population."""
-        repertoire, told = self._added(repertoire, genotypes, scores)
-        emitter = self._emitter.init(key=self._key_emitter, **told)
-        return repertoire, _strongly_typed(emitter), self._measured(repertoire, scores)
-
-    def _told(
-        self,
-        repertoire: Repertoire,
-        emitter: PyTree,
-        genotypes: Genotype,
-        remembered: ExtraScores,
-        scores: PyTree,
-    ) -> PyTree:
-        """Archive, emitter's state and metrics after another generation."""
-        repertoire, told = self._added(repertoire, genotypes, scores)
-        told["extra_scores"] = {**told["extra_scores"], **remembered}
-        emitter = self._emitter.state_update(emitter, **told)
-        metrics = self._measured(repertoire, scores)
-        metrics["rejected"] += jnp.sum(remembered.get("overflowed", 0))
-        return repertoire, emitter, metrics
-
-    def _added(
-        self, repertoire: Repertoire, genotypes: Genotype, scores: PyTree
-    ) -> tuple[Any, dict]:
-        """The archive with a generation in it, and what the emitter hears of that."""
-        fitnesses, found, extra = scores
-        kept = _break_ties(fitnesses, found, repertoire.centroids)
-        repertoire = repertoire.add(genotypes, found, kept, {})
-        if not self._algorithm.takes_faulty:
-            worst = -self._task.reward_offset * self._config.episode_length
-            fitnesses = jnp.where(jnp.isfinite(fitnesses), fitnesses, worst)
-        return repertoire, {
-            "repertoire": repertoire,
-            "genotypes": genotypes,
-            "fitnesses": fitnesses,
-            "descriptors": found,
-            "extra_scores": extra,
-        }
-
-    def _measured(self, repertoire: Repertoire, scores: PyTree) -> PyTree:
-        """QD score, coverage [%], best fitness and individuals that were rejected."""
-        from qdax.utils.metrics import default_qd_metrics
-
-        offset = self._task.reward_offset * self._config.episode_length
-        fitnesses, found, _ = scores
-        finite = jnp.isfinite(fitnesses) & jnp.all(jnp.isfinite(found), axis=1)
-        metrics = default_qd_metrics(repertoire, qd_offset=offset)
-        return {**metrics, "rejected": jnp.sum(~finite)}
-
 
 def _runnable(config: EvolveConfig) -> AlgorithmSpec[Any]:
     """Returns the algorithm of a run.
@@ -359,18 +304,6 @@ def _runnable(config: EvolveConfig) -> AlgorithmSpec[Any]:
     return spec
 
 
-def _strongly_typed(tree: PyTree) -> PyTree:
-    """Takes weak types off; those of the next generation differ, and compile again."""
-
-    def strong(leaf: Any) -> jax.Array:
-        leaf = jnp.asarray(leaf)
-        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
-            return leaf
-        return jax.lax.convert_element_type(leaf, leaf.dtype)
-
-    return jax.tree.map(strong, tree)
-
-
 def _leaf_to_host(leaf: Any) -> np.ndarray:
     """Copies a leaf; a key becomes its numbers."""
     if jnp.issubdtype(jnp.asarray(leaf).dtype, jax.dtypes.prng_key):
@@ -383,30 +316,3 @@ def _leaf_to_device(leaf: np.ndarray, like: Any) -> jax.Array:
     if jnp.issubdtype(like.dtype, jax.dtypes.prng_key):
         return jax.random.wrap_key_data(jnp.asarray(leaf))
     return jnp.asarray(leaf, like.dtype)
-
-
-def _break_ties(
-    fitnesses: jax.Array, descriptors: jax.Array, centroids: jax.Array
-) -> jax.Array:
-    """Keeps the first of several equally fit individuals of one cell.
-
-    QDax would write all of them to the same row of the archive, in an order that XLA
-    leaves open on a GPU.
-
-    Args:
-        fitnesses: (N,) returns.
-        descriptors: (N, D) descriptors.
-        centroids: (cells, D) centres of the cells.
-
-    Returns:
-        (N,) returns, ``-inf`` for the later ones.
-    """
-    from qdax.core.containers.mapelites_repertoire import get_cells_indices
-
-    cells = get_cells_indices(descriptors, centroids)
-    order = jnp.lexsort((fitnesses, cells))
-    same = (cells[order][1:] == cells[order][:-1]) & (
-        fitnesses[order][1:] == fitnesses[order][:-1]
-    )
-    later = jnp.concatenate([jnp.zeros((1,), bool), same])
-    return jnp.where(jnp.zeros_like(later).at[order].set(later), -jnp.inf, fitnesses)

@@ -1,0 +1,127 @@
+"""One generation as pure functions: what becomes of an archive and an emitter."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from newton_qd.types import ExtraScores, Genotype, PyTree, Repertoire
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Generation:
+    """A generation of one algorithm, around the evaluation of its individuals.
+
+    Attributes:
+        emitter: Emitter of QDax.
+        key: Key of the emitter's first state.
+        takes_faulty: Whether the emitter is told the fitness ``-inf`` of a faulty
+            individual; if not, it is told the worst finite one.
+        offset: Number that makes returns positive.
+    """
+
+    emitter: Any
+    key: jax.Array
+    takes_faulty: bool
+    offset: float
+
+    def propose(
+        self, repertoire: Repertoire, emitter: PyTree, key: jax.Array
+    ) -> PyTree:
+        """Next genotypes (N, size), and what the emitter wants told with them."""
+        _, key = jax.random.split(key)
+        genotypes, remembered = self.emitter.emit(repertoire, emitter, key)
+        # Under x64 QDax draws its noise in double precision.
+        return genotypes.astype(jnp.float32), remembered
+
+    def begin(
+        self, repertoire: Repertoire, genotypes: Genotype, scores: PyTree
+    ) -> PyTree:
+        """Archive, emitter's state and metrics after the initial population."""
+        repertoire, told = self._added(repertoire, genotypes, scores)
+        emitter = self.emitter.init(key=self.key, **told)
+        return repertoire, _strongly_typed(emitter), self._measured(repertoire, scores)
+
+    def tell(
+        self,
+        repertoire: Repertoire,
+        emitter: PyTree,
+        genotypes: Genotype,
+        remembered: ExtraScores,
+        scores: PyTree,
+    ) -> PyTree:
+        """Archive, emitter's state and metrics after another generation."""
+        repertoire, told = self._added(repertoire, genotypes, scores)
+        told["extra_scores"] = {**told["extra_scores"], **remembered}
+        emitter = self.emitter.state_update(emitter, **told)
+        metrics = self._measured(repertoire, scores)
+        metrics["rejected"] += jnp.sum(remembered.get("overflowed", 0))
+        return repertoire, emitter, metrics
+
+    def _added(
+        self, repertoire: Repertoire, genotypes: Genotype, scores: PyTree
+    ) -> tuple[Any, dict]:
+        """The archive with a generation in it, and what the emitter hears of that."""
+        fitnesses, found, extra = scores
+        kept = _break_ties(fitnesses, found, repertoire.centroids)
+        repertoire = repertoire.add(genotypes, found, kept, {})
+        if not self.takes_faulty:
+            fitnesses = jnp.where(jnp.isfinite(fitnesses), fitnesses, -self.offset)
+        return repertoire, {
+            "repertoire": repertoire,
+            "genotypes": genotypes,
+            "fitnesses": fitnesses,
+            "descriptors": found,
+            "extra_scores": extra,
+        }
+
+    def _measured(self, repertoire: Repertoire, scores: PyTree) -> PyTree:
+        """QD score, coverage [%], best fitness and individuals that were rejected."""
+        from qdax.utils.metrics import default_qd_metrics
+
+        fitnesses, found, _ = scores
+        finite = jnp.isfinite(fitnesses) & jnp.all(jnp.isfinite(found), axis=1)
+        metrics = default_qd_metrics(repertoire, qd_offset=self.offset)
+        return {**metrics, "rejected": jnp.sum(~finite)}
+
+
+def _strongly_typed(tree: PyTree) -> PyTree:
+    """Takes weak types off; those of the next generation differ, and compile again."""
+
+    def strong(leaf: Any) -> jax.Array:
+        leaf = jnp.asarray(leaf)
+        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            return leaf
+        return jax.lax.convert_element_type(leaf, leaf.dtype)
+
+    return jax.tree.map(strong, tree)
+
+
+def _break_ties(
+    fitnesses: jax.Array, descriptors: jax.Array, centroids: jax.Array
+) -> jax.Array:
+    """Keeps the first of several equally fit individuals of one cell.
+
+    QDax would write all of them to the same row of the archive, in an order that XLA
+    leaves open on a GPU.
+
+    Args:
+        fitnesses: (N,) returns.
+        descriptors: (N, D) descriptors.
+        centroids: (cells, D) centres of the cells.
+
+    Returns:
+        (N,) returns, ``-inf`` for the later ones.
+    """
+    from qdax.core.containers.mapelites_repertoire import get_cells_indices
+
+    cells = get_cells_indices(descriptors, centroids)
+    order = jnp.lexsort((fitnesses, cells))
+    same = (cells[order][1:] == cells[order][:-1]) & (
+        fitnesses[order][1:] == fitnesses[order][:-1]
+    )
+    later = jnp.concatenate([jnp.zeros((1,), bool), same])
+    return jnp.where(jnp.zeros_like(later).at[order].set(later), -jnp.inf, fitnesses)
