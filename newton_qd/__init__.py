@@ -2,21 +2,22 @@
 
 The facade:
 
-- ``create(name, ...)``, ``create_fn(name, ...)``: an environment by its name
-- ``registered_envs()``, ``register(name, base, ...)``: the names; a new one
-- ``Env``, ``State``: what ``create`` returns; what ``reset`` and ``step`` return
-- ``check(state)``: raises ``FaultError`` where a world was frozen
-- ``Episode(env, policy, ...)``: an episode and its gradients; ``newton_qd.gradients``
-  has the rest of what belongs to these
-- ``diagnose_gradients(env)``: over how many steps gradients can be used, and why
-- ``PhysicsParams``, ``randomize_params``: physical parameters of each world, which
-  ``step`` takes and ``env.default_params`` has; drawn at random
+- ``create(name, ...)``, ``create_fn(name, ...)``: build an environment by its name
+- ``registered_envs()``, ``register(name, base, ...)``: list the names; add a name
+- ``Env``, ``State``: result of ``create``; result of ``reset`` and ``step``
+- ``check(state)``: raises ``FaultError`` if a world was frozen
+- ``Episode(env, policy, ...)``: an episode and its gradients; more about gradients is
+  in ``newton_qd.gradients``
+- ``diagnose_gradients(env)``: the number of steps for which gradients are useful
+- ``PhysicsParams``: physical parameters of each world, an argument of ``step``;
+  ``env.default_params`` has the default values
+- ``randomize_params``: physical parameters drawn at random
 - ``NewtonQDSolver``: the same physics as a solver of Newton
 
-Beside it, ``newton_qd.authoring`` has all that an environment of one's own needs, and
+``newton_qd.authoring`` has everything that you need for your own environment.
 ``newton_qd.tables`` has tables by the name of an environment.
 
-Importing the package imports none of its parts: each name is loaded when it is
+Importing the package imports no other module of it. Each name is loaded when it is
 first used.
 """
 

@@ -24,7 +24,7 @@ def urdf_directory() -> Path:
     checkout = _PACKAGE.parent / "urdf"
     if installed.is_dir():
         return installed
-    # Beside an installed package, a folder of this name is somebody else's.
+    # Beside an installed package, a folder of this name belongs to another project.
     if checkout.is_dir() and (_PACKAGE.parent / "pyproject.toml").is_file():
         return checkout
     raise AssetNotFoundError(
@@ -37,11 +37,11 @@ def find_urdf(name: str | os.PathLike[str]) -> Path:
     """Returns the path of a URDF file.
 
     Args:
-        name: File name inside the suite's ``urdf/``; or a path, which is what a
-            name with a folder in it (``"./mine.urdf"``) and a path object are.
+        name: File name inside the suite's ``urdf/``, or a path. A path object is a
+            path, and so is text with a folder in it, such as ``"./mine.urdf"``.
 
     Raises:
-        AssetNotFoundError: There is no such file.
+        AssetNotFoundError: The file does not exist.
     """
     text = os.fspath(name)
     separators = [os.sep] + ([os.altsep] if os.altsep else [])

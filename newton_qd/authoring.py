@@ -1,21 +1,21 @@
-"""Everything for an environment of one's own, in one import.
+"""Everything that you need for your own environment, in one import.
 
     import newton_qd.authoring as nq
 
 - ``PhysicsEnv``: the base class; ``Locomotion``: running forward, for any robot
-- ``RobotSpec``, ``Contact``, ``Material``: what a robot's URDF file does not say
+- ``RobotSpec``, ``Contact``, ``Material``: data of a robot beside its URDF file
 - ``Scene``: obstacles from a URDF file
 - ``DescriptorWrapper``: the base class for descriptors; ``FeetContactWrapper`` and
-  ``XYPositionWrapper``: those of the suite; ``Wrapper``: any other change
+  ``XYPositionWrapper``: descriptors of the suite; ``Wrapper``: any other change
 - ``WrapperSpec``: a wrapper with its options
 - ``get_feet_contact_proportion``, ``get_final_xy_position``,
   ``get_mean_state_descriptor``: descriptors of episodes
-- ``register``, ``create``: the name, and the environment
-- ``length``, ``ordered_sum``, ``wrapped``: arithmetic with finite gradients that does
-  not depend on the size of a batch
+- ``register``, ``create``: add an environment by name, and build it
+- ``length``, ``ordered_sum``, ``wrapped``: arithmetic with finite gradients and with
+  results that do not depend on the batch size
 - ``Env``, ``QDEnv``, ``State``, ``PhysicsState``, ``Kinematics``: the types
 
-``docs/own_environment.md`` shows how they go together.
+``docs/own_environment.md`` shows how to use them together.
 """
 
 from newton_qd.envs.base import Env, PhysicsEnv, QDEnv

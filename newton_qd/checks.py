@@ -1,8 +1,8 @@
-"""Checks of arguments, and the one grammar of errors: NAME: got VALUE; allowed: WHAT.
+"""Checks of arguments. All errors read NAME: got VALUE; allowed: WHAT.
 
-Every check returns ``None`` for a value that is allowed. It raises ``TypeError`` for a
-wrong type and ``ValueError`` for a wrong value, or ``error`` for both where a caller
-gives that class.
+A check returns ``None`` for an allowed value. It raises ``TypeError`` for a wrong type
+and ``ValueError`` for a wrong value. If a caller gives ``error``, the check raises that
+class for both.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Value = TypeVar("Value")
 
 
 class Fact(str):
-    """Words that stand for a value in an error, such as ``"3 entries"``."""
+    """Words in the place of a value in an error, such as ``"3 entries"``."""
 
     __slots__ = ()
     __repr__ = str.__str__
@@ -33,17 +33,17 @@ def message(name: str, value: Any, allowed: str, *, why: str = "") -> str:
     """Returns the text of an error about an argument.
 
     Args:
-        name: What is wrong, as the caller knows it: an argument, or a part of one.
-        value: What was given, or a :class:`Fact` that describes it.
-        allowed: What may be given.
-        why: What is wrong with the value, where ``allowed`` does not say it.
+        name: Name of the argument, or of a part of it, that the caller knows.
+        value: The wrong value, or a :class:`Fact` that describes it.
+        allowed: Description of the allowed values.
+        why: The reason why the value is wrong, if ``allowed`` is not enough.
     """
     got = f"{shown(value)}, {why}" if why else shown(value)
     return f"{name}: got {got}; allowed: {allowed}"
 
 
 def shown(value: Any) -> str:
-    """Returns a value as an error shows it: an array by its shape, long text cut."""
+    """Returns the text of a value in errors: the shape of an array, long text cut."""
     if isinstance(value, Fact):
         return value
     if is_array(value):
@@ -57,19 +57,19 @@ def shown(value: Any) -> str:
 
 
 def listed(names: Collection[Any], otherwise: str = "none") -> str:
-    """Returns names as an error lists them, or other words where there are none."""
+    """Returns the text of a list of names in errors; ``otherwise`` if it is empty."""
     return ", ".join(str(name) for name in names) or otherwise
 
 
 def is_array(value: Any) -> bool:
-    """Returns whether a value is an array of NumPy or JAX, traced ones included."""
+    """Returns whether a value is an array of NumPy or JAX, traced or not."""
     if isinstance(value, (type, np.generic)):
         return False
     return hasattr(value, "shape") and hasattr(value, "dtype")
 
 
 def is_number(value: object) -> TypeGuard[float]:
-    """Returns whether a value is a real number; ``True`` and ``False`` are none."""
+    """Returns whether a value is a real number; ``True`` and ``False`` are not."""
     return isinstance(value, numbers.Real) and not isinstance(value, bool)
 
 
@@ -90,22 +90,22 @@ def number(
     optional: bool = False,
     error: Error | None = None,
 ) -> None:
-    """Refuses what is not a real number within bounds.
+    """Checks that a value is a real number within bounds.
 
     Args:
         name: Name of the argument.
-        value: What was given.
-        least: Smallest number that is allowed.
-        above: Bound that is not allowed itself.
-        most: Largest number that is allowed.
-        below: Bound that is not allowed itself.
-        endless: Whether it may be infinite.
-        optional: Whether it may be ``None``.
+        value: Value of the argument.
+        least: Smallest allowed number.
+        above: Lower bound; the bound itself is not allowed.
+        most: Largest allowed number.
+        below: Upper bound; the bound itself is not allowed.
+        endless: Whether infinite numbers are allowed.
+        optional: Whether ``None`` is allowed.
         error: Class to raise instead of both.
 
     Raises:
-        TypeError: It is no number.
-        ValueError: It is NaN, infinite or out of bounds.
+        TypeError: The value is not a number.
+        ValueError: The value is NaN, infinite or out of bounds.
     """
     if optional and value is None:
         return
@@ -136,20 +136,21 @@ def integer(
     optional: bool = False,
     error: Error = ValueError,
 ) -> None:
-    """Refuses what is not an integer within bounds.
+    """Checks that a value is an integer within bounds.
 
-    ``2.0`` and ``"2"`` are wrong values as ``0`` is, so all raise the same.
+    ``2.0``, ``"2"`` and ``0`` are all wrong values and raise the same class.
 
     Args:
         name: Name of the argument.
-        value: What was given.
-        least: Smallest integer that is allowed; ``None``: no bound.
-        most: Largest; by default what JAX counts with. ``None``: no bound.
-        optional: Whether it may be ``None``.
+        value: Value of the argument.
+        least: Smallest allowed integer; ``None``: no bound.
+        most: Largest allowed integer; by default the largest index of JAX. ``None``: no
+            bound.
+        optional: Whether ``None`` is allowed.
         error: Class to raise.
 
     Raises:
-        ValueError: It is no integer, or out of bounds.
+        ValueError: The value is not an integer, or is out of bounds.
     """
     if optional and value is None:
         return
@@ -171,11 +172,11 @@ def integers(
     most: int | None = _MOST,
     error: Error | None = None,
 ) -> None:
-    """Refuses what is not a tuple or list of integers within bounds.
+    """Checks that a value is a tuple or list of integers within bounds.
 
     Raises:
-        TypeError: It is no tuple and no list.
-        ValueError: An entry is no integer, or out of bounds.
+        TypeError: The value is neither a tuple nor a list.
+        ValueError: An entry is not an integer, or is out of bounds.
     """
     instance(name, values, (tuple, list), "a tuple of integers", error=error)
     for index, value in enumerate(values):
@@ -189,10 +190,10 @@ def integers(
 
 
 def interval(name: str, value: Any, *, error: Error | None = None) -> None:
-    """Refuses what is not two numbers, the lowest below the highest.
+    """Checks that a value is two numbers, the first below the second.
 
     Raises:
-        TypeError: They are not two, or no numbers.
+        TypeError: The value is not two numbers.
         ValueError: The first is not below the second.
     """
     pair = isinstance(value, (tuple, list, np.ndarray)) and len(value) == 2
@@ -204,10 +205,10 @@ def interval(name: str, value: Any, *, error: Error | None = None) -> None:
 
 
 def flag(name: str, value: Any, *, error: Error = TypeError) -> None:
-    """Refuses what is neither ``True`` nor ``False``, nor 1 or 0.
+    """Checks that a value is ``True``, ``False``, 1 or 0.
 
     Raises:
-        TypeError: It is something else.
+        TypeError: The value is none of these.
     """
     if not isinstance(value, (bool, np.bool_, int, np.integer)) or value not in (0, 1):
         raise error(message(name, value, "True, False"))
@@ -216,10 +217,10 @@ def flag(name: str, value: Any, *, error: Error = TypeError) -> None:
 def text(
     name: str, value: Any, *, optional: bool = False, error: Error = ValueError
 ) -> None:
-    """Refuses what is not text, or is empty.
+    """Checks that a value is text and not empty.
 
     Raises:
-        ValueError: It is something else, or empty.
+        ValueError: The value is not text, or is empty.
     """
     if not (optional and value is None) and not (isinstance(value, str) and value):
         raise error(message(name, value, f"{_none(optional)}text that is not empty"))
@@ -228,10 +229,10 @@ def text(
 def choice(
     name: str, value: Any, allowed: Collection[Any], *, error: Error = ValueError
 ) -> None:
-    """Refuses what is not one of some values.
+    """Checks that a value is one of the allowed values.
 
     Raises:
-        ValueError: It is something else.
+        ValueError: The value is not allowed.
     """
     if is_array(value) or value not in allowed:
         raise error(message(name, value, listed(allowed)))
@@ -246,35 +247,35 @@ def instance(
     optional: bool = False,
     error: Error | None = None,
 ) -> None:
-    """Refuses what is not of a class.
+    """Checks that a value is an instance of a class.
 
     Args:
         name: Name of the argument.
-        value: What was given.
-        kinds: Classes that are allowed.
-        allowed: They in words.
-        optional: Whether it may be ``None``.
+        value: Value of the argument.
+        kinds: Allowed classes.
+        allowed: Description of these classes.
+        optional: Whether ``None`` is allowed.
         error: Class to raise instead.
 
     Raises:
-        TypeError: It is of another class.
+        TypeError: The value is an instance of another class.
     """
     if not (optional and value is None) and not isinstance(value, kinds):
         raise (error or TypeError)(message(name, value, _none(optional) + allowed))
 
 
 def function(name: str, value: Any, allowed: str, *, optional: bool = False) -> None:
-    """Refuses what cannot be called.
+    """Checks that a value can be called.
 
     Raises:
-        TypeError: It cannot.
+        TypeError: The value cannot be called.
     """
     if not (optional and value is None) and not callable(value):
         raise TypeError(message(name, value, _none(optional) + allowed))
 
 
 def environment(value: Any, *, needs: str = "step") -> None:
-    """Refuses an ``env`` that is no environment, known by one of its attributes.
+    """Checks that ``env`` is an environment: it must have the attribute ``needs``.
 
     Raises:
         TypeError: It has no such attribute.
@@ -284,11 +285,10 @@ def environment(value: Any, *, needs: str = "step") -> None:
 
 
 def precision(dtype: Any) -> np.dtype:
-    """Returns the type that a simulation computes in.
+    """Returns the dtype of a simulation.
 
     Raises:
-        ValueError: It is neither float32 nor float64, or is float64 while JAX would
-            round it to float32.
+        ValueError: It is not float32 or float64, or it is float64 and JAX x64 is off.
     """
     try:
         found = np.dtype(dtype)
@@ -301,10 +301,10 @@ def precision(dtype: Any) -> np.dtype:
 
 
 def x64(dtype: np.dtype) -> None:
-    """Refuses float64 where JAX would round it to float32 without an error.
+    """Checks that JAX would not silently round float64 to float32.
 
     Raises:
-        ValueError: ``dtype`` is float64 and JAX's 64-bit mode is off.
+        ValueError: ``dtype`` is float64 and JAX x64 is off.
     """
     import jax
 
@@ -326,18 +326,18 @@ def array(
     *,
     scalars: bool = False,
 ) -> Value:
-    """Returns an array, strongly typed, or refuses it.
+    """Checks shape and dtype of an array, and returns it strongly typed.
 
     Args:
         name: Name of the argument.
-        value: What was given.
-        shape: Shape that is allowed.
-        dtype: Type that is allowed; weakly typed numbers are converted to it.
+        value: Value of the argument.
+        shape: Allowed shape.
+        dtype: Allowed dtype. Weakly typed numbers are converted to it.
         scalars: Whether Python's numbers and weakly typed integers are allowed.
 
     Raises:
-        TypeError: It is no array, or of another type.
-        ValueError: It has another shape.
+        TypeError: The value is not an array, or has the wrong dtype.
+        ValueError: The value has the wrong shape.
     """
     import jax
     import jax.numpy as jnp
@@ -362,7 +362,7 @@ def array(
 def _finite(value: float) -> bool:
     try:
         return math.isfinite(value)
-    except OverflowError:  # an integer beyond the floating-point numbers
+    except OverflowError:  # an integer above the largest floating-point number
         return False
 
 

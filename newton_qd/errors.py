@@ -9,8 +9,8 @@ class UnknownEnvironment(NotImplementedError):  # noqa: N818 - a name, not an ev
     """No environment of this name is registered.
 
     Attributes:
-        name: Name that was asked for.
-        known: Names that exist.
+        name: The unknown name.
+        known: The registered names.
     """
 
     def __init__(self, name: object, known: Sequence[str]) -> None:
@@ -26,7 +26,7 @@ class UnknownEnvironment(NotImplementedError):  # noqa: N818 - a name, not an ev
 
 
 class FaultError(FloatingPointError):
-    """A world met a value that is not finite, or diverged, and was frozen."""
+    """A world was frozen because a value was not finite or a speed was too high."""
 
 
 class MissingExtra(ImportError):  # noqa: N818 - likewise

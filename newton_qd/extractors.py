@@ -1,4 +1,4 @@
-"""Descriptors of whole episodes, read from batches of transitions."""
+"""Descriptors of whole episodes, computed from batches of transitions."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class Trajectories:
 def folded_sum(values: jax.Array, axis: int) -> jax.Array:
     """Sums by halving, in an order that does not depend on the other axes.
 
-    ``jnp.sum`` may add in another order when the batch has another size; this
-    sum is bitwise the same for a batch of 1 and for the same row of a larger one.
+    The order of ``jnp.sum`` may depend on the batch size. This sum is bitwise the same
+    for a batch of 1 and for the same row of a larger batch.
 
     Args:
         values: Array of any shape.
@@ -47,7 +47,7 @@ def folded_sum(values: jax.Array, axis: int) -> jax.Array:
 
 
 def get_final_xy_position(data: StateDescriptors, mask: Mask) -> Descriptor:
-    """Position before the last valid step of each episode.
+    """Returns the position before the last valid step of each episode.
 
     Args:
         data: Transitions with ``state_desc`` (n, t, nd), as QDax's ``QDTransition``:
@@ -62,7 +62,7 @@ def get_final_xy_position(data: StateDescriptors, mask: Mask) -> Descriptor:
 
 
 def get_feet_contact_proportion(data: StateDescriptors, mask: Mask) -> Descriptor:
-    """Proportion of the valid steps at which each foot touched the ground.
+    """Returns the share of the valid steps in which each foot touched the ground.
 
     Args:
         data: Transitions with ``state_desc`` (n, t, nd), as QDax's ``QDTransition``:
@@ -73,14 +73,14 @@ def get_feet_contact_proportion(data: StateDescriptors, mask: Mask) -> Descripto
         (n, nd) proportions [-].
     """
     valid = (1.0 - mask)[..., None].astype(data.state_desc.dtype)
-    # XLA would see that the number of steps is one for all components and multiply by
-    # its reciprocal, in some batches: 41 * (1 / 41) is not 1
+    # If all components had one number of steps, XLA would multiply by its reciprocal in
+    # some batches, and 41 * (1 / 41) is not 1.
     steps = folded_sum(jnp.broadcast_to(valid, data.state_desc.shape), 1)
     return folded_sum(data.state_desc * valid, 1) / jax.lax.optimization_barrier(steps)
 
 
 def get_mean_state_descriptor(data: StateDescriptors, mask: Mask) -> Descriptor:
-    """Mean of the state descriptors over the valid steps of each episode.
+    """Returns the mean state descriptor over the valid steps of each episode.
 
     Args:
         data: Transitions with ``state_desc`` (n, t, nd).
@@ -93,7 +93,7 @@ def get_mean_state_descriptor(data: StateDescriptors, mask: Mask) -> Descriptor:
 
 
 class Encoder(Protocol):
-    """A model with parameters outside of it, as a module of Flax."""
+    """A model that gets its parameters as an argument, such as a module of Flax."""
 
     def encode(self, observations: jax.Array) -> jax.Array:
         """Returns the encoding of observations."""
@@ -109,7 +109,7 @@ class Encoder(Protocol):
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, eq=False)
 class AuroraExtraInfo:
-    """What AURORA keeps besides a repertoire; a pytree.
+    """Data of AURORA beside a repertoire; a pytree.
 
     Attributes:
         model_params: Parameters of the model that reduces observations.
@@ -125,12 +125,12 @@ class AuroraExtraInfo:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, eq=False)
 class AuroraExtraInfoNormalization(AuroraExtraInfo):
-    """What AURORA keeps, with the normalization of observations.
+    """Data of AURORA, with the normalization of observations.
 
     Attributes:
         model_params: Parameters of the model that reduces observations.
-        mean_observations: Mean, of a shape that broadcasts to the observations.
-        std_observations: Standard deviation, likewise.
+        mean_observations: Mean; its shape broadcasts to that of the observations.
+        std_observations: Standard deviation; its shape broadcasts too.
     """
 
     mean_observations: jax.Array
@@ -143,7 +143,7 @@ class AuroraExtraInfoNormalization(AuroraExtraInfo):
         mean_observations: jax.Array,
         std_observations: jax.Array,
     ) -> Self:
-        """Returns the three together."""
+        """Returns an object with these three fields."""
         return cls(model_params, mean_observations, std_observations)
 
 
@@ -152,13 +152,13 @@ def get_aurora_encoding(
     aurora_extra_info: AuroraExtraInfoNormalization,
     model: Encoder,
 ) -> Descriptor:
-    """Descriptors learned from observations, by AURORA's model.
+    """Returns descriptors that AURORA's model computes from observations.
 
     Args:
-        observations: (n, t, no) observations, or what the model takes.
-        aurora_extra_info: Parameters and normalization. A standard deviation of 0
-            belongs to a component that never changes: it becomes its distance from
-            the mean, which is 0.
+        observations: (n, t, no) observations, or another input of the model.
+        aurora_extra_info: Parameters and normalization. A component with a standard
+            deviation of 0 never changes. It is not divided: its value is its distance
+            from the mean, which is 0.
         model: Flax module with a method ``encode``; static under ``jax.jit``.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Files that are either whole or absent."""
+"""Files that are either complete or absent."""
 
 from __future__ import annotations
 
@@ -8,31 +8,31 @@ from pathlib import Path
 
 
 def temporary_name(path: Path) -> Path:
-    """Name under which a file is written before it replaces ``path``."""
+    """Returns the name of the temporary file that later replaces ``path``."""
     return path.with_name(f".{path.name}.tmp")
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Writes a file so that a reader sees the old or the new one, never a part.
+    """Writes a file. A reader sees the old or the new content, never a part.
 
     Args:
         path: File to write or replace.
-        content: Everything that the file shall hold.
+        content: The complete content.
 
     Raises:
-        OSError: The disk is full, or the folder cannot be written to; the old file
-            is as it was.
+        OSError: The disk is full, or the folder is not writable. The old file did not
+            change.
     """
     temporary = temporary_name(path)
     try:
         with open(temporary, "wb") as file:
             file.write(content)
             file.flush()
-            # Without this a power cut after the rename can leave an empty file.
+            # Without this, a power failure after the rename can leave an empty file.
             os.fsync(file.fileno())
         os.replace(temporary, path)
     except OSError as error:
         with contextlib.suppress(OSError):
             temporary.unlink()
-        # The system's message, which does not always say for which file.
+        # The message of the system does not always name the file.
         raise OSError(error.errno, error.strerror, str(path)) from error

@@ -1,4 +1,4 @@
-"""Old names of a module: they keep working and say the new one."""
+"""Old names of a module: they still work, with a warning that tells the new name."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from typing import Any
 
 
 def moved_name(module: str, name: str, moved: Mapping[str, str]) -> Any:
-    """Returns what an old name of a module stands for now, for its ``__getattr__``.
+    """Returns the object with an old name, for the ``__getattr__`` of a module.
 
     Args:
         module: ``__name__`` of the module that had the name.
-        name: Name that was asked for.
+        name: The old name.
         moved: New dotted name, module first, of every old name.
 
     Returns:
-        The object, after a ``DeprecationWarning`` that says its new name.
+        The object, after a ``DeprecationWarning`` that tells the new name.
 
     Raises:
         AttributeError: The module never had the name.
@@ -25,7 +25,7 @@ def moved_name(module: str, name: str, moved: Mapping[str, str]) -> Any:
     if name not in moved:
         raise AttributeError(f"module {module!r} has no attribute {name!r}")
     home, _, new = moved[name].rpartition(".")
-    # frame 1 is this function, frame 2 is __getattr__, frame 3 is who asked
+    # frame 1 is this function, frame 2 is __getattr__, frame 3 is the caller
     warnings.warn(
         f"{module}.{name} is now {moved[name]}", DeprecationWarning, stacklevel=3
     )

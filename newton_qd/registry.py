@@ -1,4 +1,4 @@
-"""Environments by name: what builds them, and how to add one."""
+"""Environments by name: build them, and add new ones."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _MOVED = {
 
 
 def __getattr__(name: str) -> Any:
-    """Says where a name that was here has gone."""
+    """Returns a moved object by its old name."""
     return moved_name(__name__, name, _MOVED)
 
 
@@ -69,18 +69,18 @@ def register(
         wrappers: Wrappers, from the inside to the outside.
         descriptor: Wrapper that writes the state descriptor, outside of ``wrappers``:
             a class such as ``FeetContactWrapper``, or a ``WrapperSpec``.
-        descriptor_extractor: Reads the descriptor of an episode, for QD tasks;
-            ``None``: what the class ``descriptor`` says of itself, if there is one.
+        descriptor_extractor: Computes the descriptor of an episode, for QD tasks;
+            ``None``: the attribute of the class ``descriptor``, if there is one.
         reward_offset: Added to each step's reward to keep QD scores positive.
-        robot: Spec of the robot inside, given to ``base`` where it takes a ``robot``;
-            for ``FEET_NAMES`` and ``COG_NAMES``. ``None``: that of the suite called
-            ``base_name``, if there is one.
-        **options: Keyword arguments of ``base``, which ``create`` may replace.
+        robot: Spec of the robot inside. ``base`` gets it if it has an argument
+            ``robot``; ``FEET_NAMES`` and ``COG_NAMES`` use it. ``None``: the robot
+            ``base_name`` of the suite, if there is one.
+        **options: Keyword arguments of ``base``. ``create`` may replace them.
 
     Raises:
         TypeError: An argument has the wrong type, or ``base`` does not take an option.
-        ValueError: The name is taken, a name is not a name, or ``reward_offset`` is
-            not finite.
+        ValueError: The name is in use, a name is not text or is empty, or
+            ``reward_offset`` is not finite.
     """
     _check_names(env_name, base_name)
     checks.function("base", base, "a class or a function")
@@ -115,23 +115,23 @@ def _check_names(env_name: object, base_name: object) -> None:
     """Checks the names of ``register``.
 
     Raises:
-        ValueError: A name is none, or taken.
+        ValueError: A name is not text, is empty, or is in use.
     """
     checks.text("env_name", env_name)
     if env_name in tasks.ENVIRONMENTS:
         allowed = f"any name but {listed(registered_envs())}"
         raise ValueError(message("env_name", env_name, allowed, why="which is taken"))
-    # A spec is read by every table: one that is wrong would break them all.
+    # Every table reads every spec, so one wrong spec would break all tables.
     checks.text("base_name", base_name, optional=True)
 
 
 def _descriptor_specs(
     descriptor: WrapperSpec | Callable[..., Env] | None,
 ) -> tuple[WrapperSpec, ...]:
-    """Returns the wrapper that describes, if there is one.
+    """Returns the descriptor wrapper, if there is one.
 
     Raises:
-        TypeError: It is no wrapper.
+        TypeError: It is not a wrapper.
     """
     if descriptor is None:
         return ()
@@ -144,7 +144,7 @@ def _descriptor_specs(
 
 
 def _takes_robot(base: Callable[..., Env]) -> bool:
-    """Returns whether an environment is made from a robot that it is not given yet."""
+    """Returns whether ``base`` has an argument ``robot`` without a value."""
     parameter = inspect.signature(base).parameters.get("robot")
     return parameter is not None and parameter.default is parameter.empty
 
@@ -153,7 +153,7 @@ def _check_wrappers(wrappers: object) -> None:
     """Checks the ``wrappers`` of ``register``.
 
     Raises:
-        TypeError: They are not specs of wrappers.
+        TypeError: They are not a sequence of ``WrapperSpec``.
     """
     if not isinstance(wrappers, Sequence) or isinstance(wrappers, str):
         allowed = "a tuple or list of WrapperSpec, such as "
@@ -185,26 +185,26 @@ def create(
 
     Args:
         env_name: One of ``registered_envs()``.
-        episode_length: Control steps of an episode; ``None``: no end.
+        episode_length: Control steps of an episode; ``None``: no limit.
         action_repeat: Control steps for each action.
         auto_reset: Whether a finished world returns to its first state.
-        batch_size: Number of worlds of a reset; ``None`` or 0: one, without a
+        batch_size: Number of worlds of a reset; ``None`` or 0: one world, without a
             batch axis.
         eval_metrics: Whether ``info`` sums the metrics of episodes.
-        fixed_init_state: Whether a reset is free of noise.
-        qdax_wrappers_kwargs: Keyword arguments for each of the environment's own
-            wrappers, replacing those of the registry.
-        material: Softness of contacts and limits; ``None``: that of the robot's spec.
-        brax_views: Whether code for brax v1 finds ``state.qp`` and ``env.sys``.
-        **kwargs: To the environment inside, as ``dtype`` or ``ctrl_cost_weight``.
+        fixed_init_state: Whether a reset has no noise.
+        qdax_wrappers_kwargs: Keyword arguments for each wrapper of the environment's
+            spec. They replace the arguments in the spec.
+        material: Softness of contacts and limits; ``None``: as in the robot's spec.
+        brax_views: Whether to add ``state.qp`` and ``env.sys`` for code for brax v1.
+        **kwargs: Options of the environment inside, such as ``dtype``.
 
     Returns:
         The environment.
 
     Raises:
         UnknownEnvironment: ``env_name`` is not registered.
-        TypeError: A keyword argument is unknown.
-        ValueError: A value or a combination is not allowed.
+        TypeError: An argument has the wrong type, or a keyword argument is unknown.
+        ValueError: A value or a combination of values is not allowed.
     """
     spec = _spec(env_name)
     checks.flag("auto_reset", auto_reset)
@@ -240,7 +240,7 @@ def create(
 
 
 def create_fn(env_name: str, **kwargs: Any) -> Callable[..., Env]:
-    """Returns ``create`` with its arguments filled in; nothing is built yet."""
+    """Returns ``create`` with these arguments; does not build the environment yet."""
     return functools.partial(create, env_name, **kwargs)
 
 
@@ -248,7 +248,7 @@ def _spec(env_name: str) -> EnvironmentSpec:
     """Returns the spec of an environment.
 
     Raises:
-        UnknownEnvironment: There is none.
+        UnknownEnvironment: The name is not registered.
     """
     spec = tasks.ENVIRONMENTS.get(env_name) if isinstance(env_name, str) else None
     if spec is None:
@@ -265,7 +265,7 @@ def _base(
     """Returns the environment inside all wrappers.
 
     Raises:
-        TypeError: ``material`` is none, or the environment does not take an option.
+        TypeError: ``material`` is not a ``Material``, or an option is unknown.
     """
     allowed = "newton_qd.robots.Material"
     checks.instance("material", material, Material, allowed, optional=True)
@@ -280,7 +280,7 @@ def _require_keywords(
     """Checks the keyword arguments of the environment inside.
 
     Raises:
-        TypeError: It does not take one of them.
+        TypeError: One of them is unknown.
     """
     parameters = inspect.signature(base).parameters.values()
     if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
@@ -301,8 +301,8 @@ def _wrapper_options(
     """Returns the keyword arguments of each wrapper of a spec.
 
     Raises:
-        TypeError: They are no sequence of dictionaries.
-        ValueError: There are more or fewer than wrappers.
+        TypeError: They are not a sequence of dictionaries.
+        ValueError: Their number is not the number of wrappers.
     """
     if given is None:
         return [wrapper_spec.options for wrapper_spec in spec.wrappers]

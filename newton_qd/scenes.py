@@ -1,4 +1,4 @@
-"""Scenes as data: what stands on the ground beside the robot, one spec each."""
+"""Scenes as data: obstacles on the ground, one spec each."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ import dataclasses
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """Static obstacles, and which links of a robot collide with them.
+    """Static obstacles, and the links of a robot that collide with them.
 
     Attributes:
         name: Name of the scene.
         urdf: File name inside ``urdf/``, or a path: links that are fixed to the
             world, with capsules, spheres or boxes as colliders.
-        links: Links of the robot, all of whose colliders touch the obstacles;
-            ``None``: the links that touch the ground.
+        links: Links of the robot whose colliders all touch the obstacles; ``None``: the
+            links that touch the ground.
     """
 
     name: str

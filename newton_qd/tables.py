@@ -1,19 +1,19 @@
-"""Tables of what is known of the environments, by name; read-only, as in QDax.
+"""Read-only tables of properties of the environments by name, as in QDax.
 
 By the name of an environment:
 
-- ``descriptor_extractor``, and by its older name ``behavior_descriptor_extractor``:
-  what reads the descriptor of an episode
-- ``reward_offset``: what is added to the reward of each step to keep QD scores positive
-- ``original_reward_offset``: the same number of the original, on its physics
+- ``descriptor_extractor``, with the older name ``behavior_descriptor_extractor``:
+  function that computes the descriptor of an episode
+- ``reward_offset``: added to the reward of each step to keep QD scores positive
+- ``original_reward_offset``: reward offset of the original, with its physics
 
 By the name that wrappers receive:
 
 - ``FEET_NAMES``: links of the feet
 - ``COG_NAMES``: link of the torso
-- ``FORWARD_REWARD_NAMES``: metric that is the forward part of the reward
+- ``FORWARD_REWARD_NAMES``: metric with the forward part of the reward
 
-``newton_qd.register`` extends them.
+``newton_qd.register`` extends these tables.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """The environments as data: one spec for each name.
 
-To add one, add a spec; :func:`newton_qd.register` does so from outside.
+To add an environment to the suite, add a spec. Code outside of this package calls
+:func:`newton_qd.register`.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ _MOVED = {
 
 
 def __getattr__(name: str) -> Any:
-    """Says how a name that was here is called now."""
+    """Returns a renamed object by its old name."""
     return moved_name(__name__, name, _MOVED)
 
 
@@ -66,18 +67,18 @@ class WrapperSpec:
 
 @dataclasses.dataclass(frozen=True)
 class EnvironmentSpec:
-    """Everything about an environment that has a name.
+    """Everything that the suite stores about a named environment.
 
     Attributes:
         base: Makes the environment from the keyword arguments of ``create``.
         base_name: Name that wrappers receive.
-        wrappers: From the inside to the outside.
-        descriptor_extractor: Reads the descriptor of an episode, for QD tasks.
-        reward_offset: Added to each step's reward to keep QD scores positive; for the
-            tasks of the original measured by ``benchmarks/survey.py``.
-        original_reward_offset: That of the original, on its physics.
-        robot: Spec of the robot inside; ``None``: that of ``ROBOTS`` called
-            ``base_name``, if there is one.
+        wrappers: Wrappers, from the inside to the outside.
+        descriptor_extractor: Computes the descriptor of an episode, for QD tasks.
+        reward_offset: Added to each step's reward to keep QD scores positive. For the
+            tasks of the original, ``benchmarks/survey.py`` measured it.
+        original_reward_offset: Reward offset of the original, with its physics.
+        robot: Spec of the robot inside; ``None``: the entry ``base_name`` of
+            ``ROBOTS``, if there is one.
     """
 
     base: Callable[..., Env]
@@ -90,20 +91,20 @@ class EnvironmentSpec:
 
     @property
     def feet(self) -> tuple[str, ...] | None:
-        """Links of the robot's feet; ``None`` where it has none."""
+        """Links of the robot's feet; ``None`` if it has no feet."""
         robot = self._robot
         return robot.feet if robot is not None and robot.feet else None
 
     @property
     def torso(self) -> str | None:
-        """Link of the robot's torso; ``None`` where there is no robot."""
+        """Link of the robot's torso; ``None`` if there is no robot."""
         return None if self._robot is None else self._robot.torso
 
     @property
     def forward_reward(self) -> str | None:
-        """Metric that is the forward part of the reward; ``None``: there is none."""
+        """Metric with the forward part of the reward; ``None``: no forward part."""
         base: object = self.base
-        # a class with some of its arguments filled in is still that class
+        # a functools.partial of a class has the attributes of that class
         while isinstance(base, functools.partial):
             base = base.func
         return getattr(base, "forward_reward_name", None)
@@ -116,12 +117,12 @@ class EnvironmentSpec:
 def _uni(
     base: Callable[..., Env], base_name: str, offsets: tuple[float, float]
 ) -> EnvironmentSpec:
-    """Returns the task of running forward, described by the feet's contacts.
+    """Returns the task of running forward, with feet contact as the descriptor.
 
     Args:
         base: Makes the environment.
         base_name: Name that wrappers receive.
-        offsets: Reward offset, and that of the original.
+        offsets: Reward offset here, and in the original.
     """
     return EnvironmentSpec(
         base,
@@ -141,14 +142,14 @@ def _position(
     *wrappers: Callable[..., Env],
     robot: RobotSpec | None = None,
 ) -> EnvironmentSpec:
-    """Returns a task described by the last position within limits [m].
+    """Returns a task with the last position, within limits, as the descriptor [m].
 
     Args:
         base: Makes the environment.
         base_name: Name that wrappers receive.
-        offsets: Reward offset, and that of the original.
+        offsets: Reward offset here, and in the original.
         limits: Lowest and highest x and y.
-        *wrappers: Wrappers around the one that describes.
+        *wrappers: Wrappers around the descriptor wrapper.
         robot: Spec of the robot inside.
     """
     options = {"minval": limits[0], "maxval": limits[1]}

@@ -18,16 +18,16 @@ Info: TypeAlias = dict[str, Any]
 Params: TypeAlias = Any  # of simulated robots: physics.PhysicsParams
 
 PyTree: TypeAlias = Any
-"""Arrays in any nesting of dicts, tuples, lists and registered dataclasses."""
+"""Arrays in nested dicts, tuples, lists and registered dataclasses."""
 
 Genotype: TypeAlias = PyTree
-"""What a search changes: weights of a policy, or actions; N of them have N in front."""
+"""Variables of a search: weights of a policy, or actions. N genotypes: N in front."""
 
 Repertoire: TypeAlias = PyTree
 """An archive of QDax: genotypes, fitnesses, descriptors and centroids of cells."""
 
 ExtraScores: TypeAlias = dict[str, Any]
-"""What a scoring function returns besides fitness and descriptor, by name."""
+"""Further results of a scoring function, after fitness and descriptor, by name."""
 
 ScoringFunction: TypeAlias = Callable[
     [Genotype, RNGKey], tuple[jax.Array, Descriptor, ExtraScores]
@@ -61,7 +61,7 @@ class DescriptorExtractor(Protocol):
 
 
 class StateLike(Protocol):
-    """What an episode reads of a state: :class:`newton_qd.State`, or one's own."""
+    """The state of an episode: :class:`newton_qd.State`, or your own class."""
 
     @property
     def obs(self) -> Observation:
@@ -75,7 +75,7 @@ class StateLike(Protocol):
 
     @property
     def done(self) -> jax.Array:
-        """() 1 where the episode has ended, else 0."""
+        """() 1 if the episode has ended, else 0."""
         ...
 
     @property
@@ -85,9 +85,9 @@ class StateLike(Protocol):
 
 
 class Environment(Protocol):
-    """What an episode needs of an environment; :class:`newton_qd.Env` has it.
+    """The environment of an episode: :class:`newton_qd.Env`, or your own class.
 
-    ``step`` takes the physical parameters of the world, too, where there are any.
+    ``step`` may take the physical parameters of the world as a third argument.
     """
 
     @property
@@ -127,4 +127,4 @@ INFO_KEYS: Mapping[str, str] = types.MappingProxyType(
 """Every key that the environments and wrappers write into ``State.info``."""
 
 READINGS = ("state_descriptor", "xy_position")
-"""Keys of ``State.info`` that read the simulation and follow it at an auto-reset."""
+"""Keys of ``State.info`` that depend on the simulation; an auto-reset resets them."""

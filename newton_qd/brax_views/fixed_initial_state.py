@@ -1,4 +1,4 @@
-"""Resets without noise, with an observation of one's own."""
+"""Resets without noise, with an observation by a function."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ ObservationFunction = Callable[[QP, Info, jax.Array], jax.Array]
 
 
 class FixedInitialStateWrapper(fixed_initial_state.FixedInitialStateWrapper):
-    """Begins every episode in the default pose; its observation may be replaced.
+    """Begins every episode in the default pose, with an optional observation function.
 
-    This is the wrapper of the same name with the third argument of QDax's.
+    This is the wrapper of the same name with the third argument that QDax has.
     """
 
     def __init__(
@@ -35,14 +35,14 @@ class FixedInitialStateWrapper(fixed_initial_state.FixedInitialStateWrapper):
         Args:
             env: The environment, with or without wrappers; it is not changed.
             base_env_name: Its name, used in errors.
-            get_obs_fn: Makes the observation of a reset from ``(qp, info, action)``:
-                the bodies, what ``env.sys.info(qp)`` reports, and a zero action.
-                ``None``: that of the environment.
+            get_obs_fn: Computes the observation of a reset from ``(qp, info, action)``:
+                the bodies, the result of ``env.sys.info(qp)``, and a zero action.
+                ``None``: the observation of the environment.
 
         Raises:
-            TypeError: ``get_obs_fn`` is no function.
-            NotImplementedError: The environment has no ``fixed_state``, or no bodies
-                for ``get_obs_fn``.
+            TypeError: ``get_obs_fn`` is not a function.
+            NotImplementedError: The environment has no ``fixed_state``. Or
+                ``get_obs_fn`` is given and the environment has no bodies.
         """
         base = env.unwrapped
         allowed = "a function of (qp, info, action)"
@@ -62,7 +62,7 @@ class FixedInitialStateWrapper(fixed_initial_state.FixedInitialStateWrapper):
         """Returns the state with the observation of ``get_obs_fn``.
 
         Raises:
-            ValueError: The observation is of another shape.
+            ValueError: The observation has the wrong shape.
         """
         if self._get_obs_fn is None:
             return state

@@ -1,8 +1,8 @@
-"""What code for brax v1 reads: the bodies of a state, and the robot.
+"""Views for code that was written for brax v1: the bodies of a state, and the robot.
 
-Both are computed from the physics state when they are asked for. One row is one body:
+Both are computed from the physics state when they are read. One row is one body: first
 the links of the robot in the order of its URDF file, then the ground. Links below
-1e-5 kg have no row: they stand between the axes of one joint of the original.
+1e-5 kg have no row. They connect the axes of one joint of the original.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ _GROUND = ("Ground", "floor")  # names of the last row in the original
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, eq=False)
 class QP:
-    """Where the bodies are and how they move, world axes; read-only.
+    """Poses and velocities of the bodies, in world axes; read-only.
 
     Attributes:
         pos: (nr, 3) centre of mass of each body [m].
         rot: (nr, 4) quaternion wxyz.
         vel: (nr, 3) velocity of the centre of mass [m/s].
         ang: (nr, 3) angular velocity [rad/s].
-        physics: State that the rest was computed from.
+        physics: The simulation state of these bodies.
     """
 
     pos: jax.Array
@@ -61,7 +61,7 @@ class Changes:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, eq=False)
 class Info:
-    """What the last control step reported.
+    """Readings of the last control step.
 
     Attributes:
         contact: Velocity changes by contact, zero after a reset.
@@ -94,9 +94,9 @@ class Joints:
     v: np.ndarray
 
     def angle_vel(self, qp: QP) -> tuple[tuple[jax.Array, ...], tuple[jax.Array, ...]]:
-        """Returns angles and their rates, one array (nj,) each per axis [rad, rad/s].
+        """Returns angles and rates, each as one array (nj,) per axis [rad, rad/s].
 
-        The rates are those of the angles; the original has the opposite sign.
+        A rate is the time derivative of its angle. The original has the opposite sign.
         """
         axes = range(self.q.shape[1])
         return (
@@ -110,8 +110,8 @@ class Config:
     """Settings of the simulation.
 
     Attributes:
-        dt: Duration of a step, repeated actions included [s].
-        substeps: Physics steps in it [-].
+        dt: Duration of a step, with repeated actions [s].
+        substeps: Physics steps in a step [-].
     """
 
     dt: float
@@ -119,7 +119,7 @@ class Config:
 
 
 class SystemView:
-    """What old code reads of a robot; read-only."""
+    """The robot as ``env.sys`` of brax v1; read-only."""
 
     def __init__(
         self,
@@ -127,13 +127,13 @@ class SystemView:
         action_repeat: int = 1,
         body_names: Mapping[str, str] = types.MappingProxyType({}),
     ) -> None:
-        """Makes the view.
+        """Creates the view.
 
         Args:
             system: The robot.
             action_repeat: Control steps for each action.
-            body_names: What the body of a link is called in the original, where that
-                is another name.
+            body_names: Name of a link's body in the original, if it differs from the
+                name of the link.
         """
         self._system = system
         self._repeat = action_repeat
@@ -197,11 +197,12 @@ class SystemView:
         """Returns the default pose, standing on the ground.
 
         Args:
-            joint_angle: (num_joint_dof,) as ``default_angle`` [rad]; ``None``: that.
-            joint_velocity: (num_joint_dof,) [rad/s]; ``None``: 0.
+            joint_angle: (num_joint_dof,) angles in the order of ``default_angle``
+                [rad]; ``None``: ``default_angle``.
+            joint_velocity: (num_joint_dof,) velocities [rad/s]; ``None``: 0.
 
         Raises:
-            ValueError: An array is of another shape.
+            ValueError: An array has the wrong shape.
         """
         system = self._system
         dtype = jnp.dtype(system.dtype)
@@ -220,7 +221,7 @@ class SystemView:
         return qp_view(system, physics.initial_state(system, q, v))
 
     def info(self, qp: QP) -> Info:
-        """Returns what the step that led to a view reported."""
+        """Returns the readings of the step that led to a view."""
         system = self._system
         bodies = solid_bodies(system)
         impulse = qp.physics.impulse[..., bodies, :]
@@ -235,7 +236,7 @@ class SystemView:
 
 
 def qp_view(system: System, state: PhysicsState) -> QP:
-    """Returns where the bodies of a state are; every batch axis stays in front."""
+    """Returns the bodies of a state, with all batch axes in front."""
 
     def read(state: PhysicsState) -> tuple[jax.Array, ...]:
         found = physics.seen_bodies(system, state)
@@ -271,7 +272,7 @@ def _rotate(rot: jax.Array, vector: jax.Array) -> jax.Array:
 
 
 def _still_bodies(system: System) -> list[tuple[tuple[str, ...], np.ndarray]]:
-    """Returns names and frame (7,) in the world of each body that never moves."""
+    """Returns the names and the world frame (7,) of each body that never moves."""
     ground = (_GROUND, np.array([0, 0, 0, 0, 0, 0, 1.0]))
     scene = zip(system.scene_links, system.scene_frames, strict=True)
     # the original's names begin with a capital letter: Trap, Maze, Target
@@ -279,6 +280,6 @@ def _still_bodies(system: System) -> list[tuple[tuple[str, ...], np.ndarray]]:
 
 
 def _with_still(system: System, rows: jax.Array) -> jax.Array:
-    """Returns rows (..., nb, 3) with zeros behind, for the bodies that never move."""
+    """Returns rows (..., nb, 3) with zeros appended for bodies that never move."""
     shape = (*rows.shape[:-2], len(_still_bodies(system)), 3)
     return jnp.concatenate([rows, jnp.zeros(shape, rows.dtype)], axis=-2)

@@ -1,4 +1,4 @@
-"""The wrapper that shows states and the robot as brax v1 does."""
+"""The wrapper that gives states and the robot the attributes of brax v1."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ BODY_NAMES: Mapping[str, Mapping[str, str]] = types.MappingProxyType(
         )
     }
 )
-"""By robot: what the body of a link is called in the original suite."""
+"""For each robot, the name of a link's body in the original suite."""
 
 
 class _Shown:
-    """A robot as part of a tree's structure: compared by identity, printed in short."""
+    """A robot in the structure of a pytree: compared by identity, with a short repr."""
 
     def __init__(self, system: System) -> None:
         self.system = system
@@ -52,17 +52,17 @@ class _Shown:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, eq=False)
 class BraxState(State):
-    """A state that knows its robot, for ``qp``.
+    """A state with a reference to its robot, for ``qp``.
 
     Attributes:
-        shown: The robot; no leaf but part of the tree's structure.
+        shown: The robot. It is part of the pytree's structure and not a leaf.
     """
 
     shown: _Shown = dataclasses.field(repr=False, metadata={"static": True})
 
     @property
     def qp(self) -> QP:
-        """Bodies as brax v1 shows them, computed when asked for; read-only."""
+        """Bodies in the form of brax v1, computed when read; read-only."""
         return qp_view(self.system, self.pipeline_state)
 
     @property
@@ -72,12 +72,12 @@ class BraxState(State):
 
 
 class BraxViewsWrapper(Wrapper):
-    """Gives ``state.qp`` to the states of a simulated robot, and ``env.sys``.
+    """Adds ``state.qp`` to the states of a simulated robot, and ``env.sys``.
 
-    It goes around all other wrappers, changes no number, and leaves environments
-    without a simulated robot as they are. States with views are of the type
-    ``BraxState``: the robot is part of their structure, so that states of two robots,
-    or of one robot in two materials, cannot be mapped over together.
+    It goes around all other wrappers and changes no number. It has no effect on
+    environments without a simulated robot. States with views have the type
+    ``BraxState``. The robot is part of their structure, so ``jax.tree.map`` over states
+    of two robots, or of one robot in two materials, raises an error.
     """
 
     def __init__(self, env: Env, body_names: Mapping[str, str] | None = None) -> None:
@@ -85,8 +85,8 @@ class BraxViewsWrapper(Wrapper):
 
         Args:
             env: The environment.
-            body_names: What the body of a link is called in the original, where that
-                is another name; ``None``: as in ``BODY_NAMES``.
+            body_names: Name of a link's body in the original, if it differs from the
+                name of the link; ``None``: the names in ``BODY_NAMES``.
         """
         super().__init__(env)
         self._body_names = body_names
@@ -120,7 +120,7 @@ class BraxViewsWrapper(Wrapper):
 
     @property
     def sys(self) -> SystemView:
-        """What code for brax v1 reads of the robot.
+        """The robot for code that was written for brax v1.
 
         Raises:
             AttributeError: The environment inside is not a simulated robot.
@@ -139,12 +139,12 @@ class BraxViewsWrapper(Wrapper):
 
     @property
     def _system(self) -> System | None:
-        # of what is inside now: ``with_base`` may have put something else there
+        # asks the current inner environment, because ``with_base`` may have changed it
         base = self.unwrapped
         return base.system if isinstance(base, PhysicsEnv) else None
 
     def _viewed(self, state: State) -> State:
-        """Returns the state with the robot that it is of now."""
+        """Returns the state with its current robot."""
         system = self._system
         if system is None:
             return state

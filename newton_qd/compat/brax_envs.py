@@ -1,4 +1,4 @@
-"""``qdax.tasks.brax_envs`` as of QDax 0.2 to 0.4: functions return the next key."""
+"""``qdax.tasks.brax_envs`` of QDax 0.2 to 0.4: functions also return the next key."""
 
 from __future__ import annotations
 
@@ -48,13 +48,13 @@ def create(env_name: str, *args: Any, **kwargs: Any) -> Env:
         **kwargs: As for ``newton_qd.create``; ``brax_views`` is on.
 
     Returns:
-        The environment, whose states have ``qp``, with ``sys``.
+        The environment. It has ``sys``, and its states have ``qp``.
     """
     return registry.create(env_name, *args, **{"brax_views": True, **kwargs})
 
 
 def create_fn(env_name: str, **kwargs: Any) -> Callable[..., Env]:
-    """Returns ``create`` with its arguments filled in; nothing is built yet."""
+    """Returns ``create`` with these arguments; does not build the environment yet."""
     return functools.partial(create, env_name, **kwargs)
 
 
@@ -113,11 +113,11 @@ def scoring_actor_dc_function_brax_envs(
     play_step_actor_dc_fn: Callable[..., tuple],
     behavior_descriptor_extractor: DescriptorExtractor,
 ) -> ScoresAndKey:
-    """Evaluates policies that are told which descriptor to reach.
+    """Evaluates policies that have a target descriptor as an input.
 
     Args:
         actors_dc_params: Parameters of N policies.
-        descs: (N, D) descriptors to reach.
+        descs: (N, D) target descriptors.
         random_key: Key for the steps, the same for every policy.
         init_states: N states.
         episode_length: Control steps of an evaluation.
@@ -148,7 +148,7 @@ def reset_based_scoring_function_brax_envs(
     play_step_fn: Callable[..., tuple],
     behavior_descriptor_extractor: DescriptorExtractor,
 ) -> ScoresAndKey:
-    """As ``scoring_function_brax_envs``, from states that ``play_reset_fn`` makes."""
+    """As ``scoring_function_brax_envs``, but from the states of ``play_reset_fn``."""
     init_states, random_key = _reset(
         random_key, population_size(policies_params), play_reset_fn
     )
@@ -171,7 +171,7 @@ def reset_based_scoring_actor_dc_function_brax_envs(
     play_step_actor_dc_fn: Callable[..., tuple],
     behavior_descriptor_extractor: DescriptorExtractor,
 ) -> ScoresAndKey:
-    """As ``scoring_actor_dc_function_brax_envs``, from ``play_reset_fn``'s states."""
+    """As ``scoring_actor_dc_function_brax_envs``, from states of ``play_reset_fn``."""
     init_states, random_key = _reset(
         random_key, population_size(actors_dc_params), play_reset_fn
     )
@@ -214,8 +214,8 @@ def create_brax_scoring_fn(
         random_key: Key of the state in which all evaluations begin.
         play_step_fn: Replaces the step of ``env`` with ``policy_network``.
         episode_length: Control steps of an evaluation.
-        deterministic: Whether all evaluations begin in one state.
-        play_reset_fn: Replaces ``env.reset`` where ``deterministic`` is false.
+        deterministic: Whether all evaluations begin in the same state.
+        play_reset_fn: Replaces ``env.reset`` if ``deterministic`` is false.
 
     Returns:
         The scoring function and a new key.
@@ -273,12 +273,12 @@ def get_aurora_scoring_fn(
     scoring_fn: ScoringFunction,
     observation_extractor_fn: Callable[[PyTree], jax.Array],
 ) -> Callable[[Genotype, RNGKey], tuple[jax.Array, None, ExtraScores, jax.Array]]:
-    """Makes a scoring function that leaves the descriptors to AURORA.
+    """Makes a scoring function without descriptors; AURORA computes them.
 
     Args:
         scoring_fn: Scoring function whose third result has ``transitions``.
-        observation_extractor_fn: Maps transitions to what AURORA encodes; found
-            under ``last_valid_observations`` of the third result.
+        observation_extractor_fn: Maps transitions to the observations that AURORA
+            encodes. They are ``last_valid_observations`` of the third result.
     """
 
     def score(

@@ -1,7 +1,7 @@
-"""Which modules of QDax are made here, and what each of them holds.
+"""The modules of QDax that this library replaces, and their contents.
 
-``CONTENTS`` maps the name of a module to ``{home: names}``: the module of this
-library (or of QDax, for names that have moved) where its names are defined.
+``CONTENTS`` maps the name of a module to ``{home: names}``. ``home`` is the module that
+defines these names: a module of this library, or of QDax for names that have moved.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ _NEW: dict[str, Contents] = {
     "qdax.tasks.brax.v1.wrappers.reward_wrappers": _REWARD,
 }
 
-# QDax 0.2 to 0.4; the release of today does not have these modules at all.
+# QDax 0.2 to 0.4. Today's release does not have these modules.
 _OLD: dict[str, Contents] = {
     "qdax.environments": {
         **_ENVIRONMENTS,

@@ -1,4 +1,4 @@
-"""``qdax.tasks.brax.v1.env_creators`` as of QDax 0.5: keys go in, none come out."""
+"""``qdax.tasks.brax.v1.env_creators`` of QDax 0.5: functions do not return keys."""
 
 from __future__ import annotations
 
@@ -43,11 +43,12 @@ def create(env_name: str, *args: Any, legacy_spring: bool = True, **kwargs: Any)
     Args:
         env_name: One of ``newton_qd.registered_envs()``.
         *args: As for ``newton_qd.create``.
-        legacy_spring: Chose between two engines of brax v1; here there is one.
+        legacy_spring: Must be true. It selects one of two engines in brax v1; this
+            library has one engine.
         **kwargs: As for ``newton_qd.create``; ``brax_views`` is on.
 
     Returns:
-        The environment, whose states have ``qp``, with ``sys``.
+        The environment. It has ``sys``, and its states have ``qp``.
 
     Raises:
         ValueError: ``legacy_spring`` is false.
@@ -62,7 +63,7 @@ def create(env_name: str, *args: Any, legacy_spring: bool = True, **kwargs: Any)
 
 
 def create_fn(env_name: str, **kwargs: Any) -> Callable[..., Env]:
-    """Returns ``create`` with its arguments filled in; nothing is built yet."""
+    """Returns ``create`` with these arguments; does not build the environment yet."""
     return functools.partial(create, env_name, **kwargs)
 
 
@@ -83,7 +84,7 @@ def scoring_function_brax_envs(
     play_step_fn: Callable[..., tuple],
     descriptor_extractor: DescriptorExtractor,
 ) -> Scores:
-    """Evaluates policies side by side.
+    """Evaluates policies in parallel.
 
     Args:
         policies_params: Parameters of N policies.
@@ -127,7 +128,7 @@ def create_brax_scoring_fn(
         play_step_fn: Replaces the step of ``env`` with ``policy_network``.
         episode_length: Control steps of an evaluation.
         deterministic: Whether all evaluations begin in one state.
-        play_reset_fn: Replaces ``env.reset`` where ``deterministic`` is false.
+        play_reset_fn: Replaces ``env.reset`` if ``deterministic`` is false.
     """
     if play_step_fn is None:
         play_step_fn = make_policy_network_play_step_fn_brax(env, policy_network)
@@ -176,12 +177,13 @@ def get_aurora_scoring_fn(
     observation_extractor_fn: Callable[[PyTree], jax.Array],
     observations_key: str,
 ) -> Callable[[Genotype, RNGKey], tuple[jax.Array, None, ExtraScores]]:
-    """Makes a scoring function that leaves the descriptors to AURORA.
+    """Makes a scoring function without descriptors; AURORA computes them.
 
     Args:
         scoring_fn: Scoring function whose third result has ``transitions``.
-        observation_extractor_fn: Maps transitions to what AURORA encodes.
-        observations_key: Key of that in the third result.
+        observation_extractor_fn: Maps transitions to the observations that AURORA
+            encodes.
+        observations_key: Key of these observations in the third result.
     """
 
     def score(params: Genotype, key: jax.Array) -> tuple[jax.Array, None, ExtraScores]:

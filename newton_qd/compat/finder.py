@@ -1,4 +1,4 @@
-"""Puts modules of this library where QDax looks for its own."""
+"""Replaces modules of QDax by modules of this library."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from newton_qd.compat.contents import CONTENTS
 from newton_qd.errors import MissingExtra
 
 SUPPORTED = ("0.5.0",)
-"""Releases of QDax that the tests run with."""
+"""Tested releases of QDax."""
 
 
 class _Finder(MetaPathFinder, Loader):
@@ -48,12 +48,12 @@ _FINDER = _Finder()
 def install() -> None:
     """Makes QDax import and run on the environments of this library.
 
-    Call it before anything of QDax is imported; calling it again does nothing.
+    Call it before the first import of QDax. A second call has no effect.
 
     Raises:
         MissingExtra: QDax is not installed.
         ImportError: The installed release of QDax is not in ``SUPPORTED``, or it is
-            already imported with environments that are not of this library.
+            already imported with its own environments.
     """
     if _FINDER in sys.meta_path:
         return
@@ -76,7 +76,7 @@ def install() -> None:
 
 
 def uninstall() -> None:
-    """Undoes ``install``; modules of QDax that are imported keep what they have."""
+    """Reverts ``install``; imported modules of QDax do not change."""
     if _FINDER not in sys.meta_path:
         return
     sys.meta_path.remove(_FINDER)
@@ -88,7 +88,7 @@ def uninstall() -> None:
 
 
 def _restore_jax() -> None:
-    """Lets TensorFlow Probability be imported, which QDax's DADS needs."""
+    """Makes TensorFlow Probability importable, which QDax's DADS needs."""
     from jax import core
 
     # TensorFlow Probability 0.25, the last release, registers a type under a name
@@ -96,6 +96,6 @@ def _restore_jax() -> None:
     xla: Any = importlib.import_module("jax.interpreters.xla")
     if not hasattr(xla, "pytype_aval_mappings"):
         with warnings.catch_warnings():
-            # JAX deprecates the new place as well, and has no other.
+            # JAX has deprecated the new place too, but there is no other.
             warnings.simplefilter("ignore", DeprecationWarning)
             xla.pytype_aval_mappings = core.pytype_aval_mappings

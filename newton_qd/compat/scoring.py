@@ -1,4 +1,4 @@
-"""What the scoring functions of every release of QDax have in common."""
+"""Shared code of the scoring functions of all releases of QDax."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ Scores = tuple[jax.Array, jax.Array, ExtraScores]
 def make_policy_network_play_step_fn_brax(
     env: Env, policy_network: Any
 ) -> Callable[[State, Genotype, RNGKey], tuple[State, Genotype, RNGKey, PyTree]]:
-    """Makes the function that lets a policy take one step.
+    """Makes the function of one step with a policy.
 
     Args:
         env: Environment with a state descriptor.
         policy_network: Flax module from observations to actions.
 
     Returns:
-        Function of a state, parameters and a key; returns the next state, both of
-        them as they are, and a ``QDTransition``.
+        Function of a state, parameters and a key. It returns the next state, the
+        unchanged parameters and key, and a ``QDTransition``.
     """
     from qdax.core.neuroevolution.buffers.buffer import QDTransition
 
@@ -53,13 +53,13 @@ def make_policy_network_play_step_fn_brax(
 
 
 def get_mask_from_transitions(data: PyTree) -> jax.Array:
-    """Marks what comes after the end of an episode.
+    """Marks the steps after the end of an episode.
 
     Args:
         data: Transitions with ``dones`` (N, T).
 
     Returns:
-        (N, T) 1 where a step comes after one that is done, else 0.
+        (N, T) 1 if an earlier step is done, else 0.
     """
     ended = jax.lax.cummax(data.dones, axis=1)
     return jnp.concatenate([jnp.zeros_like(ended[:, :1]), ended[:, :-1]], axis=1)
@@ -72,20 +72,20 @@ def evaluate(
     episode_length: int,
     descriptor_extractor: DescriptorExtractor,
 ) -> Scores:
-    """Lets N policies play an episode each, side by side.
+    """Runs one episode for each of N policies, in parallel.
 
     Args:
         play_step: Maps the carry, as arguments, to the carry and a transition.
-        carry: States, parameters and what else ``play_step`` takes.
-        in_axes: 0 for each part of the carry of which every policy has its own,
-            ``None`` for the others.
+        carry: States, parameters and other arguments of ``play_step``.
+        in_axes: 0 for each part of the carry with one entry per policy; ``None`` for a
+            part that all policies share.
         episode_length: Number of steps T.
         descriptor_extractor: Maps transitions (N, T, ...) and their mask to
             descriptors (N, D).
 
     Returns:
-        Fitnesses (N,), summed so that a row does not depend on N; descriptors
-        (N, D); and ``{"transitions": ...}``.
+        Fitnesses (N,), descriptors (N, D), and ``{"transitions": ...}``. The order of
+        the sums does not depend on N.
     """
 
     def episode(*carry: PyTree) -> PyTree:
@@ -104,7 +104,7 @@ def evaluate(
 
 
 def population_size(params: Genotype) -> int:
-    """Number of individuals whose parameters have them on the leading axis."""
+    """Returns the number of individuals: the length of the first axis of a leaf."""
     return jax.tree.leaves(params)[0].shape[0]
 
 
@@ -114,7 +114,7 @@ def reset_function(
     deterministic: bool,
     play_reset_fn: Callable[[jax.Array], State] | None,
 ) -> Callable[[jax.Array], State]:
-    """Chooses how evaluations begin: all in one state, or each in its own."""
+    """Returns the reset of evaluations: all in the same state, or each in its own."""
     if deterministic:
         state = env.reset(key)
         return lambda _: state
@@ -124,7 +124,7 @@ def reset_function(
 def default_task(
     env_name: str, episode_length: int, hidden: tuple[int, ...]
 ) -> tuple[Env, Any]:
-    """Makes an environment, and the perceptron that QDax gives to it."""
+    """Makes an environment, and QDax's default perceptron for it."""
     from qdax.core.neuroevolution.networks.networks import MLP
 
     env = registry.create(env_name, episode_length=episode_length, brax_views=True)

@@ -13,7 +13,7 @@ from newton_qd.types import Action, Params
 
 
 def require_actuators(system: System) -> None:
-    """Raises for a robot without actuators, which no action could move.
+    """Checks that a robot has actuators.
 
     Raises:
         ValueError: The spec of the system's robot has no actuators.
@@ -26,7 +26,7 @@ def require_actuators(system: System) -> None:
 
 
 def refuse_params(params: Params) -> None:
-    """Raises where an environment without physical parameters is given some.
+    """Checks that ``params`` is ``None``, for environments without parameters.
 
     Raises:
         ValueError: ``params`` is not ``None``.
@@ -37,15 +37,15 @@ def refuse_params(params: Params) -> None:
 
 
 def require_state(state: State, *keys: str) -> None:
-    """Raises for what is no state, or one of an environment with fewer wrappers.
+    """Checks that a value is a state, and that its ``info`` has some keys.
 
     Args:
-        state: What a step was given.
-        *keys: What the step reads of its ``info``.
+        state: Argument of a step.
+        *keys: Keys of ``info`` that the step reads.
 
     Raises:
-        TypeError: It is no ``State``.
-        ValueError: Its ``info`` lacks a key.
+        TypeError: It is not a ``State``.
+        ValueError: A key is missing.
     """
     checks.instance("state", state, State, "a State that reset or step returned")
     for key in keys:
@@ -59,30 +59,30 @@ def require_state(state: State, *keys: str) -> None:
 
 
 def checked_action(action: Action, size: int, dtype: np.dtype) -> Action:
-    """Returns the action, strongly typed, or raises what is wrong with it.
+    """Checks an action, and returns it strongly typed.
 
     Args:
-        action: What a step was given.
-        size: Length that is allowed.
-        dtype: Type that is allowed; weakly typed numbers are converted to it.
+        action: Argument of a step.
+        size: Allowed length.
+        dtype: Allowed dtype. Weakly typed numbers are converted to it.
 
     Raises:
-        TypeError: It is no array, or of another type.
-        ValueError: It has another shape.
+        TypeError: It is not an array, or has the wrong dtype.
+        ValueError: It has the wrong shape.
     """
     return checks.array("action", action, (size,), dtype)
 
 
 def checked_layout(env: str, blocks: object) -> tuple[tuple[str, int], ...]:
-    """Returns name and size of each block of an observation, or raises what is wrong.
+    """Checks the result of ``observe``, and returns name and size of each block.
 
     Args:
-        env: Name of the class that observes.
-        blocks: What its ``observe`` returned.
+        env: Name of the class with this ``observe``.
+        blocks: Result of ``observe``.
 
     Raises:
-        TypeError: They are no dictionary with at least one block.
-        ValueError: A block has not one axis.
+        TypeError: It is not a dictionary with at least one block.
+        ValueError: A block does not have exactly one axis.
     """
     if not isinstance(blocks, dict) or not blocks:
         allowed = "a dictionary of arrays (n,)"
@@ -96,15 +96,15 @@ def checked_layout(env: str, blocks: object) -> tuple[tuple[str, int], ...]:
 
 
 def checked_outcome(env: str, found: object) -> tuple[str, ...]:
-    """Returns the names of the metrics, or raises what is wrong with an outcome.
+    """Checks the result of ``outcome``, and returns the names of the metrics.
 
     Args:
-        env: Name of the class that rewards.
-        found: Shapes of what its ``outcome`` returned.
+        env: Name of the class with this ``outcome``.
+        found: Shapes of the result of ``outcome``.
 
     Raises:
         TypeError: It is not a tuple of reward, done and metrics.
-        ValueError: A number is not of shape ().
+        ValueError: A number does not have the shape ().
     """
     if (
         not isinstance(found, tuple)

@@ -13,11 +13,11 @@ Constructor = TypeVar("Constructor", bound=Callable[..., None])
 
 
 def checked_options(init: Constructor) -> Constructor:
-    """Lets a constructor refuse values that its options do not allow.
+    """Decorates a constructor: checks its options by their type annotations.
 
-    Options annotated ``float`` are finite numbers, not below 0 if they scale noise;
-    ``tuple[float, float]`` are ranges, the lowest value before the highest; ``bool``
-    are ``True`` or ``False``. Other parameters are left to the constructor.
+    A ``float`` must be a finite number, and not below 0 if it scales noise. A
+    ``tuple[float, float]`` must be a range, the lowest value first. A ``bool`` must be
+    ``True`` or ``False``. The constructor checks other parameters itself.
 
     Args:
         init: An ``__init__`` whose options are keyword-only.

@@ -61,5 +61,5 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Says how a name that was here is called now."""
+    """Returns a renamed object by its old name."""
     return moved_name(__name__, name, {"Robot": "newton_qd.robots.RobotSpec"})

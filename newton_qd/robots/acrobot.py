@@ -1,4 +1,4 @@
-"""Acrobot: two poles that hang from a mount, driven where they meet."""
+"""Acrobot: two poles that hang from a mount. The joint between them is driven."""
 
 from newton_qd.robots.spec import DEGREE, RobotSpec
 

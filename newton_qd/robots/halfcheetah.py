@@ -30,7 +30,8 @@ HALFCHEETAH = RobotSpec(
         ("fshin", -0.165),
     ),
     dt=0.05,
-    # 10 ms would let a foot, light and undamped, swing for ever about its limit
+    # with steps of 10 ms, a foot would oscillate about its limit for ever: it is light
+    # and has no damping
     substeps=10,
     # smoothing: a quarter to a third of the radius of the capsules
     material=Material(friction=0.6, smoothing=0.015, limit_swing=0.36),

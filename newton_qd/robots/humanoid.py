@@ -41,6 +41,7 @@ HUMANOID = RobotSpec(
     ),
     dt=0.015,
     substeps=2,
-    # It stands on the spheres of two feet. A pose on a limit feels 1.9 % of the gear.
+    # Two spheres, one in each foot, carry the weight. The limit torque at the limit is
+    # 1.9 % of the gear.
     material=Material(support=2, limit_overshoot=0.1, limit_smoothing=0.01),
 )

@@ -2,7 +2,7 @@
 
 from newton_qd.robots.spec import DEGREE, Contact, Material, RobotSpec
 
-# What of the arm touches the table and the object.
+# Colliders of the arm that touch the table and the object.
 _CAPSULES = tuple(
     Contact(link, collider=name)
     for link, name in (
@@ -52,7 +52,7 @@ PUSHER = RobotSpec(
         ("r_upper_arm_roll_joint", 5.729577 * DEGREE),
         ("r_elbow_flex_joint", -66.50035 * DEGREE),
         ("r_wrist_flex_joint", -31.3407915 * DEGREE),
-        # the middle of where resets draw it
+        # the mean of the positions that resets draw
         ("object_x", -0.15),
     ),
     dt=0.05,

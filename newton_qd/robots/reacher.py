@@ -9,7 +9,7 @@ REACHER = RobotSpec(
     feet=(),
     actuators=(("joint0", 25.0), ("joint1", 25.0)),
     contacts=(),
-    # where a reset without noise puts the target: within reach, off the stretched arm
+    # target of a reset without noise: within reach, not on the stretched arm
     rest_pose=(("target_x", 0.1), ("target_y", 0.1)),
     dt=0.02,
     substeps=2,

@@ -1,7 +1,7 @@
-"""What a robot's spec holds: everything about a robot that its URDF file cannot.
+"""The spec of a robot: all data that a URDF file cannot describe.
 
-Masses, inertias, joint frames, limits, damping and colliders are in ``urdf/``;
-gears, the contact material and the time steps are in specs of this type.
+Masses, inertias, joint frames, limits, damping and colliders are in ``urdf/``. Gears,
+the contact material and the time steps are in specs.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ class Contact:
 
     Attributes:
         link: URDF link whose collider carries the sphere.
-        end: Which end of a capsule's axis: ``+1`` or ``-1`` along the local z
-            axis of the collider; ``0`` for a sphere, and in a pair.
-        collider: Name of the collider in the URDF file; ``None`` where the link has
-            only one of its kind.
+        end: End of a capsule's axis: ``+1`` or ``-1`` along the local z axis of the
+            collider. ``0`` for a sphere, and for any collider of a pair.
+        collider: Name of the collider in the URDF file; ``None`` if the link has only
+            one collider of this kind.
     """
 
     link: str
@@ -32,22 +32,23 @@ class Contact:
 
 @dataclasses.dataclass(frozen=True)
 class Material:
-    """Contact and joint-limit softness, scaled to the robot.
+    """Softness of contacts and joint limits, relative to the robot.
 
     Attributes:
         friction: Coulomb coefficient of a pair [-].
-        static_penetration: Penetration that the robot's weight causes when it
-            rests on ``support`` contacts [m]; sets the stiffness.
+        static_penetration: Penetration under the robot's weight at rest on ``support``
+            contacts [m]. It sets the stiffness of contacts.
         support: Number of contacts that carry the weight at rest [-].
         smoothing: Half width of the zone in which a contact switches on [m].
         slip_velocity: Velocity below which friction is viscous [m/s].
         dissipation: Hunt-Crossley dissipation [s/m].
-        limit_overshoot: Angle by which a joint's full gear holds it past its limit
-            [rad]; sets the stiffness of the limits.
-        limit_swing: Angle past its limit that a joint does not reach when its full
-            gear alone swings it there from rest [rad]; a promise, it sets nothing.
-        limit_smoothing: Half width of the zone in which a limit switches on
-            [rad]; the zone begins at the limit, where nothing is felt yet.
+        limit_overshoot: Angle past its limit at which a joint is in balance with its
+            full gear [rad]. It sets the stiffness of joint limits.
+        limit_swing: Upper bound of the angle past its limit that a joint reaches from
+            rest with its full gear alone [rad]. It has no effect on the physics; tests
+            check it.
+        limit_smoothing: Half width of the zone in which a limit switches on [rad]. The
+            zone begins at the limit, with torque 0.
     """
 
     friction: float = 1.0
@@ -69,20 +70,19 @@ class RobotSpec:
         name: Name of the robot.
         urdf: File name inside ``urdf/``, or a path.
         torso: Link whose position is the robot's position.
-        feet: Links whose contacts make the feet-contact descriptor, in order.
-        actuators: ``(joint, gear)`` in the order of the action; gear is the
-            torque of a unit action [N m], or the force of a slide [N].
+        feet: Links of the feet-contact descriptor, in order.
+        actuators: ``(joint, gear)`` in the order of the action. The gear is the torque
+            [N m] of an action of 1, or the force [N] for a slide.
         contacts: Spheres that may touch the ground.
-        pairs: Whole colliders, each with ``end`` 0, of two links that may touch each
-            other.
-        rest_pose: ``(joint, angle)`` of the default pose [rad]; joints that
-            are not named rest at 0.
+        pairs: Pairs of colliders of two links that may touch each other, each with
+            ``end`` 0.
+        rest_pose: ``(joint, angle)`` of the default pose [rad]; 0 for all other joints.
         rest_height: Height of the root in the default pose [m]; ``None`` puts
             the lowest contact on the ground.
         rest_rotation: Roll, pitch and yaw of a free root in the default pose [rad].
-        servos: Those joints of ``actuators`` that hold an angle: the action is the
-            target [rad or m] and gear the torque for each radian off it [N m/rad],
-            or the force for each metre [N/m].
+        servos: Joints of ``actuators`` that hold an angle. Their action is the target
+            [rad or m]. Their gear is the torque per radian of error [N m/rad], or the
+            force per metre [N/m].
         dt: Duration of a control step [s].
         substeps: Physics steps in a control step [-].
         gravity: Downward acceleration [m/s^2].
@@ -103,7 +103,7 @@ class RobotSpec:
     servos: tuple[str, ...] = ()
     gravity: float = 9.81
     material: Material = Material()
-    original_names: dataclasses.InitVar[tuple[()]] = ()  # where it has gone is said
+    original_names: dataclasses.InitVar[tuple[()]] = ()  # an error tells the new place
     pairs: tuple[tuple[Contact, Contact], ...] = ()
 
     def __post_init__(self, original_names: tuple[()]) -> None:

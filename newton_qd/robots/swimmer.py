@@ -7,7 +7,7 @@ SWIMMER = RobotSpec(
     urdf="swimmer.urdf",
     torso="torso",
     feet=(),
-    # The action drives the joints; the drag of the water, the root as well.
+    # The action drives the joints. The drag of the water acts on the root too.
     actuators=(
         ("rot2", 30.0),
         ("rot3", 30.0),

@@ -26,6 +26,6 @@ WALKER2D = RobotSpec(
     rest_height=1.19,
     dt=0.008,
     substeps=2,
-    # it starts 20 mm deep in the ground, as in the original; dissipation keeps it low
+    # it starts 20 mm below the ground, as in the original; dissipation limits the jump
     material=Material(friction=0.9, smoothing=0.015, dissipation=1.0),
 )

@@ -1,4 +1,4 @@
-"""Worlds that begin again by themselves."""
+"""Worlds that reset themselves at the end of an episode."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from newton_qd.wrappers.base import Wrapper
 class AutoResetWrapper(Wrapper):
     """Returns a finished world to its first state.
 
-    Where a step is done, the returned simulation state, observation and state
-    descriptor are those of the last explicit reset; reward, done, truncation,
-    metrics, steps and fault are of the step. The next step counts from 0 and clears
-    the fault.
+    If a step is done, the simulation state, the observation and the state descriptor
+    that it returns are those of the last call of ``reset``. Reward, done, truncation,
+    metrics, steps and fault are those of the step. The next step counts from 0 and
+    clears the fault.
     """
 
     def reset(self, rng: RNGKey) -> State:
-        """Begins an episode and remembers its first state.
+        """Begins an episode and stores its first state.
 
         Raises:
             ValueError: The environment is float64 and JAX x64 is off.
@@ -34,12 +34,12 @@ class AutoResetWrapper(Wrapper):
         for key in READINGS:
             if key in state.info:
                 first[f"first_{key}"] = state.info[key]
-        # copies: no buffer is in a state twice, so that a state can be donated
+        # copies, so that no buffer is in a state twice: JAX can then donate the state
         first = jax.tree.map(jnp.copy, first)
         return state.replace(info={**state.info, **first})
 
     def step(self, state: State, action: Action, params: Params = None) -> State:
-        """Advances by one step, then returns the finished worlds.
+        """Advances by one step, then resets the finished worlds.
 
         Raises:
             TypeError: The state or the action has the wrong type.

@@ -1,4 +1,4 @@
-"""The wrapper that changes nothing."""
+"""The base class of wrappers. It changes nothing."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from newton_qd.types import Action, Params, RNGKey
 
 
 def unsupported(env: Env, env_name: str, allowed: str) -> str:
-    """Returns the message of a wrapper that an environment does not fit into.
+    """Returns the error message of a wrapper that cannot wrap an environment.
 
     Args:
         env: The environment.
         env_name: Its name.
-        allowed: What does fit.
+        allowed: Description of the environments that are allowed.
     """
     refusal = message("env", Fact(type(env.unwrapped).__name__), allowed)
     return f"This wrapper does not support {env_name} yet. {refusal}"
 
 
 class Wrapper(Env):
-    """An environment around another one; forwards what it does not change.
+    """An environment around another one; forwards everything that it does not change.
 
     Attributes:
         env: The environment inside.
@@ -88,7 +88,7 @@ class Wrapper(Env):
 
     @property
     def default_params(self) -> Params:
-        """What a step takes for ``params``: as in the files, ``None`` without any."""
+        """Default ``params`` of a step; ``None`` if there are no parameters."""
         return self.env.default_params
 
     @property
@@ -107,17 +107,17 @@ class Wrapper(Env):
         return self.with_base(lambda base: base.with_scene(scene))
 
     def with_material(self, material: Material) -> Env:
-        """Returns the same wrappers around the same robot with other softness."""
+        """Returns the same wrappers around the same robot with another material."""
         return self.with_base(lambda base: base.with_material(material))
 
     def __getattr__(self, name: str) -> Any:
-        """Looks in the environment inside: ``batch_size``, descriptors, ``system``.
+        """Forwards to the environment inside: ``batch_size``, descriptors, ``system``.
 
         Raises:
-            AttributeError: It is not there.
+            AttributeError: No environment inside has the attribute.
         """
-        # Private names stay private, and while a copy is being made ``env`` is not
-        # there yet: asking for it here would never end.
+        # Private names are not forwarded. While Python copies a wrapper, ``env`` does
+        # not exist yet: reading it here would recurse without end.
         if name.startswith("_") or name == "env":
             raise AttributeError(
                 f"{type(self).__name__!r} object has no attribute {name!r}"

@@ -31,7 +31,7 @@ class ClipRewardWrapper(Wrapper):
             clip_max: Highest reward, not below ``clip_min``; ``None``: no limit.
 
         Raises:
-            ValueError: A limit is no number, or the lowest is above the highest.
+            ValueError: A limit is not a number, or ``clip_min`` is above ``clip_max``.
         """
         for name, value in (("clip_min", clip_min), ("clip_max", clip_max)):
             checks.number(name, value, endless=True, optional=True, error=ValueError)

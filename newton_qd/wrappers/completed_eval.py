@@ -16,13 +16,13 @@ from newton_qd.wrappers.evaluation import require_steps, with_reward_metric
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, eq=False)
 class CompletedEvalMetrics:
-    """Sums over completed episodes, world by world.
+    """Sums over completed episodes, separate for each world.
 
     Attributes:
         current_episode_metrics: () sums over the running episode.
         completed_episodes_metrics: () sums over the completed episodes.
         completed_episodes: () number of completed episodes.
-        completed_episodes_steps: () their steps together.
+        completed_episodes_steps: () number of steps of all completed episodes.
     """
 
     current_episode_metrics: Metrics
@@ -34,8 +34,8 @@ class CompletedEvalMetrics:
 class CompletedEvalWrapper(Wrapper):
     """Sums the metrics of every episode that ends.
 
-    Each world has its own sums, as every leaf of a batched state has the batch axis
-    in front; add them over that axis for the totals of a batch.
+    Each world has its own sums. For the totals of a batch, add them over the batch
+    axis, which is the first axis of every leaf.
     """
 
     STATE_INFO_KEY = "completed_eval_metrics"
@@ -58,7 +58,7 @@ class CompletedEvalWrapper(Wrapper):
         return state.replace(info={**state.info, self.STATE_INFO_KEY: sums})
 
     def step(self, state: State, action: Action, params: Params = None) -> State:
-        """Advances by one step; an episode that ends is added to the completed.
+        """Advances by one step; adds an episode that ends to the completed ones.
 
         Raises:
             TypeError: The state or the action has the wrong type.

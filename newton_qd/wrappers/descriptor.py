@@ -1,4 +1,4 @@
-"""State descriptors: the base class of wrappers that write one."""
+"""The base class of wrappers that write a state descriptor."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from newton_qd.wrappers.base import Wrapper
 class DescriptorWrapper(Wrapper, QDEnv):
     """Writes ``info["state_descriptor"]``; the base class for your own descriptors.
 
-    A subclass overrides ``describe`` and ``limits``, and where it wants to
+    A subclass overrides ``describe`` and ``limits``. It may also override
     ``descriptor_extractor``.
     """
 
     limits: ClassVar[tuple[Sequence[float], Sequence[float]]]
-    """Lowest and highest value of each of the nd components; what is beyond them is in
-    the outermost cells of an archive."""
+    """Lowest and highest value of each of the nd components. Values beyond these limits
+    are in the outermost cells of an archive."""
     descriptor_extractor: DescriptorExtractor = staticmethod(get_mean_state_descriptor)
-    """Makes the descriptors of episodes from their state descriptors: the mean."""
+    """Computes descriptors of episodes from state descriptors; by default the mean."""
 
     def __init__(self, env: Env, env_name: str) -> None:
         """Wraps an environment.
@@ -50,7 +50,7 @@ class DescriptorWrapper(Wrapper, QDEnv):
 
     @abc.abstractmethod
     def describe(self, state: State) -> Descriptor:
-        """What describes a state.
+        """Returns the state descriptor of a state.
 
         Args:
             state: State of one world after a reset or a step; ``pipeline_state`` is the
@@ -82,12 +82,12 @@ class DescriptorWrapper(Wrapper, QDEnv):
         describe = self._checked
         for _ in range(jnp.ndim(state.done)):
             describe = jax.vmap(describe)
-        # a buffer that is in a state twice could not be donated
+        # JAX could not donate a state that has a buffer twice
         described = jnp.copy(describe(state))
         return state.replace(info={**state.info, "state_descriptor": described})
 
     def _checked(self, state: State) -> Descriptor:
-        """Returns what describes a state of one world.
+        """Returns the state descriptor of one world.
 
         Raises:
             ValueError: It is of another shape than the limits have.
@@ -107,7 +107,7 @@ class DescriptorWrapper(Wrapper, QDEnv):
 
     @property
     def state_descriptor_name(self) -> str:
-        """What a state descriptor measures: the name of the class."""
+        """Name of the quantity that a state descriptor measures: the class name."""
         return type(self).__name__
 
     @property

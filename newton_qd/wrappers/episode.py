@@ -1,4 +1,4 @@
-"""Episodes of a given length."""
+"""Episodes with a given length."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from newton_qd.wrappers.base import Wrapper
 class EpisodeWrapper(Wrapper):
     """Counts steps, ends long episodes, and repeats actions.
 
-    ``info["steps"]`` counts the control steps of the environment inside; it stands
-    still once a world is at fault. ``info["truncation"]`` is 1 where the length
-    alone ended the episode.
+    ``info["steps"]`` counts the control steps of the environment inside. The count
+    stops when a world has a fault. ``info["truncation"]`` is 1 if the episode ended
+    only because it reached its length.
 
     Attributes:
         episode_length: Control steps after which an episode ends.
@@ -34,7 +34,7 @@ class EpisodeWrapper(Wrapper):
             action_repeat: Control steps for each action.
 
         Raises:
-            ValueError: A number is no integer above 0.
+            ValueError: A number is not an integer above 0.
         """
         checks.integer("episode_length", episode_length)
         checks.integer("action_repeat", action_repeat)
@@ -56,7 +56,7 @@ class EpisodeWrapper(Wrapper):
         return state.replace(info={**state.info, **counts})
 
     def step(self, state: State, action: Action, params: Params = None) -> State:
-        """Repeats the action; the rewards are summed, the rest is of the last.
+        """Repeats the action and sums rewards; all else is from the last repetition.
 
         Raises:
             TypeError: The state or the action has the wrong type.
@@ -97,12 +97,12 @@ class EpisodeWrapper(Wrapper):
 
     @property
     def dt(self) -> float:
-        """Duration of a step: that of all repetitions [s]."""
+        """Duration of a step with all repetitions [s]."""
         return self.env.dt * self.action_repeat
 
 
 def _moving(state: State) -> jax.Array:
-    """Returns 1 where the next step counts: where the world is not at fault."""
+    """Returns 1 if the next step counts, because the world has no fault, else 0."""
     if "fault" not in state.info:
         return jnp.ones_like(state.done)
     return (state.info["fault"] == 0).astype(state.done.dtype)

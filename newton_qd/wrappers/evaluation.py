@@ -19,8 +19,8 @@ class EvalMetrics:
     """Sums over the first episode.
 
     Attributes:
-        episode_metrics: () sum of each metric, the reward among them.
-        active_episodes: () 1 while the first episode lasts, then 0.
+        episode_metrics: () sum of each metric, with the reward as a metric.
+        active_episodes: () 1 during the first episode, then 0.
         episode_steps: () length of the episode so far.
     """
 
@@ -51,7 +51,7 @@ class EvalWrapper(Wrapper):
         return state.replace(info={**state.info, self.STATE_INFO_KEY: sums})
 
     def step(self, state: State, action: Action, params: Params = None) -> State:
-        """Advances by one step and adds its metrics while the episode lasts.
+        """Advances by one step and adds its metrics until the episode ends.
 
         Raises:
             TypeError: The state or the action has the wrong type.
@@ -84,7 +84,7 @@ def with_reward_metric(state: State) -> State:
 
 
 def require_steps(state: State, wrapper: str) -> None:
-    """Raises where no ``EpisodeWrapper`` counts steps.
+    """Raises an error if no ``EpisodeWrapper`` counts steps.
 
     Raises:
         ValueError: ``info`` has no steps.

@@ -19,8 +19,8 @@ from newton_qd.wrappers.descriptor import DescriptorWrapper
 class FeetContactWrapper(DescriptorWrapper):
     """Writes which feet touched the ground into ``info["state_descriptor"]``.
 
-    Contacts are impulses over a control step, so after a reset no foot touches.
-    With repeated actions the last repetition counts.
+    Contacts are impulses over a control step, so no foot has contact after a reset.
+    If actions are repeated, the last repetition counts.
     """
 
     descriptor_extractor = staticmethod(get_feet_contact_proportion)
@@ -37,15 +37,16 @@ class FeetContactWrapper(DescriptorWrapper):
         Args:
             env: The environment.
             env_name: Its name, used in errors.
-            smooth_width: ``None``: 0 or 1 without a gradient; else between them,
-                rising over this share of the robot's weight, above 0.
-            straight_through: Whether the reading stays 0 or 1 and has the gradient
-                of the smooth one.
+            smooth_width: ``None``: the contact is 0 or 1 and has no gradient. A number
+                above 0: the contact rises smoothly from 0 to 1 over this share of the
+                robot's weight [-].
+            straight_through: Whether the contact is 0 or 1, but has the gradient of
+                the smooth contact.
 
         Raises:
             NotImplementedError: The environment is not a simulated robot with feet.
-            TypeError: The width is no number.
-            ValueError: A width that is not finite and above 0, or none for a
+            TypeError: The width is not a number.
+            ValueError: The width is not finite or not above 0, or is missing for a
                 straight-through gradient.
         """
         robot = env.unwrapped
@@ -67,7 +68,7 @@ class FeetContactWrapper(DescriptorWrapper):
         self._straight_through = straight_through
 
     def describe(self, state: State) -> Descriptor:
-        """Returns which feet touched the ground (nf,): 0 or 1, or between them."""
+        """Returns the ground contact of each foot (nf,), from 0 to 1."""
         physics: PhysicsState = state.pipeline_state
         if not self._smooth:
             return physics.feet_contact
@@ -75,7 +76,7 @@ class FeetContactWrapper(DescriptorWrapper):
         if not self._straight_through:
             return smooth
         # Bengio et al. 2013, "Estimating or propagating gradients through stochastic
-        # neurons"; the difference is exactly 0
+        # neurons"; the value of the added difference is exactly 0
         return physics.feet_contact + (smooth - jax.lax.stop_gradient(smooth))
 
     @property
@@ -91,7 +92,7 @@ class FeetContactWrapper(DescriptorWrapper):
 
     @property
     def state_descriptor_name(self) -> str:
-        """What a state descriptor measures."""
+        """Name of the quantity that a state descriptor measures."""
         return "feet_contact"
 
     @property

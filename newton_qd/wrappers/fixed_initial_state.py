@@ -12,11 +12,10 @@ from newton_qd.wrappers.base import Wrapper, unsupported
 
 
 class FixedInitialStateWrapper(Wrapper):
-    """Begins every episode in the default pose, at rest, whatever the key.
+    """Begins every episode in the default pose, at rest. The key has no effect.
 
-    It takes effect directly around the environment inside all wrappers, wherever it
-    is put: so the other wrappers read their first values from the state that is
-    really used.
+    The wrapper moves inside all other wrappers, directly around the base environment.
+    So the other wrappers compute their first values from the fixed state.
     """
 
     def __init__(
@@ -27,7 +26,8 @@ class FixedInitialStateWrapper(Wrapper):
         Args:
             env: The environment, with or without wrappers; it is not changed.
             base_env_name: Its name, used in errors.
-            get_obs_fn: Only that of ``newton_qd.brax_views`` takes one.
+            get_obs_fn: Must be ``None``. The wrapper of this name in
+                ``newton_qd.brax_views`` takes a function.
 
         Raises:
             TypeError: A ``get_obs_fn`` is given.
@@ -57,7 +57,7 @@ class FixedInitialStateWrapper(Wrapper):
         """
         if not self._effective:
             return self.env.reset(rng)
-        # of what is inside now: ``with_base`` may have put something else there
+        # asks the current inner environment, because ``with_base`` may have changed it
         inside: Any = self.env
         return self._first(inside.fixed_state())
 

@@ -11,15 +11,15 @@ from newton_qd.envs.vectors import length
 from newton_qd.scenes import MAZE
 from newton_qd.wrappers.scene_task import SceneTaskWrapper
 
-_HEIGHTS = (0.2, 5.0)  # the torso of a robot that goes on is between these [m]
+_HEIGHTS = (0.2, 5.0)  # an episode ends if the torso is not between these [m]
 
 
 class MazeWrapper(SceneTaskWrapper):
-    """Borders around 45 m by 45 m, three walls inside, and a target to come near to.
+    """A maze of 45 m by 45 m with borders, three walls inside, and a target.
 
     The observation begins with (x - 17.5, y - 17.5) / 22.5. The reward is minus the
-    distance of the torso from the target on the ground [m], at a reset too. Done
-    when the torso is below 0.2 m or above 5 m; the target itself ends nothing.
+    horizontal distance of the torso from the target [m], also at a reset. Done when the
+    torso is below 0.2 m or above 5 m. An episode does not end at the target.
     """
 
     scene = MAZE
@@ -34,8 +34,8 @@ class MazeWrapper(SceneTaskWrapper):
             env_name: Its name, used in errors.
 
         Raises:
-            NotImplementedError: The environment is no such robot.
-            ValueError: The robot stands in a scene already.
+            NotImplementedError: The environment is not such a robot.
+            ValueError: The robot has a scene already.
         """
         super().__init__(env, env_name)
         system = self.system
@@ -47,7 +47,8 @@ class MazeWrapper(SceneTaskWrapper):
         away = position[:2] - np.asarray(self._target, self.dtype)
         low, high = (np.asarray(height, self.dtype) for height in _HEIGHTS)
         outside = (position[2] < low) | (position[2] > high)
-        # a world at fault is frozen: reward 0 and done 1, as from the robot itself
+        # a world that has a fault is frozen: reward 0 and done 1, as without this
+        # wrapper
         faulty = state.info["fault"] != 0
         reward = -length(away)
         return state.replace(

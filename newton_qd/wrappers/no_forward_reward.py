@@ -1,4 +1,4 @@
-"""Rewards without the part for running forward."""
+"""Rewards without the forward part."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from newton_qd.wrappers.base import Wrapper, unsupported
 
 
 class NoForwardRewardWrapper(Wrapper):
-    """Takes the forward part out of the reward of a step; the metrics keep it."""
+    """Subtracts the forward part from the reward of a step; metrics do not change."""
 
     def __init__(self, env: Env, env_name: str) -> None:
         """Wraps a simulated robot whose reward has a forward part.
 
         Args:
-            env: The environment; its class gives ``forward_reward_name``. Where it
-                repeats actions, this wrapper goes inside the ``EpisodeWrapper``.
+            env: The environment; its class has a ``forward_reward_name``. If actions
+                are repeated, put this wrapper inside the ``EpisodeWrapper``.
             env_name: Its name, used in errors.
 
         Raises:

@@ -16,11 +16,11 @@ class OffsetRewardWrapper(Wrapper):
         """Wraps an environment.
 
         Args:
-            env: The environment; an action that it repeats gets the offset once.
-            offset: What is added, as ``newton_qd.tables.reward_offset[name]``.
+            env: The environment; the offset is added once for a repeated action.
+            offset: Number to add, such as ``newton_qd.tables.reward_offset[name]``.
 
         Raises:
-            TypeError: ``offset`` is no number.
+            TypeError: ``offset`` is not a number.
             ValueError: ``offset`` is not finite.
         """
         checks.number("offset", offset)

@@ -1,4 +1,4 @@
-"""The wrapper that changes nothing, around an environment with a descriptor."""
+"""The base class of wrappers around an environment with a descriptor."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from newton_qd.wrappers.base import Wrapper
 
 
 class QDWrapper(Wrapper, QDEnv):
-    """An environment with a descriptor around another one; forwards everything."""
+    """A wrapper around an environment with a descriptor. It forwards everything."""
 
     @property
     def state_descriptor_length(self) -> int:
@@ -50,5 +50,5 @@ class QDWrapper(Wrapper, QDEnv):
 
     @property
     def _described(self) -> Any:
-        # any environment that has the properties: they may be forwarded to it
+        # any environment with these properties; a wrapper may forward them
         return self.env

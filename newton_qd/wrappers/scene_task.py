@@ -1,4 +1,4 @@
-"""What trap and maze have in common: walls, and where the robot is among them."""
+"""Shared code of trap and maze: walls, and the robot's position among them."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from newton_qd.wrappers.base import Wrapper, unsupported
 
 
 class SceneTaskWrapper(Wrapper):
-    """Puts a robot into a scene and its scaled position in front of the observation.
+    """Adds a scene, and puts the scaled position at the front of the observation.
 
-    It takes effect directly around the environment inside all wrappers, wherever it
-    is put: so wrappers around it see the rewards and the ends of the task.
+    The wrapper moves inside all other wrappers, directly around the base environment.
+    So the other wrappers see the rewards of the task and the ends of its episodes.
     """
 
     scene: Scene
     """The walls."""
     xy_centre: tuple[float, float]
-    """Position that is observed as zero [m]."""
+    """Position with the observation zero [m]."""
     xy_scale: tuple[float, float]
-    """Distances from it that are observed as one [m]."""
+    """Distances from the centre with the observation one [m]."""
 
     def __init__(self, env: Env, env_name: str) -> None:
         """Wraps a simulated robot with a floating torso; ``env`` is not changed.
@@ -39,8 +39,8 @@ class SceneTaskWrapper(Wrapper):
             env_name: Its name, used in errors.
 
         Raises:
-            NotImplementedError: The environment is no such robot.
-            ValueError: The robot stands in a scene already.
+            NotImplementedError: The environment is not such a robot.
+            ValueError: The robot has a scene already.
         """
         base = env.unwrapped
         if not isinstance(base, PhysicsEnv) or not _floats(base.system):

@@ -1,4 +1,4 @@
-"""State descriptors that follow an auto-reset."""
+"""State descriptors that are reset with the world."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from newton_qd.wrappers.qd import QDWrapper
 
 
 class StateDescriptorResetWrapper(QDWrapper):
-    """Returns the state descriptor of a finished world to its first value.
+    """Resets the state descriptor of a finished world to its first value.
 
-    ``AutoResetWrapper`` does so already; this is for worlds that another wrapper
-    resets. The observation stays as it is.
+    ``AutoResetWrapper`` does this already. Use this wrapper if another wrapper resets
+    the worlds. It does not change the observation.
     """
 
     def reset(self, rng: RNGKey) -> State:
-        """Begins an episode and remembers its first state descriptor.
+        """Begins an episode and stores its first state descriptor.
 
         Raises:
             KeyError: No wrapper inside writes a state descriptor.
@@ -33,7 +33,7 @@ class StateDescriptorResetWrapper(QDWrapper):
         return state.replace(info={**state.info, "first_state_descriptor": first})
 
     def step(self, state: State, action: Action, params: Params = None) -> State:
-        """Advances by one step, then returns the descriptors of finished worlds.
+        """Advances by one step, then resets the state descriptors of finished worlds.
 
         Raises:
             TypeError: The state or the action has the wrong type.

@@ -1,4 +1,4 @@
-"""A trap in the way of a robot that runs forward."""
+"""A trap in front of a robot that runs forward."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ from newton_qd.wrappers.scene_task import SceneTaskWrapper
 
 
 class TrapWrapper(SceneTaskWrapper):
-    """Three walls in a U, open towards the robot, 12 m ahead.
+    """Three walls in the shape of a U, open towards the robot, 12 m in front of it.
 
-    The observation begins with ((x - 15) / 15, y / 8); reward and end are those of
-    the environment inside.
+    The observation begins with ((x - 15) / 15, y / 8). Reward and done do not change.
     """
 
     scene = TRAP

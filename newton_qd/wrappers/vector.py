@@ -15,10 +15,10 @@ from newton_qd.wrappers.base import Wrapper
 
 
 class VectorWrapper(Wrapper):
-    """Steps a batch of worlds; every leaf of the state has the batch axis in front.
+    """Steps a batch of worlds; the first axis of every leaf of a state is the batch.
 
     Attributes:
-        batch_size: Number of worlds that a reset makes; a step takes any number.
+        batch_size: Number of worlds of a reset. A step takes any number of worlds.
     """
 
     def __init__(self, env: Env, batch_size: int) -> None:
@@ -26,10 +26,11 @@ class VectorWrapper(Wrapper):
 
         Args:
             env: The environment.
-            batch_size: Number of worlds that a reset makes.
+            batch_size: Number of worlds of a reset.
 
         Raises:
-            ValueError: The number is no integer above 0, or there is a batch already.
+            ValueError: ``batch_size`` is not an integer above 0, or ``env`` has a batch
+                already.
         """
         checks.integer("batch_size", batch_size)
         inside = env
@@ -56,7 +57,7 @@ class VectorWrapper(Wrapper):
         Args:
             state: Batched state.
             action: (batch, nu) actions.
-            params: As for the environment inside, with the batch axis in front.
+            params: As for one world, with the batch axis in front.
 
         Raises:
             TypeError: The state or the action has the wrong type.
@@ -83,7 +84,7 @@ class VectorWrapper(Wrapper):
 
     @property
     def default_params(self) -> Params:
-        """Those of the environment inside, for each of ``batch_size`` worlds."""
+        """Default ``params`` of ``batch_size`` worlds."""
         size = (self.batch_size,)
         return jax.tree.map(
             lambda leaf: jnp.broadcast_to(leaf, size + jnp.shape(leaf)),

@@ -22,10 +22,10 @@ Limits = Sequence[float] | np.ndarray | jax.Array
 class XYPositionWrapper(DescriptorWrapper):
     """Writes where the torso is into ``info["state_descriptor"]``.
 
-    The state descriptor is kept within the limits; ``info["xy_position"]`` is the
-    position itself. With repeated actions the last repetition counts. The torso is the
-    robot's first link where its spec names no other: of an arm it sits on its pivot,
-    and its position tells nothing.
+    The state descriptor is clipped to the limits. ``info["xy_position"]`` is not
+    clipped. If actions are repeated, the last repetition counts. The torso is the
+    robot's first link, unless its spec names another one. The first link of an arm does
+    not move, so its position carries no information.
     """
 
     descriptor_extractor = staticmethod(get_final_xy_position)
@@ -60,12 +60,12 @@ class XYPositionWrapper(DescriptorWrapper):
             raise ValueError(message("minval, maxval", (minval, maxval), allowed))
 
     def describe(self, state: State) -> Descriptor:
-        """Returns the position (2,) of the torso within the limits [m]."""
+        """Returns the position (2,) of the torso, clipped to the limits [m]."""
         low, high = self.state_descriptor_limits
         return jnp.clip(state.pipeline_state.torso_xy, low, high)
 
     def _described(self, state: State) -> State:
-        # a buffer that is in a state twice could not be donated
+        # JAX could not donate a state that has a buffer twice
         position = jnp.copy(state.pipeline_state.torso_xy)
         state = super()._described(state)
         return state.replace(info={**state.info, "xy_position": position})
@@ -77,7 +77,7 @@ class XYPositionWrapper(DescriptorWrapper):
 
     @property
     def state_descriptor_name(self) -> str:
-        """What a state descriptor measures."""
+        """Name of the quantity that a state descriptor measures."""
         return "xy_position"
 
     @property
