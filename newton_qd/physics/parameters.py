@@ -99,7 +99,7 @@ def check_bounds(name: str, values: np.ndarray) -> None:
 
 
 def _checked(
-    name: str, value: object, shape: tuple[int, ...], dtype: np.dtype
+    name: str, value: jax.Array, shape: tuple[int, ...], dtype: np.dtype
 ) -> jax.Array:
     """Returns one parameter, strongly typed; weakly typed numbers are converted."""
     array = checks.array(f"params.{name}", value, shape, dtype, scalars=True)
