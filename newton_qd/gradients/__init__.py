@@ -1,16 +1,16 @@
-"""Gradients of fitness and descriptor over whole episodes, and what they are worth.
+"""Gradients of fitness and descriptor over whole episodes, and checks of their quality.
 
-- ``Episode``: an environment under a policy or open-loop actions; its methods are
-  ``gradient``, ``directional`` (of weighted sums alone), ``mixed`` (of first and zeroth
+- ``Episode``: an environment with a policy or open-loop actions; its methods are
+  ``gradient``, ``directional`` (only of weighted sums), ``mixed`` (first and zeroth
   order, under noise) and ``scoring`` (QDax's contract)
 - ``GradientOptions``: windows, clipping, discounting, memory
-- ``diagnose_gradients``: over how many steps the gradient can be used
-- ``soft_to_stiff``, ``softened``: softer contacts, and the way back
+- ``diagnose_gradients``: the number of steps for which the gradient is useful
+- ``soft_to_stiff``, ``softened``: softer contacts, and a series back to stiff ones
 - ``with_smooth_descriptor``: an environment whose descriptor has a gradient
 - ``make_episode``, ``make_episode_gradient``, ``make_directional_gradient``,
   ``make_mixed_gradient``: deprecated; methods of ``Episode``
 
-Importing this package imports none of its parts: each name is loaded when it is
+Importing this package imports no other module of it. Each name is loaded when it is
 first used.
 """
 
@@ -72,7 +72,11 @@ _HOME = {
 
 
 def __getattr__(name: str) -> Any:
-    """Loads a name of this package when it is first used."""
+    """Loads a name of this package when it is first used.
+
+    Raises:
+        AttributeError: The package has no such name.
+    """
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)

@@ -1,4 +1,4 @@
-"""The gradient doctor: over how many control steps a gradient can be used, and why."""
+"""The gradient doctor: measures for how many control steps a gradient is useful."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from newton_qd.gradients.mixed import Mixture
 from newton_qd.gradients.report import ContactRow, GradientReport, HorizonRow
 from newton_qd.types import Genotype, Policy, RNGKey
 
-_BREAK = 0.1  # error of a step's derivative over that reach, above which it is broken
+_BREAK = 0.1  # relative error above which the derivative of a step is broken
 
 
 def diagnose_gradients(
@@ -43,26 +43,29 @@ def diagnose_gradients(
     sigma: float = 0.05,
     seed: int = 0,
 ) -> GradientReport:
-    """Measures what the gradient of the return is worth, horizon by horizon.
+    """Measures the quality of the gradient of the return for each horizon.
 
-    Three comparisons, all in float64: with central differences along random
-    directions, whether the gradient is that of the function; of first- with
-    zeroth-order estimates under noise, whether it is a better guide than an evolution
-    strategy with as many samples (Suh et al. 2022, "Do differentiable simulators give
-    better policy gradients?"); and over finite changes, which contacts end its
-    validity, and when.
+    It makes three comparisons, all in float64:
+
+    - The gradient is compared with central differences along random directions. This
+      shows whether the gradient is correct.
+    - First- and zeroth-order estimates under noise are compared. This shows whether the
+      gradient is better than an evolution strategy with as many samples (Suh et al.
+      2022, "Do differentiable simulators give better policy gradients?").
+    - The gradient is compared with finite changes. This shows which contacts limit its
+      validity, and at which step.
 
     Args:
         env: Name, or an environment of one world in float64. Rewards count up to the
             first ``done``.
         policy: Maps a genotype and an observation to an action, or ``None``.
-        genotypes: Pytree with one entry a world in front; without a policy plans of
-            actions (worlds, steps, nu), by default uniform random ones.
+        genotypes: Pytree with leaves (worlds, ...). Without a policy: plans of actions
+            (worlds, steps, nu), by default uniform random plans.
         horizons: Numbers of control steps, ascending.
-        worlds: Number of random plans; not read where there are genotypes. All worlds
-            share one reset.
-        directions: Random directions of the differences, in each world.
-        samples: Pairs of noisy samples, in each world.
+        worlds: Number of random plans. It has no effect if genotypes are given. All
+            worlds share one reset.
+        directions: Number of random directions of the differences for each world.
+        samples: Pairs of noisy samples for each world.
         sigma: Standard deviation of the noise, in the units of the genotype.
         seed: Seed of reset, plans, directions and noise.
 
@@ -71,8 +74,8 @@ def diagnose_gradients(
 
     Raises:
         TypeError: A setting has the wrong type.
-        ValueError: A setting is out of its range, or the environment in float32.
-        FaultError: A world is at fault, or too many of its noisy samples are.
+        ValueError: A setting is out of its range, or the environment is float32.
+        FaultError: A world has a fault, or too many of its noisy samples have one.
     """
     checks.integer("worlds", worlds)
     checks.integer("directions", directions)
@@ -103,7 +106,11 @@ def _report(
     samples: int,
     sigma: float,
 ) -> GradientReport:
-    """The findings; the keys are those of the directions and of the noise."""
+    """Returns the report; the two keys are for the directions and for the noise.
+
+    Raises:
+        FaultError: Too many noisy samples have a fault.
+    """
     ends = np.asarray(horizons, np.int32)
     difference, gradients = take_differences(subject, genotypes, keys[0], directions)
     refuse_faults(difference.faulty)
@@ -171,7 +178,7 @@ def _root(variance: jax.Array, index: int) -> float:
 
 
 def _cosines(difference: Differences, step: int) -> np.ndarray:
-    """Cosine (worlds,) of exact and central derivatives over all directions."""
+    """Returns the cosine (worlds,) of exact and central derivatives."""
     exact = difference.exact[:, :, step]
     central = difference.central[:, :, :-1, step]
     scale = np.linalg.norm(exact, axis=1)[:, None] * np.linalg.norm(central, axis=1)
@@ -181,7 +188,7 @@ def _cosines(difference: Differences, step: int) -> np.ndarray:
 
 
 def _contacts(subject: Subject, difference: Differences) -> tuple[ContactRow, ...]:
-    """Where finite changes leave the gradient: the first broken step of each pair."""
+    """Returns the contacts at the first step whose derivative is broken."""
     exact = np.diff(difference.exact, axis=2, prepend=0.0)
     finite = np.diff(difference.central[:, :, -1], axis=2, prepend=0.0)
     scale = np.sqrt(np.mean(exact**2, axis=1, keepdims=True))

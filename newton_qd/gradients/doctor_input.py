@@ -1,4 +1,4 @@
-"""What the gradient doctor is given: settings, environment, genotypes."""
+"""Input of the gradient doctor: settings, environment, genotypes."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from newton_qd.types import Genotype, Policy
 
 
 def refuse_faults(faulty: np.ndarray) -> None:
-    """Raises where a world (worlds, steps) is at fault: a gradient of 0 says nothing.
+    """Checks that no world (worlds, steps) has a fault, because its gradient is 0.
 
     Raises:
-        FaultError: One is.
+        FaultError: A world has a fault.
     """
     worlds = faulty.any(axis=1)
     if worlds.any():
@@ -38,11 +38,11 @@ def refuse_faults(faulty: np.ndarray) -> None:
 
 
 def checked_horizons(horizons: Sequence[int] | np.ndarray) -> tuple[int, ...]:
-    """Numbers of control steps.
+    """Returns the horizons as a tuple of integers.
 
     Raises:
-        TypeError: They are no sequence.
-        ValueError: They are no ascending integers.
+        TypeError: They are not a sequence.
+        ValueError: They are not ascending integers.
     """
     refusal = message("horizons", horizons, "ascending integers from 1")
     if isinstance(horizons, str) or not isinstance(horizons, (Sequence, np.ndarray)):
@@ -58,11 +58,11 @@ def checked_horizons(horizons: Sequence[int] | np.ndarray) -> tuple[int, ...]:
 def checked_genotypes(
     genotypes: Genotype | None, env: Env, policy: Policy | None, length: int
 ) -> Genotype:
-    """Genotypes in the precision of the environment; plans as long as is needed.
+    """Returns genotypes in the dtype of the environment; cuts plans to ``length``.
 
     Raises:
-        ValueError: There are none, the leaves differ in the number of worlds, or plans
-            are no actions (worlds, steps, nu) for all steps.
+        ValueError: They are missing, their leaves have different numbers of worlds, or
+            plans are not actions (worlds, steps, nu) for all steps.
     """
     if genotypes is None:
         raise ValueError(message("genotypes", None, "with a policy: what it acts by"))
@@ -90,11 +90,11 @@ def checked_genotypes(
 
 
 def made_env(env: Env | str) -> Env:
-    """The environment to diagnose.
+    """Returns the environment to diagnose.
 
     Raises:
         TypeError: It is neither a name nor an environment.
-        ValueError: It is in float32.
+        ValueError: It is float32.
     """
     if isinstance(env, str):
         return create(env, episode_length=None, auto_reset=False, dtype="float64")

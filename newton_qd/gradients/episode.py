@@ -1,4 +1,4 @@
-"""Episodes of an environment: what they come to, and the gradients of that."""
+"""Episodes of an environment: their results and the gradients of these results."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ _MOVED = {
 
 
 def __getattr__(name: str) -> Any:
-    """Finds what has left this module."""
+    """Returns a moved object by its old name."""
     return moved_name(__name__, name, _MOVED)
 
 
 Start: TypeAlias = RNGKey | StateLike
-"""Where an episode begins: a key of the reset, or a state of one world."""
+"""Start of an episode: a key of the reset, or a state of one world."""
 
 _Same = TypeVar("_Same")
 
@@ -63,14 +63,14 @@ def itself(genotype: _Same) -> _Same:
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True, eq=False)
 class Episode:
-    """One episode of an environment under a policy, and its gradients.
+    """One episode of an environment with a policy, and its gradients.
 
-    Every method is a pure function that ``jax.jit`` and ``jax.vmap`` take; an episode
-    is immutable, compares and hashes by identity, and is static where a transformed
-    function takes it as an argument. Called, it runs one world; it is differentiable in
-    the genotype, in the state that it begins from and in the physical parameters of the
-    world. The other methods take N genotypes, a pytree whose leaves have N in front,
-    and share one start among them.
+    Every method is a pure function and works with ``jax.jit`` and ``jax.vmap``. An
+    episode is immutable. It compares and hashes by identity, so it can be a static
+    argument of jitted functions. A call runs one world. It is differentiable with
+    respect to the genotype, the initial state and the physical parameters of the world.
+    The other methods take N genotypes, a pytree with leaves (N, ...). All N episodes
+    have the same start.
 
         episode = Episode(env, policy, extractor, episode_length=100)
         outcome = episode(genotype, key)
@@ -78,31 +78,28 @@ class Episode:
         score = jax.jit(episode.scoring(episode.gradient))
 
     Attributes:
-        env: Environment of one world without auto-reset; with
-            ``info["state_descriptor"]`` where a descriptor is extracted. The descriptor
-            has a gradient where the environment's does: see
+        env: Environment of one world without auto-reset. A descriptor needs
+            ``info["state_descriptor"]``, and its gradient needs a smooth one: see
             :func:`~newton_qd.gradients.with_smooth_descriptor`.
         policy: Maps parameters and an observation to an action; ``None``: the
-            parameters are the actions themselves, (episode_length, nu) or as many
-            numbers in another shape.
+            parameters are the actions, (episode_length, nu) or as many numbers in
+            another shape.
         descriptor_extractor: Maps ``(data, mask)`` to descriptors (1, D), with
             ``data.state_desc`` (1, T, nd) and ``mask`` (1, T) equal to 1 after the
-            end of the episode; ``newton_qd.tables.descriptor_extractor`` has those of
-            tasks. ``None``: the descriptor is empty, and the fitness alone has a
-            gradient.
-        episode_length: Control steps; a reward counts up to the first ``done``.
-        options: What becomes of a gradient on its way back through the episode:
-            windows, clipping, discounting and memory. By default it is exact, and one
-            state is kept per control step. The value never changes.
-        unravel: Maps a genotype to the parameters, once an episode.
-        transitions: Whether to return the steps, for algorithms that learn from
-            them. An episode that ends early is followed by another one then, which
-            counts for nothing else.
+            end of the episode. ``newton_qd.tables.descriptor_extractor`` has the
+            extractors of tasks. ``None``: the descriptor is empty, and only the fitness
+            has a gradient.
+        episode_length: Control steps. Rewards count up to the first ``done``.
+        options: Windows, clipping, discounting and memory of the gradient. By default
+            it is exact, and the way back stores one state per control step. Options
+            never change the value of the episode.
+        unravel: Maps a genotype to the parameters, once per episode.
+        transitions: Whether to return the steps, for algorithms that learn from them.
+            If an episode ends early, another one then follows. It has no effect on
+            fitness and descriptor.
 
     Raises:
-        TypeError: ``env`` is no environment, ``policy``, ``descriptor_extractor`` or
-            ``unravel`` no function, ``options`` something else than ``GradientOptions``
-            or ``transitions`` neither true nor false.
+        TypeError: An argument has the wrong type.
         ValueError: ``episode_length`` is not an integer from 1.
     """
 
@@ -135,15 +132,15 @@ class Episode:
         """Runs the episode in one world.
 
         Args:
-            genotype: Whose policy acts, or the actions.
-            start: Key of the reset, or the state that the episode begins from.
-            params: Physical parameters of the world; ``None``: as in its files.
+            genotype: Genotype of the policy, or the actions.
+            start: Key of the reset, or the initial state.
+            params: Physical parameters of the world; ``None``: the default ones.
 
         Raises:
             TypeError: ``start`` is neither a key nor a state.
-            ValueError: ``start`` is a state of several worlds or without the state
-                descriptor that is read, or the genotype is no plan of actions where
-                there is no policy.
+            ValueError: ``start`` is a state of several worlds, it has no state
+                descriptor but a descriptor is extracted, or there is no policy and the
+                genotype is not a plan of actions.
         """
         parameters = self.unravel(genotype)
         is_key = isinstance(start, (jax.Array, np.ndarray))
@@ -175,18 +172,18 @@ class Episode:
     ) -> EpisodeGradients:
         """Runs N episodes, with the gradients of fitness and descriptor.
 
-        All rows of the Jacobian go back through the episode at once: a launch of the
-        physics' adjoint has N (1 + D) worlds. The values are bitwise those of the
-        episode without gradients.
+        All rows of the Jacobian go back through the episode together: one launch of the
+        physics' adjoint has N (1 + D) worlds. The values are bitwise equal to those of
+        the episode without gradients.
 
         Args:
             genotypes: Leaves (N, ...).
-            start: One key of the reset, or one state, for all.
-            params: Physical parameters of all worlds; ``None``: as in their files.
+            start: One key of the reset, or one state, for all episodes.
+            params: Physical parameters of all worlds; ``None``: the default ones.
 
         Raises:
-            TypeError: As when the episode is called.
-            ValueError: Likewise.
+            TypeError: ``start`` is neither a key nor a state.
+            ValueError: ``start`` or a genotype is wrong, as in a call of the episode.
         """
         axes = (0, None, None, None)
         return jax.vmap(self._differentiated, axes)(genotypes, None, start, params)
@@ -200,23 +197,23 @@ class Episode:
     ) -> EpisodeGradients:
         """Runs N episodes, with the gradients of weighted sums of their results.
 
-        What :meth:`gradient` gives, multiplied by weights, for the price of as many
-        rows as there are sums: a launch of the physics' adjoint has N R worlds.
+        The result is that of :meth:`gradient` multiplied by weights. It costs only as
+        many rows as there are sums: one launch of the physics' adjoint has N R worlds.
 
         Args:
             genotypes: Leaves (N, ...).
-            weights: (N, R, 1 + D), of the fitness first, then of each component of the
-                descriptor.
-            start: One key of the reset, or one state, for all.
-            params: Physical parameters of all worlds; ``None``: as in their files.
+            weights: (N, R, 1 + D) weights, first of the fitness, then of each component
+                of the descriptor.
+            start: One key of the reset, or one state, for all episodes.
+            params: Physical parameters of all worlds; ``None``: the default ones.
 
         Returns:
-            Gradients with the rows of the sums, leaves (N, R, ...), and ``overflowed``
+            Gradients with one row per sum, leaves (N, R, ...), and ``overflowed``
             (N, R).
 
         Raises:
-            TypeError: As when the episode is called.
-            ValueError: Likewise.
+            TypeError: ``start`` is neither a key nor a state.
+            ValueError: ``start`` or a genotype is wrong, as in a call of the episode.
         """
         axes = (0, 0, None, None)
         return jax.vmap(self._differentiated, axes)(genotypes, weights, start, params)
@@ -233,28 +230,30 @@ class Episode:
     ) -> MixedGradients:
         """Runs N episodes, with gradients of first and zeroth order under noise.
 
-        It estimates the gradient of the mean of f(x + w), w normal with standard
-        deviation ``sigma``, by alpha times the mean gradient of the samples plus
-        (1 - alpha) times the mean of (f(x + w) - f(x - w)) w / (2 sigma^2), in pairs of
-        w and -w. Alpha weights them by their inverse variances, and less where the two
-        differ by more than the tolerance: the alpha-order gradient of Suh et al. 2022,
-        "Do differentiable simulators give better policy gradients?", whose error bound
-        of the zeroth order is its standard error here.
+        It estimates the gradient of the mean of f(x + w), where w is normal noise with
+        standard deviation ``sigma``. The estimate is alpha times the mean gradient of
+        the samples plus (1 - alpha) times the mean of (f(x + w) - f(x - w)) w /
+        (2 sigma^2), in pairs of w and -w. Alpha follows from the inverse variances of
+        the two. It is smaller if the two differ by more than the tolerance. This is the
+        alpha-order gradient of Suh et al. 2022, "Do differentiable simulators give
+        better policy gradients?". Its error bound of the zeroth order is here the
+        standard error.
 
         Args:
             genotypes: Leaves (N, ...).
-            key: Of the reset that all share; it gives the noise, too.
-            params: Physical parameters of all worlds; ``None``: as in their files.
-            samples: Pairs of samples of a genotype, from 2; N individuals are
-                2 N ``samples`` worlds, in one launch.
+            key: Key of the shared reset and of the noise.
+            params: Physical parameters of all worlds; ``None``: the default ones.
+            samples: Pairs of samples for each genotype, at least 2. One launch has
+                2 N ``samples`` worlds.
             sigma: Standard deviation of the noise, in the units of the genotype.
-            tolerance: Error that the estimate may have where first and zeroth order
-                disagree, in units of the gradient; infinite: inverse variances alone,
-                which trusts a first order that is wrong without being noisy.
+            tolerance: Allowed error of the estimate if first and zeroth order disagree,
+                in units of the gradient. Infinite: only inverse variances count. Then a
+                wrong first order with little noise gets a large weight.
 
         Raises:
-            TypeError: A setting is no number, or as when the episode is called.
-            ValueError: A setting is out of its range, or likewise.
+            TypeError: A setting is not a number, or ``key`` is not a key.
+            ValueError: A setting is out of its range, or a genotype is wrong, as in a
+                call of the episode.
         """
         check_mixture(samples, sigma, tolerance)
         return mixed_gradients(
@@ -272,18 +271,19 @@ class Episode:
 
         Args:
             gradient: Maps genotypes and a key to gradients: :meth:`gradient`, or
-                ``functools.partial(episode.mixed, sigma=0.05)``; ``None``: the scores
-                have none.
+                ``functools.partial(episode.mixed, sigma=0.05)``; ``None``: no
+                gradients.
 
         Returns:
-            Function of genotypes, leaves (N, ...), and one key of the reset; returns
-            fitnesses (N,), ``-inf`` where a world was at fault, descriptors (N, D) and
-            a dictionary. With gradients it holds ``gradients``, every leaf of the
-            genotypes with an axis of 1 + D behind, the fitness first;
-            ``normalized_grads``, the same with Euclidean norm 1 over a genotype, or 0
-            where the gradient is; ``faulty`` (N,) and ``overflowed`` (N, 1 + D), whose
-            gradients were set to 0. Without, it holds ``transitions``, if the episode
-            returns them: the fields of QDax's ``QDTransition`` by name, (N, T, ...).
+            Function of genotypes, leaves (N, ...), and one key of the reset. It returns
+            fitnesses (N,), descriptors (N, D) and a dictionary. The fitness is ``-inf``
+            if the world had a fault. With gradients, the dictionary contains:
+            ``gradients``, every leaf of the genotypes with an axis 1 + D at the end,
+            first the fitness; ``normalized_grads``, the same with Euclidean norm 1 over
+            a genotype (0 stays 0); ``faulty`` (N,) and ``overflowed`` (N, 1 + D), which
+            mark gradients that were set to 0. Without gradients, it contains
+            ``transitions`` if the episode returns them: the fields of QDax's
+            ``QDTransition`` by name, (N, T, ...).
         """
         if gradient is None:
             return self._score
@@ -292,7 +292,7 @@ class Episode:
     def _score(
         self, genotypes: Genotype, key: RNGKey
     ) -> tuple[jax.Array, jax.Array, ExtraScores]:
-        """Fitnesses (N,), descriptors (N, D), and transitions, if any."""
+        """Returns fitnesses (N,), descriptors (N, D), and transitions, if any."""
         return scores(jax.vmap(self, (0, None))(genotypes, key))
 
     def _differentiated(
@@ -302,11 +302,16 @@ class Episode:
         start: Start,
         params: Params,
     ) -> EpisodeGradients:
-        """One episode with its gradient along weights (R, 1 + D); ``None``: each."""
+        """Returns one episode with gradients of R sums; ``None``: of all components."""
         return differentiate(lambda x: self(x, start, params), genotype, weights)
 
     def _check_first(self, first: Any) -> None:
-        """Raises for what no episode can begin from."""
+        """Checks the first state of an episode.
+
+        Raises:
+            TypeError: It is not a state.
+            ValueError: It is a state of several worlds, or lacks the state descriptor.
+        """
         if not hasattr(first, "reward"):
             allowed = "a key of jax.random, or a state of the environment"
             raise TypeError(message("start", first, allowed))
@@ -323,7 +328,11 @@ class Episode:
             raise ValueError(message("env", given, allowed))
 
     def _plan(self, parameters: PyTree) -> jax.Array:
-        """Open-loop actions (episode_length, nu)."""
+        """Returns open-loop actions (episode_length, nu).
+
+        Raises:
+            ValueError: The parameters are not a plan of actions.
+        """
         shape = (self.episode_length, self.env.action_size)
         if np.size(parameters) != math.prod(shape):
             given = Fact(f"shape {np.shape(parameters)}")
@@ -339,7 +348,7 @@ class Episode:
         carry: tuple[Any, jax.Array, jax.Array, jax.Array],
         row: dict[str, jax.Array],
     ) -> tuple[tuple, tuple]:
-        """One control step; hands on state, fitness, whether it is over, and faults."""
+        """Runs one control step; carries state, fitness, end of the episode, faults."""
         begin, fitness, over, bad = carry
         state = begin
         if "factor" in row:
@@ -348,12 +357,12 @@ class Episode:
             action = row["action"]
         else:
             action = self.policy(parameters, state.obs)
-        # an environment of one's own may have a step without parameters
+        # the step of a user's environment may have no parameters
         step: Callable[..., StateLike] = self.env.step
         state = step(state, action) if params is None else step(state, action, params)
         steps = transition(begin, action, state) if self.transitions else {}
-        # The sum runs in time order here, not in a reduction over time, so that a
-        # row's return does not depend on the size of the batch.
+        # This sum is in time order. A reduction over time would depend on the batch
+        # size.
         fitness = jnp.where(over, fitness, fitness + state.reward)
         bad = bad | (~over & at_fault(state))
         reading = None

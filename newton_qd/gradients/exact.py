@@ -21,7 +21,7 @@ _MOVED = {
 
 
 def __getattr__(name: str) -> Any:
-    """Finds what has left this module."""
+    """Returns a moved object by its old name."""
     return moved_name(__name__, name, _MOVED)
 
 
@@ -31,15 +31,15 @@ class EpisodeGradients:
     """Fitness and descriptor of N episodes, and their gradients.
 
     Attributes:
-        fitnesses: (N,) sums of the rewards up to the first ``done``; ``-inf`` where
+        fitnesses: (N,) sums of the rewards up to the first ``done``; ``-inf`` if
             ``faulty``.
         descriptors: (N, D) descriptors.
-        gradients: As the genotypes, every leaf (N, 1 + D, ...): of the fitness, then
-            of each component of the descriptor; exactly 0 where ``faulty`` or
-            ``overflowed``, and finite everywhere.
-        faulty: (N,) whether the world was at fault before the episode ended.
-        overflowed: (N, 1 + D) whether the world was sound and the gradient was not
-            finite: it grew beyond the numbers, or the policy has none there.
+        gradients: Pytree like the genotypes, leaves (N, 1 + D, ...): first of the
+            fitness, then of each component of the descriptor. Always finite, and
+            exactly 0 if ``faulty`` or ``overflowed``.
+        faulty: (N,) whether the world had a fault before the episode ended.
+        overflowed: (N, 1 + D) whether the world had no fault but the gradient was not
+            finite. It was too large for the dtype, or the policy has no gradient there.
     """
 
     fitnesses: jax.Array
@@ -50,7 +50,7 @@ class EpisodeGradients:
 
 
 EpisodeGradient: TypeAlias = Callable[[Genotype, RNGKey], EpisodeGradients]
-"""Maps N genotypes and the key of the reset that they share to their gradients."""
+"""Maps N genotypes and the key of their shared reset to their gradients."""
 
 DirectionalGradient: TypeAlias = Callable[
     [Genotype, jax.Array, RNGKey], EpisodeGradients
@@ -61,13 +61,13 @@ DirectionalGradient: TypeAlias = Callable[
 def differentiate(
     run: Callable[[Genotype], Outcome], genotype: Genotype, weights: jax.Array | None
 ) -> EpisodeGradients:
-    """One episode with the gradients of fitness and descriptor.
+    """Returns one episode with the gradients of fitness and descriptor.
 
     Args:
         run: The episode, as a function of the genotype.
-        genotype: Whose policy acts, or the actions.
-        weights: (R, 1 + D) one weighted sum of fitness and descriptor in each row;
-            ``None``: the fitness and each component of the descriptor by themselves.
+        genotype: Genotype of the policy, or the actions.
+        weights: (R, 1 + D) weights of one sum of fitness and descriptor in each row;
+            ``None``: no sums, but the fitness and each component of the descriptor.
     """
 
     def values(genotype: Genotype) -> tuple[jax.Array, Outcome]:
@@ -90,7 +90,7 @@ def differentiate(
 
 
 def finite_rows(tree: PyTree) -> jax.Array:
-    """Whether all numbers of each row are finite, (n,) for leaves (n, ...)."""
+    """Returns whether each row is finite, (n,) for leaves (n, ...)."""
     leaves = jax.tree.leaves(tree)
     finite = [jnp.isfinite(x).reshape(x.shape[0], -1).all(axis=1) for x in leaves]
     return jnp.stack(finite).all(axis=0)

@@ -1,6 +1,6 @@
-"""Functions that :class:`~newton_qd.gradients.Episode` has taken the place of.
+"""Deprecated functions; use :class:`~newton_qd.gradients.Episode` instead.
 
-They keep their names, arguments and results; each is a method of an ``Episode``.
+They keep their names, arguments and results. Each calls a method of an ``Episode``.
 """
 
 from __future__ import annotations
@@ -36,17 +36,17 @@ def make_episode(
     """Makes an episode. Deprecated: use :class:`~newton_qd.gradients.Episode`.
 
     Args:
-        env: As of ``Episode``; so are all others.
+        env: As for ``Episode``, like all other arguments.
         policy: Maps parameters and an observation to an action, or ``None``.
-        descriptor_extractor: Reads the descriptor of an episode, or ``None``.
+        descriptor_extractor: Computes the descriptor of an episode, or ``None``.
         episode_length: Control steps.
         unravel: Maps a genotype to the parameters.
-        options: What becomes of the gradient on its way back; ``None``: exact, and
-            every intermediate is kept.
+        options: Windows, clipping, discounting and memory of the gradient; ``None``:
+            exact, and all intermediate values are stored.
         transitions: Whether to return the steps.
 
     Raises:
-        TypeError: ``env`` is no environment, or another argument of another type.
+        TypeError: An argument has the wrong type.
         ValueError: ``episode_length`` is not an integer from 1.
     """
     if options is None:
@@ -74,16 +74,16 @@ def make_episode_gradient(
     """Returns ``Episode.gradient``. Deprecated: use ``Episode(...).gradient``.
 
     Args:
-        env: As of :class:`~newton_qd.gradients.Episode`; so are all others.
+        env: As for :class:`~newton_qd.gradients.Episode`, like all other arguments.
         policy: Maps parameters and an observation to an action, or ``None``.
-        descriptor_extractor: Reads the descriptor of an episode, or ``None``.
+        descriptor_extractor: Computes the descriptor of an episode, or ``None``.
         episode_length: Control steps.
         unravel: Maps a genotype to the parameters.
-        options: Windows, clipping, discounting and memory; ``None``: exact, one state
-            kept per control step.
+        options: Windows, clipping, discounting and memory; ``None``: exact, with one
+            stored state per control step.
 
     Raises:
-        TypeError: ``env`` is no environment, or another argument of another type.
+        TypeError: An argument has the wrong type.
         ValueError: ``episode_length`` is not an integer from 1.
     """
     return Episode(
@@ -108,15 +108,15 @@ def make_directional_gradient(
     """Returns ``Episode.directional``. Deprecated: use ``Episode(...).directional``.
 
     Args:
-        env: As of :class:`~newton_qd.gradients.Episode`; so are all others.
+        env: As for :class:`~newton_qd.gradients.Episode`, like all other arguments.
         policy: Maps parameters and an observation to an action, or ``None``.
-        descriptor_extractor: Reads the descriptor of an episode.
+        descriptor_extractor: Computes the descriptor of an episode.
         episode_length: Control steps.
         unravel: Maps a genotype to the parameters.
         options: Windows, clipping, discounting and memory; ``None``: exact.
 
     Raises:
-        TypeError: ``env`` is no environment, or another argument of another type.
+        TypeError: An argument has the wrong type.
         ValueError: ``episode_length`` is not an integer from 1.
     """
     return Episode(
@@ -144,18 +144,18 @@ def make_mixed_gradient(
     """Returns ``Episode.mixed`` with settings. Deprecated: use ``Episode(...).mixed``.
 
     Args:
-        env: As of :class:`~newton_qd.gradients.Episode`; so are all others.
+        env: As for :class:`~newton_qd.gradients.Episode`, like all other arguments.
         policy: Maps parameters and an observation to an action, or ``None``.
-        descriptor_extractor: Reads the descriptor of an episode, or ``None``.
+        descriptor_extractor: Computes the descriptor of an episode, or ``None``.
         episode_length: Control steps.
         unravel: Maps a genotype to the parameters.
         options: Windows, clipping, discounting and memory of the first order.
-        samples: Pairs of samples of a genotype, from 2.
+        samples: Pairs of samples for each genotype, at least 2.
         sigma: Standard deviation of the noise, in the units of the genotype.
-        tolerance: Error that is allowed where the two orders disagree.
+        tolerance: Allowed error if the two orders disagree.
 
     Raises:
-        TypeError: ``env`` is no environment, or another argument of another type.
+        TypeError: An argument has the wrong type.
         ValueError: A number is out of its range.
     """
     check_mixture(samples, sigma, tolerance)

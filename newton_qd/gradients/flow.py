@@ -1,4 +1,4 @@
-"""How a gradient flows back from a control step to the one before it."""
+"""The way of a gradient back from a control step to the one before it."""
 
 from __future__ import annotations
 
@@ -20,30 +20,31 @@ Carry = TypeVar("Carry")
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class GradientOptions:
-    """What becomes of the gradient on its way back through an episode.
+    """Windows, clipping, discounting and memory of the gradient of an episode.
 
-    The value of the episode never changes. Windows, clipping and discounting act on
-    the adjoint of the state that one control step hands to the next, in the order
-    clip, then discount; without them the gradient is exact. They bias it, and keep its
-    size in bounds where the exact one grows without.
+    The value of the episode never changes. Windows, clipping and discounting act on the
+    adjoint of the state between two control steps: first clip, then discount. Without
+    them the gradient is exact. With them it is biased, but it stays bounded where the
+    exact gradient would grow without limit.
 
     Attributes:
-        window: Control steps after which the gradient is cut: a reward counts towards
-            actions of its own window only (Xu et al. 2022, "Accelerated policy
-            learning with parallel differentiable simulation"). Windows begin at
-            multiples of it; ``None``: one window.
+        window: Control steps after which the gradient is cut. A reward then has a
+            gradient for actions of its own window only (Xu et al. 2022, "Accelerated
+            policy learning with parallel differentiable simulation"). Windows begin at
+            multiples of this number. ``None``: one window.
         clip: Largest Euclidean norm of the adjoint, over all floating-point numbers of
-            the state of one world; longer ones are shortened to it. ``None``: no limit.
-        discount: Factor for each control step that the adjoint goes back [-].
-        checkpoint_every: Control steps between the states that are kept for the way
-            back; what lies between is computed again. With 1, one state per control
-            step is kept; with the square root of the episode's length, the memory is
-            least. ``None``: every intermediate of the environment and of the policy
-            is kept and only the physics computed again, the fastest.
+            the state of one world. A longer adjoint is scaled to it. ``None``: no
+            limit.
+        discount: Factor of the adjoint for each control step on the way back [-].
+        checkpoint_every: Control steps between the states that are stored for the way
+            back. The steps between are computed again. With 1, each control step stores
+            one state. The square root of the episode's length needs the least memory.
+            ``None``: all intermediate values of environment and policy are stored, and
+            only the physics is computed again. This is the fastest way.
 
     Raises:
-        TypeError: ``clip`` or ``discount`` is no number.
-        ValueError: A value is out of its range, or a number of steps no integer.
+        TypeError: ``clip`` or ``discount`` is not a number.
+        ValueError: A value is out of its range, or a number of steps is not an integer.
     """
 
     window: int | None = None
@@ -60,30 +61,30 @@ class GradientOptions:
 
     @property
     def exact(self) -> bool:
-        """Whether the gradient is that of the episode."""
+        """Whether the gradient is exact."""
         return self.window is None and self.clip is None and self.discount == 1
 
     def factors(self, steps: int) -> np.ndarray:
-        """Factor of the adjoint of the state before each step, (steps,) [-]."""
+        """Returns the factor of the adjoint of the state before each step, (steps,)."""
         factors = np.full(steps, self.discount)
         if self.window is not None:
             factors[:: self.window] = 0.0
-        factors[0] = 1.0  # no step handed the first state on
+        factors[0] = 1.0  # no step is before the first state
         return factors
 
 
 EXACT = GradientOptions()
-"""The exact gradient; one state is kept per control step."""
+"""The exact gradient; each control step stores one state."""
 
 
 def passed_back(tree: Tree, factor: jax.Array, clip: float | None) -> Tree:
-    """Returns a pytree as it is, and changes the gradient that flows back into it.
+    """Returns a pytree unchanged, but changes the gradient on its way back.
 
     Args:
-        tree: PyTree pytree; leaves that are not floating-point have no gradient.
-        factor: () by which the gradient is multiplied; at 0 it is exactly 0, whatever
-            flowed in.
-        clip: Largest norm of the gradient before that; ``None``: no limit.
+        tree: Pytree; leaves that are not floating-point have no gradient.
+        factor: () factor of the gradient. With 0 the result is exactly 0, even if the
+            gradient is not finite.
+        clip: Largest norm of the gradient before the factor; ``None``: no limit.
     """
     leaves, structure = jax.tree.flatten(tree)
     real = [jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves]
@@ -115,7 +116,7 @@ def _backward(
     scale = factor
     if clip is not None:
         norm = tree_norm(adjoint)
-        # no division where nothing is clipped; an adjoint that is not finite stays so
+        # no division without clipping; an adjoint that is not finite stays like this
         scale = scale * jnp.where(
             norm > clip, clip / jnp.where(norm > clip, norm, 1), 1
         )
@@ -134,15 +135,15 @@ def scan_keeping(
     steps: int,
     every: int | None,
 ) -> tuple[Carry, PyTree]:
-    """``jax.lax.scan`` that keeps a carry every so many steps for its gradient.
+    """Runs ``jax.lax.scan``, but stores only some carries for its gradient.
 
     Args:
         body: Maps a carry and a row to the next carry and to a reading.
-        carry: The first one.
+        carry: The first carry.
         rows: Leaves (steps, ...).
         steps: Number of steps.
-        every: Steps between the carries that are kept; what lies between is computed
-            again. ``None``: every intermediate is kept.
+        every: Steps between stored carries. The steps between are computed again.
+            ``None``: all intermediate values are stored.
 
     Returns:
         The last carry, and the readings, leaves (steps, ...).
@@ -174,12 +175,12 @@ def scan_keeping(
 
 
 def tree_norm(tree: PyTree) -> jax.Array:
-    """Euclidean norm () over all leaves; for use without gradient.
+    """Returns the Euclidean norm () over all leaves; for use without gradient.
 
     Args:
         tree: Pytree of floating-point arrays.
     """
-    # squares of numbers above 1e19 would not be finite in single precision
+    # scaled first: squares of numbers above 1e19 are not finite in single precision
     largest = tree_largest(tree)
     unit = jnp.where((largest > 0) & jnp.isfinite(largest), largest, 1)
     squares = [jnp.sum(jnp.square(x / unit)) for x in jax.tree.leaves(tree)]
@@ -187,7 +188,7 @@ def tree_norm(tree: PyTree) -> jax.Array:
 
 
 def tree_largest(tree: PyTree) -> jax.Array:
-    """Largest magnitude () over all leaves; for use without gradient.
+    """Returns the largest magnitude () over all leaves; for use without gradient.
 
     Args:
         tree: Pytree of floating-point arrays.

@@ -1,4 +1,4 @@
-"""What the gradient doctor measures: derivatives, differences and noisy samples."""
+"""Measurements of the gradient doctor: derivatives, differences and noisy samples."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from newton_qd.physics.system import PhysicsState
 from newton_qd.types import Genotype, Policy, PyTree, RNGKey
 
 DISTANCES = (1e-4, 1e-6, 1e-8, 1e-10)
-"""Steps of the central differences; the one that agrees best counts.
+"""Steps of the central differences; the step that agrees best counts.
 
-The smallest are for chaotic motion: over 32 steps of a halfcheetah a gradient may have
-the norm 1e9.
+The smallest steps are for chaotic motion: the gradient over 32 steps of a halfcheetah
+may have a norm of 1e9.
 """
 REACH = 1e-2
-"""Norm of the finite changes that show where contacts end a gradient's validity."""
+"""Norm of the finite changes that show which contacts limit a gradient's validity."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Subject:
-    """What is differentiated: the rewards of an episode as a function of a genotype."""
+    """The rewards of an episode as a function of a genotype, to be differentiated."""
 
     env: Env
     policy: Policy | None
@@ -38,7 +38,7 @@ class Subject:
     key: jax.Array
 
     def rewards(self, genotype: Genotype) -> tuple[jax.Array, tuple[jax.Array, ...]]:
-        """Rewards (steps,), 0 after the end; who is alive, what touches, faults."""
+        """Returns rewards (steps,), 0 after the end; alive, contacts and faults."""
 
         def advance(carry: PyTree, action: jax.Array | None) -> tuple[PyTree, PyTree]:
             state, over = carry
@@ -61,14 +61,14 @@ class Subject:
         return rewards, tuple(seen)
 
     def body_name(self, body: int) -> str:
-        """Name of a body of a simulated robot."""
+        """Returns the name of a body of a simulated robot."""
         robot: Any = self.env
         return robot.system.body_names[body]
 
     def returns(
         self, genotype: Genotype, ends: np.ndarray
     ) -> tuple[jax.Array, tuple[jax.Array, ...]]:
-        """Sums (rows,) of the rewards up to the ends (rows,) of several horizons."""
+        """Returns sums (rows,) of the rewards up to the ends (rows,) of horizons."""
         rewards, seen = self.rewards(genotype)
         rows = np.arange(self.steps)[None] < ends[:, None]
         return jnp.asarray(rows, rewards.dtype) @ rewards, seen
@@ -76,7 +76,7 @@ class Subject:
     def gradients(
         self, genotype: Genotype, ends: np.ndarray
     ) -> tuple[jax.Array, Genotype, jax.Array]:
-        """Returns up to the ends, gradients (rows, ...), and faults (steps,)."""
+        """Computes returns (rows,), their gradients (rows, ...) and faults (steps,)."""
         values, pull, seen = jax.vjp(
             lambda x: self.returns(x, ends), genotype, has_aux=True
         )
@@ -90,13 +90,13 @@ class Differences:
 
     Attributes:
         norms: (worlds, steps) norm of the gradient of the return up to each step.
-        exact: (worlds, directions, steps) its component along each direction.
+        exact: (worlds, directions, steps) component of the gradient along a direction.
         central: (worlds, directions, distances, steps) central differences over
             ``DISTANCES``, then over ``REACH``.
-        alive: (worlds, steps) whether the episode goes on before each step.
-        faulty: (worlds, steps) whether the world is at fault after each step.
-        switched: (worlds, directions, steps, nb) whether a body touches on one side of
-            ``REACH`` and not on the other.
+        alive: (worlds, steps) whether the episode has not ended before each step.
+        faulty: (worlds, steps) whether the world has a fault after each step.
+        switched: (worlds, directions, steps, nb) whether a body has contact for one of
+            the two changes of size ``REACH`` only.
     """
 
     norms: np.ndarray
@@ -110,7 +110,7 @@ class Differences:
 def take_differences(
     subject: Subject, genotypes: Genotype, key: RNGKey, directions: int
 ) -> tuple[Differences, Genotype]:
-    """The derivatives, and the gradients, leaves (worlds, steps, ...)."""
+    """Returns the derivatives, and the gradients, leaves (worlds, steps, ...)."""
     every = np.arange(1, subject.steps + 1, dtype=np.int32)
     sides = np.array([[d, -d] for d in (*DISTANCES, REACH)])
 
@@ -144,7 +144,7 @@ def take_differences(
 
 
 def normal_like(key: RNGKey, genotypes: Genotype, count: int) -> Genotype:
-    """Normal numbers, leaves (worlds, count, ...)."""
+    """Returns normal random numbers, leaves (worlds, count, ...)."""
     leaves, structure = jax.tree.flatten(genotypes)
     keys = jax.random.split(key, len(leaves))
     drawn = [
@@ -155,14 +155,14 @@ def normal_like(key: RNGKey, genotypes: Genotype, count: int) -> Genotype:
 
 
 def _unit(tree: PyTree) -> PyTree:
-    """A pytree over its norm, or as it is where that is 0."""
+    """Returns a pytree divided by its norm; a norm of 0 changes nothing."""
     norm = tree_norm(tree)
     divisor = jnp.where(norm == 0, 1, norm)
     return jax.tree.map(lambda x: x / divisor, tree)
 
 
 def _inner(a: PyTree, b: PyTree) -> jax.Array:
-    """Inner product () of two pytrees."""
+    """Returns the inner product () of two pytrees."""
     return functools.reduce(
         jnp.add, jax.tree.leaves(jax.tree.map(lambda x, y: (x * y).sum(), a, b))
     )
@@ -176,20 +176,20 @@ def take_samples(
     sigma: float,
     ends: np.ndarray,
 ) -> tuple[Mixture, np.ndarray, np.ndarray]:
-    """First- and zeroth-order estimates (worlds, horizons) under noise.
+    """Returns first- and zeroth-order estimates (worlds, horizons) under noise.
 
     Args:
         subject: The rewards of an episode.
         genotypes: Leaves (worlds, ...).
         centre: Leaves (worlds, horizons, ...): the gradients without noise.
         noise: Leaves (worlds, samples, ...), normal with deviation ``sigma``.
-        sigma: That deviation.
+        sigma: Standard deviation of the noise.
         ends: (horizons,) control steps.
 
     Returns:
         The estimates; the components (worlds, 2, horizons) of their means along the
-        gradient without noise, which few samples tell apart; and how many pairs of
-        samples of each world (worlds,) stay sound.
+        gradient without noise, for which few samples are enough; and the number of
+        pairs of samples without a fault for each world (worlds,).
     """
 
     def one(

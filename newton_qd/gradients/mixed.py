@@ -1,4 +1,4 @@
-"""The gradient of a smoothed episode, of first and zeroth order at once."""
+"""The gradient of a smoothed episode: a mix of first and zeroth order."""
 
 from __future__ import annotations
 
@@ -24,27 +24,27 @@ _MOVED = {
 
 
 def __getattr__(name: str) -> Any:
-    """Finds what has left this module."""
+    """Returns a moved object by its old name."""
     return moved_name(__name__, name, _MOVED)
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class MixedGradients(EpisodeGradients):
-    """Gradients of smoothed episodes, and what their two estimates are worth.
+    """Gradients of smoothed episodes, and the quality of the two estimates.
 
     Fitness, descriptor and ``faulty`` are those of the genotype without noise.
-    ``overflowed``: fewer than two pairs of samples were sound, or neither order was
-    finite.
+    ``overflowed`` is true if fewer than two pairs of samples had no fault, or if
+    neither order was finite.
 
     Attributes:
         order: (N, 1 + D) weight of the first-order estimate, 0 to 1 [-].
         first_variance: (N, 1 + D) variance of a first-order sample, summed over the
-            genotype; infinite where a sample was not finite, or it is too large for
-            a number itself.
-        zeroth_variance: (N, 1 + D) likewise of a zeroth-order sample.
-        bias: (N, 1 + D) distance between the means of the two, less what their
-            variance explains.
+            genotype. It is infinite if a sample was not finite, or if the variance is
+            too large for the dtype.
+        zeroth_variance: (N, 1 + D) variance of a zeroth-order sample, in the same way.
+        bias: (N, 1 + D) distance between the means of the two orders, minus the part
+            that their variances explain.
     """
 
     order: jax.Array
@@ -57,8 +57,8 @@ def check_mixture(samples: int, sigma: float, tolerance: float = math.inf) -> No
     """Checks the settings of a mixed gradient.
 
     Raises:
-        TypeError: A setting is no number.
-        ValueError: It is out of its range.
+        TypeError: A setting is not a number.
+        ValueError: A setting is out of its range.
     """
     checks.integer("samples", samples, least=2)
     checks.number("sigma", sigma, above=0)
@@ -75,16 +75,16 @@ def mixed_gradients(
     sigma: float,
     tolerance: float,
 ) -> MixedGradients:
-    """Alpha-order gradients of N individuals; :meth:`Episode.mixed` says what they are.
+    """Returns alpha-order gradients of N individuals, as :meth:`Episode.mixed`.
 
     Args:
         centre: Their episodes without noise, leaves (N, ...).
         gradient: Maps any number of genotypes to values and first-order gradients.
         genotypes: Leaves (N, ...).
-        noise_key: Of the noise.
+        noise_key: Key of the noise.
         samples: Pairs of samples of a genotype.
         sigma: Standard deviation of the noise, in the units of the genotype.
-        tolerance: Error allowed where the two orders disagree.
+        tolerance: Allowed error if the two orders disagree.
     """
     noise = _noise(noise_key, genotypes, samples, sigma)
     found = _pairs(gradient, genotypes, noise)
@@ -95,7 +95,7 @@ def mixed_gradients(
 def _pairs(
     gradient: Callable[[Genotype], EpisodeGradients], genotypes: Genotype, noise: PyTree
 ) -> EpisodeGradients:
-    """Values and gradients at x + w and x - w, leaves (N, samples, 2, ...)."""
+    """Returns values and gradients at x + w and x - w, leaves (N, samples, 2, ...)."""
     signs = jnp.array([1, -1], jnp.int32)
     around = jax.tree.map(
         lambda x, w: x[:, None, None] + w[:, :, None] * _like(signs, w[0]),
@@ -108,7 +108,7 @@ def _pairs(
 
 
 def _noise(key: RNGKey, genotypes: Genotype, samples: int, sigma: float) -> PyTree:
-    """Normal noise of every genotype, leaves (N, samples, ...)."""
+    """Returns normal noise for every genotype, leaves (N, samples, ...)."""
     leaves, structure = jax.tree.flatten(genotypes)
     keys = jax.random.split(key, len(leaves))
     noise = [
@@ -119,7 +119,7 @@ def _noise(key: RNGKey, genotypes: Genotype, samples: int, sigma: float) -> PyTr
 
 
 def _like(factors: jax.Array, array: jax.Array) -> jax.Array:
-    """Factors (n,) that multiply arrays (..., n, *the axes of ``array`` but one)."""
+    """Reshapes factors (n,) to multiply arrays (..., n, *axes of ``array`` but one)."""
     shape = factors.shape + (1,) * (array.ndim - 1)
     return factors.astype(array.dtype).reshape(shape)
 
@@ -132,7 +132,7 @@ def _combined(
     sigma: float,
     tolerance: float,
 ) -> MixedGradients:
-    """The estimate of one individual from its pairs (samples, 2, ...)."""
+    """Returns the estimate of one individual from its pairs (samples, 2, ...)."""
     sound = ~found.faulty.any(axis=1)
     fitness = jnp.where(sound[:, None], found.fitnesses, 0)
     values = jnp.concatenate([fitness[..., None], found.descriptors], axis=-1)
@@ -158,7 +158,7 @@ def _combined(
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Mixture:
-    """Alpha-order, first- and zeroth-order gradients (rows, ...), and their worth."""
+    """Alpha-order, first- and zeroth-order gradients (rows, ...), and their quality."""
 
     gradients: PyTree
     first: PyTree
@@ -185,15 +185,15 @@ def mixture(
         values: (samples, 2, rows) the functions at x + w and at x - w.
         gradients: Leaves (samples, 2, rows, ...): their gradients there.
         noise: Leaves (samples, ...): w.
-        sound: (samples,) which pairs count.
-        lost: (rows,) which first orders do not; a zeroth order that is not finite
-            does not, either.
+        sound: (samples,) whether a pair counts.
+        lost: (rows,) whether a first order does not count. A zeroth order that is not
+            finite does not count either.
         sigma: Standard deviation of the noise.
-        tolerance: Error allowed where the two disagree.
+        tolerance: Allowed error if the two orders disagree.
     """
     first, zeroth, missing = _samples(values, gradients, noise, sound, lost, sigma)
-    # squares of numbers above 1e19 are none in float32: variances are taken in units
-    # of the largest number of a row
+    # squares of numbers above 1e19 are not finite in float32, so variances are computed
+    # in units of the largest number of a row
     spread = functools.partial(_mean_and_variance, sound=sound)
     first_unit, zeroth_unit = _unit(first), _unit(zeroth)
     first_own = spread(_scaled(first, first_unit))[1]
@@ -204,7 +204,7 @@ def mixture(
     zeroth_mean, zeroth_variance = spread(zeroth)
     apart, apart_variance = spread(jax.tree.map(jnp.subtract, first, zeroth))
     pairs = jnp.maximum(sound.sum(), 1)
-    # what the scatter of the samples adds to the distance of their means
+    # the part of the distance of the means that the variance of the samples explains
     distance = _squared(apart)
     explained = jnp.where(lost, 0, apart_variance / pairs)
     error = jnp.sqrt(zeroth_variance / pairs)
@@ -238,12 +238,12 @@ def _samples(
     lost: jax.Array,
     sigma: float,
 ) -> tuple[PyTree, PyTree, jax.Array]:
-    """Samples of first and zeroth order (n, rows, ...), and which of these are none.
+    """Returns samples of first and zeroth order (n, rows, ...).
 
-    Those that are not finite, ``lost`` ones and those of the zeroth order that the last
-    value (rows,) marks, are 0.
+    The last result (rows,) marks zeroth orders that do not count. These samples are 0,
+    and so are ``lost`` samples and samples that are not finite.
     """
-    # sigma^2 may be too small for a number
+    # not divided by sigma^2, which may be too small for the dtype
     slope = jnp.where(sound[:, None], values[:, 0] - values[:, 1], 0) / (2 * sigma)
     zeroth = jax.tree.map(
         lambda w: jax.vmap(jnp.multiply.outer)(slope, w / sigma), noise
@@ -258,29 +258,29 @@ def _samples(
 
 
 def _rows(factors: jax.Array, samples: jax.Array) -> jax.Array:
-    """Factors (rows,) that multiply samples (n, rows, ...)."""
+    """Reshapes factors (rows,) to multiply samples (n, rows, ...)."""
     return factors.reshape(-1, *[1] * (samples.ndim - 2))
 
 
 def _scaled(samples: PyTree, unit: jax.Array) -> PyTree:
-    """Samples (n, rows, ...) in units (rows,)."""
+    """Returns samples (n, rows, ...) in units (rows,)."""
     return jax.tree.map(lambda x: x / _rows(unit, x), samples)
 
 
 def _unit(samples: PyTree) -> jax.Array:
-    """Power of two (rows,) near the largest number of samples (n, rows, ...), or 1."""
+    """Returns a power of two (rows,), or 1, near the largest of samples."""
     sizes = [
         jnp.abs(jnp.moveaxis(x, 1, 0)).reshape(x.shape[1], -1).max(axis=1, initial=0)
         for x in jax.tree.leaves(samples)
     ]
     largest = functools.reduce(jnp.maximum, sizes)
-    exponent = jnp.frexp(largest)[1] - 1  # exact: it changes no digit
+    exponent = jnp.frexp(largest)[1] - 1  # exact: division by it changes no digit
     one = jnp.ones_like(largest)
     return jnp.where(largest > 0, jnp.ldexp(one, exponent), one)
 
 
 def _mean_and_variance(samples: PyTree, sound: jax.Array) -> tuple[PyTree, jax.Array]:
-    """Mean over sound samples, leaves (rows, ...), and total variance (rows,)."""
+    """Returns mean (rows, ...) and total variance (rows,) of the sound samples."""
     count = sound.sum()
 
     def mean(x: jax.Array) -> jax.Array:
@@ -295,6 +295,6 @@ def _mean_and_variance(samples: PyTree, sound: jax.Array) -> tuple[PyTree, jax.A
 
 
 def _squared(rows: PyTree) -> jax.Array:
-    """Squared norm (rows,) of leaves (rows, ...)."""
+    """Returns the squared norm (rows,) of leaves (rows, ...)."""
     squares = [jnp.square(x).reshape(x.shape[0], -1) for x in jax.tree.leaves(rows)]
     return functools.reduce(jnp.add, [x.sum(axis=1) for x in squares])

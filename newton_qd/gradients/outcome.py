@@ -1,4 +1,4 @@
-"""What a step and an episode of one world came to."""
+"""Results of a step and of an episode of one world."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from newton_qd.types import Action, StateLike
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """What an episode came to.
+    """The result of an episode.
 
     Attributes:
         fitness: () sum of the rewards up to the first ``done``.
         descriptor: (D,) descriptor of the episode.
-        faulty: () whether the world was at fault before the episode ended, or
-            fitness or descriptor are not finite: they mean nothing then.
+        faulty: () whether the world had a fault before the episode ended, or fitness or
+            descriptor are not finite. They have no meaning then.
         transitions: Empty, or the fields of QDax's ``QDTransition`` by name,
             (T, ...) each.
     """
@@ -31,19 +31,19 @@ class Outcome:
 
     @property
     def admitted_fitness(self) -> jax.Array:
-        """() fitness, or ``-inf`` where ``faulty``: no archive takes it then."""
+        """() fitness, or ``-inf`` if ``faulty``, so that no archive takes it."""
         return jnp.where(self.faulty, -jnp.inf, self.fitness)
 
 
 def transition(
     begin: StateLike, action: Action, end: StateLike
 ) -> dict[str, jax.Array]:
-    """The fields of QDax's ``QDTransition`` for one step.
+    """Returns the fields of QDax's ``QDTransition`` for one step.
 
     Args:
         begin: State before the step.
-        action: (nu,) what was done.
-        end: State after it.
+        action: (nu,) the action.
+        end: State after the step.
     """
     return {
         "obs": begin.obs,
@@ -58,7 +58,7 @@ def transition(
 
 
 def at_fault(state: StateLike) -> jax.Array:
-    """Whether the physics of a state contained a value that is not finite, ()."""
+    """Returns whether the world of a state has a fault, ()."""
     if "fault" in state.info:
         return state.info["fault"] != 0
     return jnp.zeros((), bool)

@@ -1,4 +1,4 @@
-"""What the gradient doctor found: a table, words, files and a picture."""
+"""The report of the gradient doctor: a table, words, files and a picture."""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 AGREEMENT = 0.999
-"""Cosine with central differences from which a gradient counts as right [-]."""
+"""Smallest cosine with central differences of a correct gradient [-]."""
 
 
 @dataclasses.dataclass(frozen=True)
 class HorizonRow:
-    """What the gradient of the return over some control steps is worth.
+    """Quality of the gradient of the return for one horizon.
 
     Attributes:
         steps: Control steps of the return.
         seconds: The same in simulated time [s].
         alive: Share of the worlds whose episode reaches the last step [-].
         norm: Norm of the gradient, median over the worlds.
-        largest_norm: Its largest.
+        largest_norm: Norm of the gradient, maximum over the worlds.
         cosine: Cosine with central differences along random directions, median [-].
-        worst_cosine: Its smallest [-].
+        worst_cosine: The same cosine, minimum over the worlds [-].
         first_deviation: Standard deviation of a first-order sample, over the whole
-            genotype, median; infinite where one was not finite.
-        zeroth_deviation: Likewise of a zeroth-order sample.
-        bias: Share of the first-order slope, along the gradient without noise, that
-            the zeroth order does not confirm, mean over the worlds [-].
-        bias_error: Standard error of that mean [-].
-        order: Weight that inverse variances give to the first order, median [-].
+            genotype, median; infinite if a sample was not finite.
+        zeroth_deviation: Standard deviation of a zeroth-order sample, in the same way.
+        bias: Share of the first-order slope along the gradient without noise that the
+            zeroth order does not confirm, mean over the worlds [-].
+        bias_error: Standard error of ``bias`` [-].
+        order: Weight of the first order by inverse variances, median [-].
     """
 
     steps: int
@@ -58,11 +58,11 @@ class HorizonRow:
 
 @dataclasses.dataclass(frozen=True)
 class ContactRow:
-    """A body whose contact differed before a finite change left the gradient.
+    """A body whose contact changed before the gradient broke for a finite change.
 
     Attributes:
-        body: Link, or ``no contact`` where none differed.
-        share: Share of the pairs of world and direction in which it did [-].
+        body: Link, or ``no contact`` if no contact changed.
+        share: Share of the pairs of world and direction with this body [-].
         first_step: Earliest control step at which the gradient broke, from 1.
         median_step: Median of these steps.
     """
@@ -75,15 +75,15 @@ class ContactRow:
 
 @dataclasses.dataclass(frozen=True)
 class GradientReport:
-    """The findings of :func:`~newton_qd.diagnose_gradients`; ``print`` shows them.
+    """The result of :func:`~newton_qd.diagnose_gradients`; ``print`` shows it.
 
     Attributes:
         name: Environment.
         dt: Duration of a control step [s].
         open_loop: Whether the genotypes were actions, not policies.
         sigma: Standard deviation of the noise of the estimates.
-        horizons: One row a horizon, ascending.
-        contacts: Where finite changes leave the gradient, most frequent first.
+        horizons: One row for each horizon, ascending.
+        contacts: Contacts at which the gradient broke, most frequent first.
     """
 
     name: str
@@ -95,9 +95,9 @@ class GradientReport:
 
     @property
     def growth(self) -> float:
-        """Factor by which the norm grows with a step, over the later half of them.
+        """Growth factor of the norm per step, over the later half of the horizons.
 
-        Not a number where a single horizon, or a norm of 0, tells nothing of it.
+        It is NaN for a single horizon, or if a norm is 0.
         """
         last = self.horizons[-1]
         middle = min(self.horizons, key=lambda row: abs(row.steps - last.steps / 2))
@@ -107,12 +107,12 @@ class GradientReport:
 
     @property
     def exact_horizon(self) -> int:
-        """Control steps up to which the gradient agrees with differences, or 0."""
+        """Longest horizon at which the gradient agrees with differences, or 0."""
         return self._last(lambda row: row.worst_cosine >= AGREEMENT)
 
     @property
     def useful_horizon(self) -> int:
-        """Control steps up to which first orders vary less than zeroth ones, or 0."""
+        """Longest horizon at which first orders vary less than zeroth orders, or 0."""
         return self._last(lambda row: row.order > 0.5)
 
     def _last(self, good: Callable[[HorizonRow], bool]) -> int:
@@ -125,7 +125,7 @@ class GradientReport:
 
     @property
     def verdict(self) -> str:
-        """Which horizon is usable, in words."""
+        """The useful horizon, in words."""
         exact, useful = self.exact_horizon, self.useful_horizon
         longest = self.horizons[-1].steps
         usable = min(exact, useful)
@@ -217,14 +217,14 @@ class GradientReport:
     def write(self, folder: Path | str) -> None:
         """Writes ``horizons.csv``, ``contacts.csv``, ``report.txt``, ``gradients.png``.
 
-        Each file is written whole or left as it was.
+        A file is either written completely or not changed.
 
         Args:
-            folder: Where to; made if it does not exist.
+            folder: Folder for the files. It is created if it does not exist.
 
         Raises:
-            MissingExtra: matplotlib is not installed; the other files are written.
-            OSError: The folder cannot be made or written to.
+            MissingExtra: matplotlib is not installed. The other files are written.
+            OSError: The folder cannot be created or is not writable.
         """
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
@@ -239,7 +239,7 @@ class GradientReport:
         write_atomically(folder / "gradients.png", picture.getvalue())
 
     def plot(self) -> Figure:
-        """Draws norm, agreement and scatter over the horizon.
+        """Draws norm, agreement and deviation over the horizon.
 
         Raises:
             MissingExtra: matplotlib is not installed.
@@ -292,12 +292,12 @@ class GradientReport:
 
 
 def _error(cosine: float) -> float:
-    """Distance of a cosine from 1, at least what a picture can show."""
+    """Returns the distance of a cosine from 1, with the lower limit of the picture."""
     return max(1 - cosine, 1e-16)
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of a table with columns aligned to the right, the first to the left."""
+    """Returns lines of a table; the first column is aligned left, all others right."""
     widths = [max(len(row[i]) for row in (head, *rows)) for i in range(len(head))]
     return [
         "  ".join(

@@ -1,4 +1,4 @@
-"""Episodes as QDax scores them: fitnesses, descriptors and a dictionary."""
+"""Scores of episodes for QDax: fitnesses, descriptors and a dictionary."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from newton_qd.types import ExtraScores, Genotype
 
 
 def scores(outcome: Outcome) -> tuple[jax.Array, jax.Array, ExtraScores]:
-    """Scores of N episodes; the dictionary holds their transitions, if any."""
+    """Returns scores of N episodes; the dictionary has their transitions, if any."""
     steps = outcome.transitions
     extra = {"transitions": steps} if steps else {}
     return outcome.admitted_fitness, outcome.descriptor, extra
@@ -21,13 +21,13 @@ def scores(outcome: Outcome) -> tuple[jax.Array, jax.Array, ExtraScores]:
 def gradient_scores(
     found: EpisodeGradients,
 ) -> tuple[jax.Array, jax.Array, ExtraScores]:
-    """Scores of N episodes with their gradients in QDax's layout.
+    """Returns scores of N episodes with their gradients in QDax's layout.
 
     Returns:
         Fitnesses (N,), descriptors (N, D) and a dictionary: ``gradients``, every leaf
-        of the genotypes with an axis of 1 + D behind, the fitness first;
-        ``normalized_grads``, the same with Euclidean norm 1 over a genotype, or 0 where
-        the gradient is; ``faulty`` (N,) and ``overflowed`` (N, 1 + D).
+        of the genotypes with an axis 1 + D at the end, first the fitness;
+        ``normalized_grads``, the same with Euclidean norm 1 over a genotype (0 stays
+        0); ``faulty`` (N,) and ``overflowed`` (N, 1 + D).
     """
     unit = jax.vmap(jax.vmap(_unit))(found.gradients)
     extra: ExtraScores = {
@@ -41,7 +41,7 @@ def gradient_scores(
 
 def _unit(gradient: Genotype) -> Genotype:
     """Returns a gradient of norm 1, or 0 where it is 0."""
-    # twice: the norm of large numbers may be beyond the numbers
+    # scaled twice, because the norm of large numbers may overflow
     for norm in (tree_largest, tree_norm):
         size = norm(gradient)
         divisor = jnp.where(size == 0, jnp.ones_like(size), size)

@@ -1,4 +1,4 @@
-"""Descriptors that have a gradient, for environments that exist already."""
+"""Descriptors with a gradient, for existing environments."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ def with_smooth_descriptor(
 ) -> Any:
     """Returns the environment with a state descriptor that has a gradient.
 
-    Feet contact becomes its smooth reading, and with it the feet-contact proportion of
-    an episode; the position of the torso is smooth as it is, and so are tasks that
-    it describes. This is ``create(..., qdax_wrappers_kwargs=[{"smooth_width": width,
-    "straight_through": straight_through}])`` for an environment that is already made.
+    Feet contact becomes smooth, and so does the feet-contact proportion of an episode.
+    The position of the torso is already smooth, so tasks with this descriptor do not
+    change. For an existing environment, this is the same as ``create(...,
+    qdax_wrappers_kwargs=[{"smooth_width": width, "straight_through":
+    straight_through}])``.
 
     Args:
-        env: The environment; it stays as it is.
-        width: Share of the robot's weight over which the reading of a foot rises [-],
-            above 0.
-        straight_through: Whether the reading stays 0 or 1, and the gradient alone is
-            that of the smooth reading.
+        env: The environment; it does not change.
+        width: Share of the robot's weight over which the contact of a foot rises from 0
+            to 1 [-], above 0.
+        straight_through: Whether the contact stays 0 or 1, but has the gradient of the
+            smooth contact.
 
     Raises:
-        TypeError: ``env`` is no environment, ``width`` no number or
-            ``straight_through`` neither true nor false.
+        TypeError: An argument has the wrong type.
         ValueError: ``width`` is not finite and above 0.
     """
     checks.environment(env)

@@ -1,4 +1,4 @@
-"""Soft contacts for gradients, and the way back to stiff ones."""
+"""Soft contacts for gradients, and a series back to stiff contacts."""
 
 from __future__ import annotations
 
@@ -16,18 +16,19 @@ _ANGLES = ("limit_overshoot", "limit_smoothing")
 
 
 def softened(material: Material, factor: float) -> Material:
-    """Returns a material with all its scales of softness multiplied.
+    """Returns a material with all scales of softness multiplied by a factor.
 
-    Penetration at rest, the widths over which contacts and limits switch on, the slip
-    velocity and the overshoot past limits; friction and dissipation stay.
+    These are the penetration at rest, the widths over which contacts and limits switch
+    on, the slip velocity and the overshoot past limits. Friction and dissipation do not
+    change.
 
     Args:
         material: Softness of contacts and joint limits.
-        factor: Above 1: softer, with gradients that stay small over more steps; below:
-            stiffer, and nearer to rigid bodies.
+        factor: Above 1: softer; gradients stay small over more steps. Below 1: stiffer,
+            nearer to rigid bodies.
 
     Raises:
-        TypeError: ``factor`` is no number, or ``material`` no material.
+        TypeError: ``factor`` is not a number, or ``material`` is not a ``Material``.
         ValueError: ``factor`` is not finite and above 0.
     """
     checks.number("factor", factor, above=0)
@@ -37,17 +38,17 @@ def softened(material: Material, factor: float) -> Material:
 
 
 def soft_to_stiff(env: Env, factors: Sequence[float] = (4, 2, 1)) -> tuple[Any, ...]:
-    """Returns the environment with its softness multiplied, for a continuation.
+    """Returns the environment with several degrees of softness, for a continuation.
 
-    Optimize in the first one, go on from there in the next, and end with the one that
-    counts.
+    Optimize in the first environment. Start the next one from the result, and so on.
+    The last environment is the real one.
 
     Args:
-        env: A simulated robot, in any wrappers; it stays as it is.
-        factors: One for each environment that is returned.
+        env: A simulated robot, with any wrappers; it does not change.
+        factors: Factor of the softness of each returned environment.
 
     Raises:
-        TypeError: ``env`` is no environment, or a factor no number.
+        TypeError: ``env`` is not an environment, or a factor is not a number.
         ValueError: A factor is not finite and above 0.
         NotImplementedError: The environment inside is not a simulated robot.
     """

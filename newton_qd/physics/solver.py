@@ -193,7 +193,11 @@ class NewtonQDSolver(SolverBase):
         _check_model(self.model, self._reference, self.robot)
 
     def _rows(self, name: str, array: wp.array | None, columns: int) -> wp.array:
-        """Returns the array as (worlds, columns), without a copy."""
+        """Returns the array as (worlds, columns), without a copy.
+
+        Raises:
+            ValueError: It is missing, or has the wrong size.
+        """
         size = self._worlds * columns
         if array is None or array.shape != (size,):
             given = None if array is None else Fact(f"shape {array.shape}")
@@ -231,7 +235,11 @@ def _one_world(robot: RobotSpec, device: wp.Device) -> newton.Model:
 
 
 def _check_model(model: newton.Model, one: newton.Model, robot: RobotSpec) -> None:
-    """Raises ValueError unless every world of ``model`` is ``one``."""
+    """Checks that every world of ``model`` is equal to ``one``.
+
+    Raises:
+        ValueError: A world differs.
+    """
     worlds = model.world_count
     for name in _ABSENT:
         if getattr(model, name):
@@ -287,7 +295,11 @@ def _colliders(model: newton.Model, name: str, nb: int) -> list[np.ndarray]:
 def _compare(
     name: str, worlds: np.ndarray, robot: np.ndarray, first_world: int = 0
 ) -> None:
-    """Raises ValueError where a world's row differs from the robot's."""
+    """Checks that the row of each world is equal to that of the robot.
+
+    Raises:
+        ValueError: A row differs.
+    """
     different = worlds != robot
     if different.any():
         place = tuple(np.argwhere(different)[0])

@@ -85,7 +85,11 @@ def _numpy(array: object) -> np.ndarray:
 
 
 def _joint_kinds(model: newton.Model, description: Description) -> np.ndarray:
-    """Returns the kind of every Newton joint (number of joints,)."""
+    """Returns the kind of every Newton joint (number of joints,).
+
+    Raises:
+        RobotDescriptionError: Newton made a joint of an unsupported kind.
+    """
     from newton import JointType
 
     kinds = {
@@ -105,7 +109,11 @@ def _joint_kinds(model: newton.Model, description: Description) -> np.ndarray:
 
 
 def _read_newton(model: newton.Model, description: Description) -> BuiltModel:
-    """Copies the model into NumPy arrays ordered by body."""
+    """Copies the model into NumPy arrays ordered by body.
+
+    Raises:
+        ModelMismatchError: Newton's joints do not move each body once.
+    """
     prefix = f"{description.name}/" if description.name else ""
     kinds = _joint_kinds(model, description)
     child = _numpy(model.joint_child)

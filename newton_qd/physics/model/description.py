@@ -129,6 +129,9 @@ def _merge_fixed(
     Returns:
         Frames (7,) of the links by name, their colliders, and the moving joints on
         them, all in the frame of ``root``.
+
+    Raises:
+        RobotDescriptionError: A fixed link has mass.
     """
     frames, shapes, moving = {root.name: IDENTITY}, list(root.shapes), []
     pending = [(joint, IDENTITY) for joint in children[root.name]]

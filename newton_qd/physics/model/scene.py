@@ -97,7 +97,11 @@ def read_scene(scene: Scene) -> tuple[SceneLink, ...]:
 
 
 def _link_frames(reader: XmlReader, links: dict[str, Link]) -> dict[str, np.ndarray]:
-    """Returns the frame (7,) of every link in the world."""
+    """Returns the frame (7,) of every link in the world.
+
+    Raises:
+        RobotDescriptionError: A joint is not fixed.
+    """
     children = read_joints(reader, links)
     root = find_root(reader, links, children)
     frames = {root: IDENTITY}
