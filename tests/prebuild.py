@@ -42,10 +42,12 @@ def build(env_name: str, dtype: str, kernel: str) -> None:
     import warp as wp
 
     import newton_qd
+    from newton_qd.envs.base import PhysicsEnv
     from newton_qd.physics.bridge import launcher
 
     jax.config.update("jax_enable_x64", dtype == "float64")
     env = newton_qd.create(env_name, dtype=dtype).unwrapped
+    assert isinstance(env, PhysicsEnv)
     launcher(env.system, wp.get_device("cpu")).prepare(kernel)
 
 
