@@ -12,6 +12,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from newton_qd import checks
+from newton_qd.checks import Fact, listed, message
+
 FORMAT = 1
 MAX_CELLS = 1_000_000
 DEFAULT_GRIDS = {1: (64,), 2: (32, 32), 3: (9, 9, 9), 4: (5, 5, 5, 5)}
@@ -88,26 +91,23 @@ class EvolveConfig:
             object.__setattr__(self, name, float(getattr(self, name)))
 
     def _check(self) -> None:
-        if not isinstance(self.env_name, str) or not self.env_name:
-            raise ConfigError(f"env_name must be a name, got {self.env_name!r}")
-        if not isinstance(self.algorithm, str) or not self.algorithm:
-            raise ConfigError(f"algorithm must be a name, got {self.algorithm!r}")
+        checks.text("env_name", self.env_name, error=ConfigError)
+        checks.text("algorithm", self.algorithm, error=ConfigError)
         check_integer("seed", self.seed, 0, 2**32 - 1)
         check_integer("iterations", self.iterations, 0)
         check_integer("batch_size", self.batch_size, 1)
         check_integer("reevaluations", self.reevaluations, 0)
         check_integer("episode_length", self.episode_length, 1)
-        check_integers("hidden", self.hidden, 1)
-        check_number("iso_sigma", self.iso_sigma)
-        check_number("line_sigma", self.line_sigma)
+        check_integers("hidden", self.hidden)
+        checks.number("iso_sigma", self.iso_sigma, least=0, error=ConfigError)
+        checks.number("line_sigma", self.line_sigma, least=0, error=ConfigError)
         if self.grid is not None and self.centroids is not None:
-            raise ConfigError(
-                f"grid {self.grid} and centroids {self.centroids} exclude each other"
-            )
+            given = (self.grid, self.centroids)
+            raise ConfigError(message("grid, centroids", given, "one of the two"))
         if self.grid is not None:
-            check_integers("grid", self.grid, 1)
+            check_integers("grid", self.grid)
             if not self.grid:
-                raise ConfigError("grid must name at least one dimension, got ()")
+                raise ConfigError(message("grid", (), "at least one dimension"))
             check_integer("grid's number of cells", math.prod(self.grid), 2, MAX_CELLS)
         if self.centroids is not None:
             check_integer("centroids", self.centroids, 2, MAX_CELLS)
@@ -129,17 +129,18 @@ class EvolveConfig:
             return self
         if self.grid is None:
             if descriptor_length not in DEFAULT_GRIDS:
-                raise ConfigError(
-                    f"a descriptor of {descriptor_length} components has no default "
-                    "grid: give centroids (a number of cells)"
+                why = (
+                    f"and a descriptor of {descriptor_length} components has no default"
                 )
+                allowed = "a grid, or centroids (a number of cells)"
+                raise ConfigError(message("grid", None, allowed, why=why))
             return dataclasses.replace(self, grid=DEFAULT_GRIDS[descriptor_length])
         if len(self.grid) != descriptor_length:
-            raise ConfigError(
-                f"grid {'x'.join(map(str, self.grid))} has {len(self.grid)} "
-                f"dimensions; the descriptor of {self.env_name!r} has "
-                f"{descriptor_length}"
-            )
+            cells = "x".join(map(str, self.grid))
+            given = Fact(f"{cells}, which has {len(self.grid)} dimensions")
+            allowed = f"as many as the descriptor of {self.env_name!r} has: "
+            allowed += str(descriptor_length)
+            raise ConfigError(message("grid", given, allowed))
         return self
 
     def replace(self, **changes: Any) -> EvolveConfig:
@@ -151,9 +152,7 @@ class EvolveConfig:
         known = {field.name for field in dataclasses.fields(self)}
         unknown = sorted(set(changes) - known)
         if unknown:
-            raise ConfigError(
-                f"unknown setting {unknown[0]!r}; known: {', '.join(sorted(known))}"
-            )
+            raise ConfigError(message("setting", unknown[0], listed(sorted(known))))
         return dataclasses.replace(self, **changes)
 
     def differences(self, other: EvolveConfig) -> list[tuple[str, Any, Any]]:
@@ -178,47 +177,22 @@ def _pairs(options: Any) -> tuple[tuple[str, Any], ...]:
             for name, value in items
         }
     except (TypeError, ValueError) as error:
-        raise ConfigError(
-            f"options must be names with values, got {options!r}"
-        ) from error
+        raise ConfigError(message("options", options, "names with values")) from error
     return tuple(sorted(pairs.items()))
 
 
-def check_number(name: str, value: Any) -> None:
-    """Checks a finite number of at least 0.
-
-    Raises:
-        ConfigError: The value is something else.
-    """
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not number or not math.isfinite(value) or value < 0:
-        raise ConfigError(
-            f"{name} must be a finite number of at least 0, got {value!r}"
-        )
+def check_integer(name: str, value: Any, least: int, most: int | None = None) -> None:
+    """Raises ``ConfigError`` for what is not an integer of Python in a range."""
+    checks.integer(name, value, least=least, most=most, error=ConfigError)
+    # others could not be written to the file of settings
+    checks.instance(name, value, int, "integers of Python", error=ConfigError)
 
 
-def check_integer(name: str, value: Any, low: int, high: int | None = None) -> None:
-    """Checks an integer from low to high.
-
-    Raises:
-        ConfigError: The value is something else.
-    """
-    bad_type = not isinstance(value, int) or isinstance(value, bool)
-    if bad_type or value < low or (high is not None and value > high):
-        allowed = f"at least {low}" if high is None else f"{low} to {high}"
-        raise ConfigError(f"{name} must be an integer, {allowed}; got {value!r}")
-
-
-def check_integers(name: str, values: Any, low: int) -> None:
-    """Checks a tuple of integers from low on.
-
-    Raises:
-        ConfigError: The values are something else.
-    """
-    if not isinstance(values, tuple):
-        raise ConfigError(f"{name} must be a tuple of integers, got {values!r}")
-    for value in values:
-        check_integer(f"every entry of {name}", value, low)
+def check_integers(name: str, values: Any) -> None:
+    """Raises ``ConfigError`` for what is not a tuple of integers from 1 on."""
+    checks.instance(name, values, tuple, "a tuple of integers", error=ConfigError)
+    for index, value in enumerate(values):
+        check_integer(f"{name}[{index}]", value, 1)
 
 
 def environment_facts() -> dict[str, Any]:
@@ -297,16 +271,16 @@ def read_config(
         )
     settings = document["settings"]
     if not isinstance(settings, dict):
-        raise ConfigError(f"{path}: 'settings' must be an object, got {settings!r}")
+        raise ConfigError(message(f"{path}: settings", settings, "an object"))
     facts = document.get("environment", {})
     if not isinstance(facts, dict) or not isinstance(facts.get("packages", {}), dict):
-        raise ConfigError(f"{path}: 'environment' must be facts by name, got {facts!r}")
+        raise ConfigError(message(f"{path}: environment", facts, "facts by name"))
     if env_name is not None:
         settings = {"env_name": env_name, **settings}
     try:
         config = EvolveConfig().replace(**settings)
         if "env_name" not in settings:
-            raise ConfigError("env_name is missing: name an environment")
+            raise ConfigError(message("env_name", None, "the name of an environment"))
         return config, facts
     except (ConfigError, TypeError, ValueError) as error:
         raise ConfigError(f"{path}: {error}") from error

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from newton_qd.checks import listed, message
 from newton_qd.qd.algorithms.cma_maega import CMA_MAEGA
 from newton_qd.qd.algorithms.cma_me import CMA_ME
 from newton_qd.qd.algorithms.cma_mega import CMA_MEGA
@@ -49,5 +50,5 @@ def algorithm_named(name: str) -> AlgorithmSpec[Any]:
     for spec in ALGORITHMS:
         if spec.name == name:
             return spec
-    names = ", ".join(spec.name for spec in ALGORITHMS)
-    raise ConfigError(f"algorithm: {name!r} does not exist; allowed: {names}")
+    names = listed([spec.name for spec in ALGORITHMS])
+    raise ConfigError(message("algorithm", name, names, why="which does not exist"))

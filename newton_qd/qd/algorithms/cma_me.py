@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+from newton_qd import checks
 from newton_qd.qd.algorithms.options import Options
 from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext
 from newton_qd.qd.config import ConfigError
@@ -32,8 +33,7 @@ def _make(context: EmitterContext, options: CMAMEOptions) -> Any:
     from qdax.core.emitters.cma_improvement_emitter import CMAImprovementEmitter
     from qdax.core.emitters.cma_pool_emitter import CMAPoolEmitter
 
-    if not options.sigma_g > 0:
-        raise ConfigError(f"options: sigma_g must be positive, got {options.sigma_g}")
+    checks.number("options: sigma_g", options.sigma_g, above=0, error=ConfigError)
     emitter = CMAImprovementEmitter(
         batch_size=context.config.batch_size,
         genotype_dim=context.policy.size,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING, Any
 
+from newton_qd.checks import message
 from newton_qd.qd.algorithms.gradient_options import (
     CHAOTIC,
     MixedOptions,
@@ -50,16 +51,13 @@ class CMAMEGAOptions(MixedOptions):
             ConfigError: The points do not divide a generation, or are too many.
         """
         if self.points < 1 or config.batch_size % self.points:
-            raise ConfigError(
-                f"options: points must divide batch_size = {config.batch_size}, got "
-                f"{self.points!r}"
-            )
+            allowed = f"divisors of batch_size = {config.batch_size}"
+            raise ConfigError(message("options: points", self.points, allowed))
         each = config.batch_size // self.points
         if each < _SMALLEST_POPULATION:
-            raise ConfigError(
-                f"options: points = {self.points} leave {each} of batch_size = "
-                f"{config.batch_size} each; at least {_SMALLEST_POPULATION}"
-            )
+            why = f"which leave {each} of batch_size = {config.batch_size} each"
+            allowed = f"at least {_SMALLEST_POPULATION} for each point"
+            raise ConfigError(message("options: points", self.points, allowed, why=why))
         return each
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+from newton_qd.checks import message
 from newton_qd.qd.algorithms.options import Options
 from newton_qd.qd.config import ConfigError, EvolveConfig
 
@@ -51,6 +52,5 @@ def require_batch_size(config: EvolveConfig, name: str, value: int | None) -> No
         ConfigError: The value is given, and is not the size of a generation.
     """
     if value not in (None, config.batch_size):
-        raise ConfigError(
-            f"options: {name} is batch_size ({config.batch_size}), not {value!r}"
-        )
+        allowed = f"batch_size ({config.batch_size})"
+        raise ConfigError(message(f"options: {name}", value, allowed))

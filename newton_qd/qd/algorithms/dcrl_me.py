@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING, Any
 
+from newton_qd.checks import listed, message
 from newton_qd.qd.algorithms.critic_options import CriticOptions
 from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext
 from newton_qd.qd.algorithms.variation import isoline
@@ -51,10 +52,10 @@ class DCRLMEOptions(CriticOptions):
         found |= {name: value for name, value in given.items() if value is not None}
         sizes = tuple(found.values())
         if min(sizes) < 1 or sum(sizes) != config.batch_size:
-            raise ConfigError(
-                "options: ga_batch_size, dcrl_batch_size and ai_batch_size must be at "
-                f"least 1 and add up to batch_size ({config.batch_size}), got {sizes}"
-            )
+            names = f"options: {listed(found)}"
+            allowed = "integers from 1 that add up to batch_size "
+            allowed += f"({config.batch_size})"
+            raise ConfigError(message(names, sizes, allowed))
         return found
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+from newton_qd.checks import message
 from newton_qd.qd.algorithms.gradient_options import (
     DifferentiableOptions,
     differentiable,
@@ -76,11 +77,10 @@ def _make(context: EmitterContext, options: ActorCriticOptions) -> Any:
         measures=task.descriptor_length,
     )
     if emitter.batch_size > config.batch_size:
-        raise ConfigError(
-            f"options: actors = {options.actors} times branches = {options.branches} "
-            f"times copies = {options.copies} are more than batch_size = "
-            f"{config.batch_size}"
-        )
+        given = options.actors, options.branches, options.copies
+        allowed = f"at most batch_size = {config.batch_size} as their product"
+        name = "options: actors, branches, copies"
+        raise ConfigError(message(name, given, allowed))
     return with_isoline(emitter, config)
 
 

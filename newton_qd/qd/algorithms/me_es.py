@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING, Any
 
+from newton_qd.checks import message
 from newton_qd.qd.algorithms.critic_options import require_batch_size
 from newton_qd.qd.algorithms.options import Options
 from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext
@@ -76,9 +77,8 @@ def _make(context: EmitterContext, options: MEESOptions) -> Any:
     samples = context.config.batch_size
     require_batch_size(context.config, "sample_number", options.sample_number)
     if options.sample_mirror and samples % 2:
-        raise ConfigError(
-            f"batch_size must be even for 'me-es' with sample_mirror, got {samples}"
-        )
+        allowed = "even numbers for 'me-es' with sample_mirror"
+        raise ConfigError(message("batch_size", samples, allowed))
     emitter = MEESEmitter(
         MEESConfig(**{**dataclasses.asdict(options), "sample_number": samples}),
         # The archive of its novelty holds one descriptor for each generation.

@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+from newton_qd import checks
+from newton_qd.checks import message
 from newton_qd.qd.algorithms.gradient_options import (
     CHAOTIC,
     FlowOptions,
@@ -43,18 +45,15 @@ class MEGradientOptions(FlowOptions):
         Raises:
             ConfigError: A generation is too small, or a value out of its range.
         """
-        if not 0 < self.share <= 1:
-            raise ConfigError(f"options: share must be in (0, 1], got {self.share!r}")
-        if self.branches < 1:
-            raise ConfigError(
-                f"options: branches must be at least 1, got {self.branches!r}"
-            )
+        checks.number("options: share", self.share, above=0, most=1, error=ConfigError)
+        checks.integer("options: branches", self.branches, most=None, error=ConfigError)
         parents = int(self.share * config.batch_size) // self.branches
         if parents < 1:
-            raise ConfigError(
-                f"options: share = {self.share} of batch_size = {config.batch_size} "
-                f"holds no parent with branches = {self.branches} offspring"
+            allowed = (
+                f"a share of batch_size = {config.batch_size} that holds a parent with "
+                f"branches = {self.branches} offspring"
             )
+            raise ConfigError(message("options: share", self.share, allowed))
         return parents
 
 

@@ -14,12 +14,13 @@ import typing
 from collections.abc import Iterator
 from typing import Any, TypeVar
 
+from newton_qd import checks
+from newton_qd.checks import listed, message
 from newton_qd.qd.config import (
     ConfigError,
     EvolveConfig,
     check_integer,
     check_integers,
-    check_number,
 )
 
 
@@ -78,10 +79,9 @@ def read_options(
     allowed = {field.name for field in dataclasses.fields(kind)}
     for name, value in config.options:
         if name not in allowed:
-            raise ConfigError(
-                f"options: {config.algorithm!r} has no {name!r}; allowed: "
-                f"{', '.join(sorted(allowed)) or 'none'}"
-            )
+            why = f"which {config.algorithm!r} does not have"
+            known = listed(sorted(allowed))
+            raise ConfigError(message("options", name, known, why=why))
         defaults[name] = _fitting(name, value, _without_none(hints[name]), least)
     with refused_options():
         options = kind(**defaults)
@@ -106,15 +106,14 @@ def _fitting(name: str, value: Any, wanted: Any, least: int) -> Any:
     """
     name = f"options: {name}"
     if wanted is float:
-        check_number(name, value)
+        checks.number(name, value, least=0, error=ConfigError)
         return float(value)
     if wanted is int:
         check_integer(name, value, least)
     elif wanted is bool:
-        if not isinstance(value, bool):
-            raise ConfigError(f"{name} must be true or false, got {value!r}")
+        checks.instance(name, value, bool, "true or false", error=ConfigError)
     elif typing.get_origin(wanted) is tuple:
-        check_integers(name, value, 1)
+        check_integers(name, value)
     else:
         raise TypeError(f"{name}: a setting of type {wanted} cannot be an option")
     return value

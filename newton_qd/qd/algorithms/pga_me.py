@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+from newton_qd.checks import message
 from newton_qd.qd.algorithms.critic_options import CriticOptions, require_batch_size
 from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext
 from newton_qd.qd.algorithms.variation import isoline
@@ -43,10 +44,9 @@ def _make(context: EmitterContext, options: PGAMEOptions) -> Any:
     size = context.config.batch_size
     require_batch_size(context.config, "env_batch_size", options.env_batch_size)
     if not 0 < int(options.proportion_mutation_ga * size) < size:
-        raise ConfigError(
-            f"options: proportion_mutation_ga = {options.proportion_mutation_ga} of "
-            f"batch_size = {size} must be some individuals, not all"
-        )
+        name = "options: proportion_mutation_ga"
+        allowed = f"some individuals of batch_size = {size}, not all"
+        raise ConfigError(message(name, options.proportion_mutation_ga, allowed))
     emitter = PGAMEEmitter(
         PGAMEConfig(**{**dataclasses.asdict(options), "env_batch_size": size}),
         context.policy.network,

@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 from qdax.core.emitters.emitter import Emitter
 
+from newton_qd import checks
+from newton_qd.checks import message
 from newton_qd.envs.state import select
 from newton_qd.qd.emitters.actor_critic_learner import ActorCritic, Learner
 from newton_qd.qd.emitters.cells import draw_cells
@@ -101,12 +103,10 @@ class ActorCriticEmitter(Emitter):
         counts = {"actors": actors, "branches": branches, "copies": copies}
         counts = {**counts, "updates": updates}
         for name, value in {**counts, "lifetime": lifetime}.items():
-            if value < 1:
-                raise ValueError(f"{name} must be at least 1, got {value}")
+            checks.integer(name, value, most=None)
         if not 0 < spread[0] <= spread[1]:
-            raise ValueError(f"spread must be 0 < smallest <= largest, got {spread}")
-        if not 0 <= steered <= 1:
-            raise ValueError(f"steered must be in [0, 1], got {steered}")
+            raise ValueError(message("spread", spread, "0 < smallest <= largest"))
+        checks.number("steered", steered, least=0, most=1)
         self._method = method
         self._first = first
         self._actors = actors

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import math
+
+from newton_qd import checks
+from newton_qd.checks import message
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -47,24 +49,13 @@ class ActorCriticSettings:
         """
         object.__setattr__(self, "critic", tuple(self.critic))
         for name in ("worlds", "window", "epochs", "batches"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {self._of(name)}")
-        if self.batches > self.worlds * self.window:
-            raise ValueError(
-                f"batches must be at most worlds * window = "
-                f"{self.worlds * self.window}, got {self.batches}"
-            )
+            checks.integer(name, getattr(self, name), most=None)
+        steps = self.worlds * self.window
+        if self.batches > steps:
+            allowed = f"at most worlds * window = {steps}"
+            raise ValueError(message("batches", self.batches, allowed))
         for name in ("rate", "critic_rate", "clip"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(
-                    f"{name} must be finite and above 0, got {self._of(name)}"
-                )
-        if not 0 <= self.noise < math.inf:
-            raise ValueError(f"noise must be at least 0, got {self.noise!r}")
-        if not 0 <= self.discount < 1:
-            raise ValueError(f"discount must be in [0, 1), got {self.discount!r}")
-        if not 0 <= self.trace <= 1:
-            raise ValueError(f"trace must be in [0, 1], got {self.trace!r}")
-
-    def _of(self, name: str) -> str:
-        return repr(getattr(self, name))
+            checks.number(name, getattr(self, name), above=0)
+        checks.number("noise", self.noise, least=0)
+        checks.number("discount", self.discount, least=0, below=1)
+        checks.number("trace", self.trace, least=0, most=1)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import flax.struct
 import jax
 import jax.numpy as jnp
@@ -12,6 +10,7 @@ from qdax.core.containers.mapelites_repertoire import (
     get_cells_indices,
 )
 
+from newton_qd import checks
 from newton_qd.types import ExtraScores, Genotype
 
 
@@ -155,7 +154,5 @@ def check_annealing(learning_rate: float, threshold_min: float) -> None:
     Raises:
         ValueError: A setting is out of its range.
     """
-    if not 0 <= learning_rate <= 1:
-        raise ValueError(f"learning_rate must be in [0, 1], got {learning_rate}")
-    if not math.isfinite(threshold_min):
-        raise ValueError(f"threshold_min must be finite, got {threshold_min}")
+    checks.number("learning_rate", learning_rate, least=0, most=1)
+    checks.number("threshold_min", threshold_min)

@@ -25,6 +25,8 @@ from jax.typing import ArrayLike
 from qdax.core.containers.mapelites_repertoire import get_cells_indices
 from qdax.core.emitters.emitter import Emitter, EmitterState
 
+from newton_qd import checks
+from newton_qd.checks import Fact, message
 from newton_qd.qd.emitters.cma_es import CMAES, CMAESState
 from newton_qd.qd.emitters.ranking import best_of
 from newton_qd.qd.emitters.restarts import RestartRule
@@ -126,10 +128,8 @@ class ArborescenceEmitter(Emitter, abc.ABC):
             ("num_emitters", num_emitters, 1),
             ("restart_period", 1 if restart_period is None else restart_period, 1),
         ):
-            if value < low:
-                raise ValueError(f"{name} must be at least {low}, got {value}")
-        if not sigma_g > 0:
-            raise ValueError(f"sigma_g must be positive, got {sigma_g}")
+            checks.integer(name, value, least=low, most=None)
+        checks.number("sigma_g", sigma_g, above=0)
         self._scoring_function = scoring_function
         self._sigma_g = sigma_g
         self._population = batch_size
@@ -185,10 +185,9 @@ class ArborescenceEmitter(Emitter, abc.ABC):
             points = repertoire.select(points_key, self._num_emitters).genotypes
         else:
             if jnp.shape(self._start) != (size,):
-                raise GradientsError(
-                    f"start must have the genotypes' shape {(size,)}, got "
-                    f"{jnp.shape(self._start)}"
-                )
+                given = Fact(f"shape {jnp.shape(self._start)}")
+                allowed = f"the genotypes' shape {(size,)}"
+                raise GradientsError(message("start", given, allowed))
             points = jnp.broadcast_to(
                 jnp.asarray(self._start, dtype), (self._num_emitters, size)
             )

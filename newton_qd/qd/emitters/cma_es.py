@@ -16,6 +16,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from newton_qd import checks
+
 # pyribs' and pycma's limit for the extent of the distribution.
 _SMALLEST_EXTENT = 1e-11
 
@@ -64,10 +66,8 @@ class CMAES:
         Raises:
             ValueError: Fewer than two samples, or a step size that is not positive.
         """
-        if self.population < 2:
-            raise ValueError(f"population must be at least 2, got {self.population}")
-        if not self.sigma > 0:
-            raise ValueError(f"sigma must be positive, got {self.sigma}")
+        checks.integer("population", self.population, least=2, most=None)
+        checks.number("sigma", self.sigma, above=0)
 
     @property
     def weights(self) -> np.ndarray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from newton_qd import checks
 from newton_qd.qd.emitters.annealed_repertoire import AnnealedRepertoire
 from newton_qd.qd.emitters.arborescence import ArborescenceEmitter
 from newton_qd.qd.emitters.restarts import RestartRule
@@ -22,12 +23,11 @@ class CMAMAEGAEmitter(ArborescenceEmitter):
     default_restart_rule = RestartRule.BASIC
 
     def _bars(self, repertoire: Repertoire) -> jax.Array:
-        if not isinstance(repertoire, AnnealedRepertoire):
-            raise TypeError(
-                "repertoire must be an AnnealedRepertoire, whose cells have "
-                f"thresholds, got {type(repertoire).__name__}: give MAPElites its "
-                "init as repertoire_init"
-            )
+        allowed = (
+            "an AnnealedRepertoire, whose cells have thresholds: give MAPElites its "
+            "init as repertoire_init"
+        )
+        checks.instance("repertoire", repertoire, AnnealedRepertoire, allowed)
         return repertoire.thresholds
 
     def _rank(

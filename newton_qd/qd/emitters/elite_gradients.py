@@ -15,6 +15,8 @@ from qdax.core.containers.mapelites_repertoire import get_cells_indices
 from qdax.core.emitters.emitter import Emitter, EmitterState
 from qdax.core.emitters.repertoire_selectors.selector import Selector
 
+from newton_qd import checks
+from newton_qd.checks import message
 from newton_qd.qd.scoring.gradient_scores import Scores, read_scores
 from newton_qd.types import (
     ExtraScores,
@@ -116,8 +118,7 @@ class EliteGradientEmitter(Emitter, abc.ABC):
         Raises:
             ValueError: The batch is empty.
         """
-        if batch_size < 1:
-            raise ValueError(f"batch_size must be at least 1, got {batch_size}")
+        checks.integer("batch_size", batch_size, most=None)
         self._batch_size = batch_size
         self._selector = selector
 
@@ -179,7 +180,6 @@ def check_steps(steps: int, scoring_function: ScoringFunction | None) -> None:
     Raises:
         ValueError: It is below 1, or needs a scoring function that is not given.
     """
-    if steps < 1:
-        raise ValueError(f"steps must be at least 1, got {steps}")
+    checks.integer("steps", steps, most=None)
     if steps > 1 and scoring_function is None:
-        raise ValueError(f"steps = {steps} needs a scoring_function")
+        raise ValueError(message("steps", steps, "1 without a scoring_function"))

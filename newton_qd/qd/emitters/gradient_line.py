@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 from qdax.core.emitters.emitter import Emitter
 
+from newton_qd import checks
+from newton_qd.checks import message
 from newton_qd.gradients.exact import DirectionalGradient
 from newton_qd.qd.emitters.cells import draw_cells, empty_targets, nearest_cells
 from newton_qd.types import ExtraScores, PyTree, Repertoire
@@ -57,15 +59,12 @@ class GradientLineEmitter(Emitter):
             ValueError: A number is out of its range.
         """
         for name, value in (("parents", parents), ("branches", branches)):
-            if value < 1:
-                raise ValueError(f"{name} must be at least 1, got {value}")
+            checks.integer(name, value, most=None)
         if not 0 < shortest <= longest:
-            raise ValueError(
-                "steps must be 0 < shortest <= longest, got shortest = "
-                f"{shortest}, longest = {longest}"
-            )
-        if not 0 <= steered <= 1:
-            raise ValueError(f"steered must be in [0, 1], got {steered}")
+            given = (shortest, longest)
+            allowed = "0 < shortest <= longest"
+            raise ValueError(message("shortest, longest", given, allowed))
+        checks.number("steered", steered, least=0, most=1)
         self._gradient = gradient
         self._parents = parents
         self._branches = branches

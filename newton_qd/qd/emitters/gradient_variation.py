@@ -11,6 +11,7 @@ import optax
 from numpy.typing import ArrayLike
 from qdax.core.emitters.repertoire_selectors.selector import Selector
 
+from newton_qd.checks import Fact, message
 from newton_qd.qd.emitters.elite_gradients import EliteGradientEmitter, check_steps
 from newton_qd.qd.scoring.gradient_scores import normalize, read_scores
 from newton_qd.types import (
@@ -70,10 +71,8 @@ class GradientVariationEmitter(EliteGradientEmitter):
         if directions is not None:
             directions = np.asarray(directions)
             if directions.ndim != 2 or not np.all(np.isfinite(directions)):
-                raise ValueError(
-                    "directions must be finite numbers (K, 1 + D), got "
-                    f"{directions.tolist()}"
-                )
+                allowed = "finite numbers (K, 1 + D)"
+                raise ValueError(message("directions", directions.tolist(), allowed))
         self._optimizer = optimizer
         self._steps = steps
         self._scoring_function = scoring_function
@@ -135,9 +134,7 @@ class GradientVariationEmitter(EliteGradientEmitter):
         if directions is None:
             directions = np.eye(1, rows)
         if directions.shape[1] != rows:
-            raise ValueError(
-                f"directions must have 1 + D = {rows} columns, got "
-                f"{directions.shape[1]}"
-            )
+            given = Fact(f"{directions.shape[1]} columns")
+            raise ValueError(message("directions", given, f"1 + D = {rows} columns"))
         drawn = jax.random.randint(key, (count,), 0, len(directions))
         return jnp.asarray(directions, gradients.dtype)[drawn]

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from qdax.core.emitters.repertoire_selectors.selector import Selector
 
+from newton_qd import checks
 from newton_qd.qd.emitters.elite_gradients import EliteGradientEmitter
 from newton_qd.qd.scoring.gradient_scores import normalize
 from newton_qd.types import ExtraScores, PyTree, Repertoire
@@ -42,8 +43,7 @@ class OMGMEGAEmitter(EliteGradientEmitter):
             ValueError: ``sigma_g`` is not positive, or the batch is empty.
         """
         super().__init__(batch_size, selector)
-        if not sigma_g > 0:
-            raise ValueError(f"sigma_g must be positive, got {sigma_g}")
+        checks.number("sigma_g", sigma_g, above=0)
         self._sigma_g = sigma_g
 
     def emit(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from newton_qd import checks
 from newton_qd.qd.emitters.cells import empty_targets, nearest_cells
 from newton_qd.qd.emitters.elite_gradients import EliteGradientEmitter, check_steps
 from newton_qd.qd.scoring.gradient_scores import read_scores
@@ -57,8 +58,7 @@ class SteeringEmitter(EliteGradientEmitter):
         super().__init__(batch_size)
         check_steps(steps, scoring_function)
         for name, value in (("max_step", max_step), ("damping", damping)):
-            if not value > 0:
-                raise ValueError(f"{name} must be positive, got {value}")
+            checks.number(name, value, above=0)
         self._max_step = max_step
         self._steps = steps
         self._scoring_function = scoring_function

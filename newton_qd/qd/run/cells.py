@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from newton_qd.checks import Fact, message
 from newton_qd.qd.config import ConfigError, EvolveConfig
 
 _CVT_SAMPLES_PER_CELL = 50
@@ -29,9 +30,8 @@ def cell_centroids(
 
     low, high = limits
     if not (np.all(np.isfinite(low)) and np.all(low < high)):
-        raise ConfigError(
-            f"the descriptor of {config.env_name!r} has no finite box: {low} to {high}"
-        )
+        given = Fact(f"{config.env_name!r}, whose descriptor is from {low} to {high}")
+        raise ConfigError(message("env_name", given, "a descriptor in a finite box"))
     if config.grid is None:
         centroids = _voronoi_centroids(config, low, high, key)
     else:

@@ -14,6 +14,8 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 
+from newton_qd import checks
+from newton_qd.checks import message
 from newton_qd.physics import interrupts
 from newton_qd.qd.config import ConfigError, EvolveConfig, environment_facts
 from newton_qd.qd.extras import require_extra
@@ -141,7 +143,9 @@ def _folder(
     require_extra("qdax", "qd")
     if out is None:
         if tensorboard:
-            raise ConfigError("tensorboard: needs a results folder (out)")
+            raise ConfigError(
+                message("tensorboard", True, "with a results folder (out)")
+            )
         return None
     folder = RunFolder(out)
     folder.check(resume=resume)
@@ -158,16 +162,14 @@ def _mesh(devices: int | None, resume: bool) -> Mesh | None:
         ConfigError: There are fewer devices, or several processes resume a run.
     """
     if resume and jax.process_count() > 1:
-        raise ConfigError(
-            f"resume: a run of {jax.process_count()} processes cannot be resumed, "
-            "only one of a single process"
-        )
+        why = f"with {jax.process_count()} processes"
+        allowed = "with a single process"
+        raise ConfigError(message("resume", True, allowed, why=why))
     if devices is None:
         return None
-    try:
-        return device_mesh(devices)
-    except ValueError as error:
-        raise ConfigError(f"devices: {error}") from error
+    most = len(jax.devices())
+    checks.integer("devices", devices, most=most, error=ConfigError)
+    return device_mesh(devices)
 
 
 def _first(

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from newton_qd.checks import Fact, message
 from newton_qd.files import temporary_name, write_atomically
 from newton_qd.qd.config import (
     ConfigError,
@@ -85,16 +86,20 @@ class RunFolder:
             ConfigError: The folder cannot be used like this.
         """
         if self.path.exists() and not self.path.is_dir():
-            raise ConfigError(f"out: {self.path} is a file, not a folder")
+            raise self._refused("which is a file", "a folder")
         if not self._occupied():
             return
         if not resume:
-            raise ConfigError(
-                f"out: {self.path} is not empty; add --resume to continue the run in "
-                "it, or choose another folder"
+            allowed = (
+                "an empty or another folder, or --resume to continue the run in it"
             )
+            raise self._refused("which is not empty", allowed)
         if not self.has_config:
-            raise ConfigError(f"out: {self.path} holds no run to resume ({CONFIG})")
+            why = f"which has no {CONFIG}"
+            raise self._refused(why, "a folder that holds a run to resume")
+
+    def _refused(self, why: str, allowed: str) -> ConfigError:
+        return ConfigError(message("out", Fact(self.path), allowed, why=why))
 
     def _occupied(self) -> bool:
         """Whether anything but the unfinished files of a killed run is here."""
@@ -113,9 +118,8 @@ class RunFolder:
         try:
             self.path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise ConfigError(
-                f"out: cannot create {self.path}: {error.strerror}"
-            ) from error
+            why = f"and cannot create it: {error.strerror}"
+            raise self._refused(why, "a folder that can be made") from error
         try:
             import fcntl
         except ImportError:  # Windows: a second writer is the user's affair
@@ -127,9 +131,8 @@ class RunFolder:
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
-                raise ConfigError(
-                    f"out: another process is writing to {self.path}"
-                ) from error
+                why = "and another process is writing to it"
+                raise self._refused(why, "a folder for each run") from error
             yield
         finally:
             os.close(descriptor)
@@ -158,16 +161,14 @@ class RunFolder:
         """
         stored, old_facts = read_config(self.path / CONFIG)
         for name, old, new in stored.differences(config):
-            raise ConfigError(
-                f"{name}: the run in {self.path} has {old!r}, not {new!r}; resume with "
-                "the same setting, or start a new run in another folder"
-            )
+            allowed = f"{old!r}, as the run in {self.path} has; or start a new run in "
+            allowed += "another folder"
+            raise ConfigError(message(name, new, allowed))
         warnings = []
         for name, old, new in changed_facts(old_facts, facts):
             if name == "x64":
-                raise ConfigError(
-                    f"jax_enable_x64: the run in {self.path} has {old!r}, not {new!r}"
-                )
+                allowed = f"{old!r}, as the run in {self.path} has"
+                raise ConfigError(message("jax_enable_x64", new, allowed))
             warnings.append(
                 f"warning: {name} was {old} when the run began and is {new} now; "
                 "the result may differ from an uninterrupted run"

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
+from newton_qd.checks import message
 from newton_qd.qd.algorithms import AlgorithmSpec, EmitterContext, algorithm_named
 from newton_qd.qd.algorithms.options import refused_options
 from newton_qd.qd.config import ConfigError, EvolveConfig, settings_text
@@ -292,15 +293,12 @@ def _runnable(config: EvolveConfig) -> AlgorithmSpec[Any]:
     """
     spec = algorithm_named(config.algorithm)
     if config.batch_size < spec.smallest:
-        raise ConfigError(
-            f"batch_size must be at least {spec.smallest} for {config.algorithm!r}, "
-            f"got {config.batch_size}"
-        )
+        allowed = f"at least {spec.smallest} for {config.algorithm!r}"
+        raise ConfigError(message("batch_size", config.batch_size, allowed))
     if jax.config.read("jax_enable_x64") and not spec.double:
-        raise ConfigError(
-            f"algorithm: {config.algorithm!r} is QDax's and mixes precisions in JAX's "
-            "64-bit mode; run it without jax_enable_x64"
-        )
+        why = "which is QDax's and mixes precisions in JAX's 64-bit mode"
+        allowed = "those of newton_qd, or any without jax_enable_x64"
+        raise ConfigError(message("algorithm", config.algorithm, allowed, why=why))
     return spec
 
 

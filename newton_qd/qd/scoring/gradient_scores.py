@@ -20,6 +20,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
+from newton_qd.checks import Fact, listed, message
 from newton_qd.types import Genotype
 
 GRADIENTS = "gradients"
@@ -70,22 +71,20 @@ def read_scores(
             are not one array.
     """
     count, size = check_genotypes(genotypes).shape
-    if extra_scores is None or GRADIENTS not in extra_scores:
-        held = ", ".join(repr(key) for key in extra_scores or ()) or "nothing"
-        raise GradientsError(
-            f"extra_scores[{GRADIENTS!r}] is missing: extra_scores holds {held}. The "
-            "scoring function must return the gradients of fitness and descriptors, "
-            f"(N, size, 1 + D) = {(count, size, 1 + descriptors.shape[-1])}"
-        )
-    gradients = extra_scores[GRADIENTS]
     expected = (count, size, 1 + descriptors.shape[-1])
+    allowed = f"(N, size, 1 + D) = {expected}"
+    if extra_scores is None or GRADIENTS not in extra_scores:
+        held = listed([repr(key) for key in extra_scores or ()], "nothing")
+        given = Fact(f"{held}, and {GRADIENTS!r} is missing")
+        allowed = f"with the gradients of fitness and descriptors, {allowed}"
+        raise GradientsError(message("extra_scores", given, allowed))
+    gradients = extra_scores[GRADIENTS]
     if jnp.shape(gradients) != expected:
         swapped = jnp.shape(gradients) == (expected[0], expected[2], expected[1])
-        hint = "; swap the last two axes" if swapped else ""
-        raise GradientsError(
-            f"extra_scores[{GRADIENTS!r}] must be (N, size, 1 + D) = {expected}, "
-            f"objective first, got {jnp.shape(gradients)}{hint}"
-        )
+        hint = " (swap the last two axes)" if swapped else ""
+        given = Fact(f"shape {jnp.shape(gradients)}{hint}")
+        name = f"extra_scores[{GRADIENTS!r}]"
+        raise GradientsError(message(name, given, f"{allowed}, objective first"))
     gradients = jnp.swapaxes(jnp.asarray(gradients, genotypes.dtype), 1, 2)
     finite = finite_scores(fitnesses, descriptors) & jnp.all(
         jnp.isfinite(gradients), axis=(1, 2)
@@ -107,10 +106,11 @@ def check_genotypes(genotypes: Genotype) -> jax.Array:
     """
     if not isinstance(genotypes, jax.Array) or genotypes.ndim != 2:
         shapes = jax.tree.map(jnp.shape, genotypes)
-        raise GradientsError(
-            f"genotypes must be one array (N, size), got {shapes}; flatten the "
-            "parameters of a policy with jax.flatten_util.ravel_pytree"
+        allowed = (
+            "one array (N, size); flatten the parameters of a policy with "
+            "jax.flatten_util.ravel_pytree"
         )
+        raise GradientsError(message("genotypes", shapes, allowed))
     return genotypes
 
 

@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from newton_qd import checks
+from newton_qd.checks import Fact, message
 from newton_qd.qd.extras import require_extra
 from newton_qd.types import Repertoire, ScoringFunction
 
@@ -50,8 +52,7 @@ def make_ribs_evaluation(
         ValueError: ``worst`` is not finite. The function raises ``GradientsError``
             where gradients are missing or have another shape.
     """
-    if not np.isfinite(worst):
-        raise ValueError(f"worst={worst!r}: allowed: a finite number")
+    checks.number("worst", worst)
     low = jnp.asarray(limits[0], jnp.float32)
 
     @jax.jit
@@ -101,10 +102,9 @@ def to_ribs(
 
     centroids = np.asarray(repertoire.centroids)
     if grid is not None and np.prod(grid) != len(centroids):
-        raise ValueError(
-            f"grid={grid} has {np.prod(grid)} cells; the repertoire has "
-            f"{len(centroids)}"
-        )
+        allowed = f"{len(centroids)} cells, as the repertoire has"
+        why = f"which has {np.prod(grid)} cells"
+        raise ValueError(message("grid", grid, allowed, why=why))
     ravel = jax.vmap(lambda genotype: ravel_pytree(genotype)[0])
     solutions = np.asarray(ravel(jax.tree.map(jnp.asarray, repertoire.genotypes)))
     common: Any = {
@@ -172,13 +172,11 @@ def _centroids(archive: Any) -> np.ndarray:
 
     # Others have grid indices, too, but cells that move.
     if not isinstance(archive, CVTArchive | GridArchive):
-        raise TypeError(
-            f"archive={type(archive).__name__}: allowed: GridArchive, CVTArchive"
-        )
-    if not isinstance(archive.solution_dim, int | np.integer):
-        raise TypeError(
-            f"archive with solution_dim={archive.solution_dim!r}: allowed: an integer"
-        )
+        given = Fact(type(archive).__name__)
+        raise TypeError(message("archive", given, "GridArchive, CVTArchive"))
+    checks.integer(
+        "archive.solution_dim", archive.solution_dim, most=None, error=TypeError
+    )
     if isinstance(archive, CVTArchive):
         return np.asarray(archive.centroids)
     index = archive.int_to_grid_index(np.arange(archive.cells))

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from newton_qd.checks import Fact, message
 from newton_qd.gradients.episode import Episode
 from newton_qd.gradients.flow import EXACT, GradientOptions
 from newton_qd.qd.extras import require_extra
@@ -54,10 +55,9 @@ class Policy:
             ValueError: They have another shape.
         """
         if jnp.shape(genotypes)[1:] != (self.size,):
-            raise ValueError(
-                f"genotypes: shape {jnp.shape(genotypes)}: allowed: (N, {self.size}), "
-                "the weights of this policy"
-            )
+            given = Fact(f"shape {jnp.shape(genotypes)}")
+            allowed = f"(N, {self.size}), the weights of this policy"
+            raise ValueError(message("genotypes", given, allowed))
         array = jnp.asarray(genotypes)
         whole = not jnp.issubdtype(array.dtype, jnp.floating)
         return array.astype(jnp.float32) if whole else array

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from newton_qd import checks
 from newton_qd.types import ScoringFunction
 
 AXIS = "individuals"
@@ -28,8 +29,7 @@ def device_mesh(count: int | None = None) -> Mesh:
     devices = jax.devices()
     if count is None:
         count = len(devices)
-    if not 1 <= count <= len(devices):
-        raise ValueError(f"count={count!r}: allowed: 1 to {len(devices)}, the devices")
+    checks.integer("count", count, most=len(devices))
     return Mesh(np.array(devices[:count]), (AXIS,))
 
 

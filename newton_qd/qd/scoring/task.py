@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from newton_qd.checks import listed, message
 from newton_qd.qd.config import ConfigError, EvolveConfig
 
 
@@ -58,9 +59,8 @@ def make_task(config: EvolveConfig) -> Task:
         raise newton_qd.UnknownEnvironment(name, newton_qd.registered_envs())
     tasks = sorted(newton_qd.tables.descriptor_extractor)
     if name not in tasks:
-        raise ConfigError(
-            f"env_name: {name!r} has no descriptor; evolve takes {', '.join(tasks)}"
-        )
+        why = "which has no descriptor"
+        raise ConfigError(message("env_name", name, listed(tasks), why=why))
     env: Any = newton_qd.create(
         name, episode_length=config.episode_length, auto_reset=False
     )
