@@ -103,9 +103,12 @@ def test_a_signal_before_the_first_generation(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["evolve"], "name an environment"),
-        (["evolve", "--resume"], "name an environment"),
-        (["evolve", "--resume", "--out", "nowhere"], "name an environment"),
+        (["evolve"], "ENV: got None; allowed: the name of an env"),
+        (["evolve", "--resume"], "ENV: got None; allowed: the name of an env"),
+        (
+            ["evolve", "--resume", "--out", "nowhere"],
+            "ENV: got None; allowed: the name of an env",
+        ),
         (["evolve", "ant_unicorn"], "known names: ant, ant_uni"),
         (["evolve", "ant"], "has no descriptor; evolve takes ant_omni, "),
         (["evolve", "ant_uni", "--batch-size", "0"], "batch_size must be"),

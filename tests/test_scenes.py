@@ -227,7 +227,7 @@ MESH = '<collision><geometry><mesh filename="a.obj"/></geometry></collision>'
             f"<link name='a'/><link name='b'/>{joint('j', 'continuous', 'a', 'b')}",
             "joint 'j': got 'continuous'; allowed: fixed joints in a scene",
         ),
-        ("<link name='a'/><link name='b'/>", "2 links without a parent"),
+        ("<link name='a'/><link name='b'/>", "links: got 2 without a parent"),
     ],
 )
 def test_refused_files(tmp_path: Path, inside: str, message: str) -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from newton_qd import checks
+from newton_qd.checks import message
 from newton_qd.cli.arguments import FAILED, OK, Commands, complain, integers, widths
 from newton_qd.qd.algorithms import ALGORITHMS
 from newton_qd.qd.config import (
@@ -142,6 +143,9 @@ def _add_setting_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
+_UNNAMED = message("ENV", None, "the name of an environment, as in evolve ant_uni")
+
+
 def _option(text: str) -> tuple[str, Any]:
     name, separator, value = text.partition("=")
     try:
@@ -222,14 +226,14 @@ def _settle(arguments: argparse.Namespace) -> tuple[EvolveConfig, Path]:
     if out is None:
         named = (base or _DEFAULTS).replace(**given)
         if base is None and "env_name" not in given:
-            raise ConfigError("name an environment, for example: evolve ant_uni")
+            raise ConfigError(_UNNAMED)
         out = Path("results") / f"{named.env_name}-seed{named.seed}"
     folder = RunFolder(out)
     folder.check(resume=arguments.resume)
     if base is None and arguments.resume and folder.has_config:
         base = read_config(out / CONFIG)[0]
     if base is None and "env_name" not in given:
-        raise ConfigError("name an environment, for example: evolve ant_uni")
+        raise ConfigError(_UNNAMED)
     base = base or _DEFAULTS
     # A new choice of cells replaces the other kind of cells.
     if "grid" in given:

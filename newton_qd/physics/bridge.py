@@ -315,7 +315,6 @@ def from_jax(array: jax.Array, dtype: type | None = None) -> wp.array:
         TypeError: ``array`` is traced.
     """
     if isinstance(array, Tracer):
-        raise TypeError(
-            "from_jax: array is traced; a DLPack view needs a concrete array"
-        )
+        allowed = "a concrete array, which a DLPack view needs"
+        raise TypeError(message("from_jax: array", Fact("a traced one"), allowed))
     return wp.from_jax(jax.block_until_ready(array), dtype=dtype)

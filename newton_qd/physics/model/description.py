@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from newton_qd.checks import Fact, listed, message
 from newton_qd.physics.model.elements import (
     Joint,
     Link,
@@ -83,9 +84,7 @@ def read_joints(reader: XmlReader, links: dict[str, Link]) -> dict[str, list[Joi
         joint = read_joint(reader, element)
         for role, link in (("parent", joint.parent), ("child", joint.child)):
             if link not in links:
-                raise reader.error(
-                    element, f"{role} {link!r} unknown; links: {', '.join(links)}"
-                )
+                raise reader.refused(element, role, link, listed(links))
         if joint.child in moved:
             raise reader.error(element, f"link {joint.child!r} already has a parent")
         moved.add(joint.child)
@@ -104,17 +103,15 @@ def find_root(
     moved = {joint.child for joints in children.values() for joint in joints}
     roots = [name for name in links if name not in moved]
     if len(roots) != 1:
-        raise reader.error(
-            reader.root,
-            f"{len(roots)} links without a parent ({', '.join(roots) or 'a loop'}); "
-            "allowed: one tree",
-        )
+        given = Fact(f"{len(roots)} without a parent ({listed(roots, 'a loop')})")
+        raise reader.refused(reader.root, "links", given, "one tree")
     reached = [roots[0]]
     for link in reached:
         reached += [joint.child for joint in children[link]]
     if len(reached) != len(links):
         loop = ", ".join(name for name in links if name not in reached)
-        raise reader.error(reader.root, f"links in a loop: {loop}; allowed: one tree")
+        given = Fact(f"a loop ({loop})")
+        raise reader.refused(reader.root, "links", given, "one tree")
     return roots[0]
 
 
@@ -144,10 +141,11 @@ def _merge_fixed(
         link = links[joint.child]
         if link.mass > 0:
             # Newton 1.8 forgets the offset of the centre of mass when it merges.
-            raise RobotDescriptionError(
-                f"{reader.path}: link {link.name!r} has mass and is fixed to "
-                f"{joint.parent!r}; allowed: give the mass of both to {joint.parent!r}"
-            )
+            name = f"{reader.path}: mass of link {link.name!r}"
+            given = Fact(f"{link.mass:g}")
+            why = f"and it is fixed to {joint.parent!r}"
+            allowed = f"0, so give the mass of both to {joint.parent!r}"
+            raise RobotDescriptionError(message(name, given, allowed, why=why))
         frames[link.name] = frame
         shapes += [
             dataclasses.replace(shape, frame=compose(frame, shape.frame))
@@ -161,10 +159,9 @@ def _check_masses(path: Path, bodies: dict[str, Body]) -> None:
     carried = {name: body.link.mass for name, body in bodies.items()}
     for name, body in reversed(bodies.items()):
         if carried[name] <= 0:
-            raise RobotDescriptionError(
-                f"{path}: link {name!r} and all that hangs on it have no mass; "
-                "allowed: an <inertial> on it or on a link below it"
-            )
+            name = f"{path}: mass of link {name!r} and all that hangs on it"
+            allowed = "an <inertial> on it or on a link below it"
+            raise RobotDescriptionError(message(name, Fact("none"), allowed))
         if body.parent is not None:
             carried[body.parent] += carried[name]
 
@@ -178,7 +175,8 @@ def read_description(path: Path) -> Description:
     """
     reader = XmlReader(path)
     if reader.root.tag != "robot":
-        raise reader.error(reader.root, "allowed as the outermost element: <robot>")
+        given = Fact(f"<{reader.root.tag}>")
+        raise reader.refused(reader.root, "outermost element", given, "<robot>")
     elements = by_name(reader, "link")
     if not elements:
         raise reader.error(reader.root, "element <link> is missing")
@@ -193,10 +191,9 @@ def read_description(path: Path) -> Description:
         frames, shapes, moving = _merge_fixed(reader, link, links, children)
         fixed = joint is None and not floating
         if fixed and (link.shapes or link.mass > 0):
-            raise reader.error(
-                elements[WORLD],
-                "a robot's world link has a collider or a mass; allowed: neither",
-            )
+            given = Fact("a collider or a mass")
+            allowed = "neither on a robot's world link"
+            raise reader.refused(elements[WORLD], "link", given, allowed)
         if fixed:
             still.update((name, at) for name, at in frames.items() if name != WORLD)
         else:

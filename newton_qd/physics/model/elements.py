@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from newton_qd.checks import Fact, listed
 from newton_qd.physics.model.xml_reader import XmlReader
 from newton_qd.physics.reference import rotation_matrix
 
@@ -80,9 +81,8 @@ def _read_shape(reader: XmlReader, element: ElementTree.Element, link: str) -> S
     kinds = [child for child in geometry if child.tag in _SHAPES]
     if len(kinds) != 1 or len(geometry) != 1:
         found = ", ".join(child.tag for child in geometry) or "nothing"
-        raise reader.error(
-            geometry, f"holds {found}; allowed: exactly one of {', '.join(_SHAPES)}"
-        )
+        allowed = f"exactly one of {listed(_SHAPES)}"
+        raise reader.refused(geometry, "shape", Fact(found), allowed)
     shape = kinds[0]
     size = np.zeros(3)
     if shape.tag == "mesh":
@@ -95,11 +95,9 @@ def _read_shape(reader: XmlReader, element: ElementTree.Element, link: str) -> S
     # Newton reads a capsule's height, MuJoCo its length.
     if shape.tag == "capsule" and shape.get("length") is not None:
         if 2 * size[1] != reader.number(shape, "length"):
-            raise reader.error(
-                shape,
-                f"height={shape.get('height')!r} and length={shape.get('length')!r} "
-                "both mean the straight part and must be equal",
-            )
+            given = (shape.get("height"), shape.get("length"))
+            allowed = "two equal numbers, as both mean the straight part"
+            raise reader.refused(shape, "height, length", given, allowed)
     return Shape(link, shape.tag, reader.frame(element), size, element.get("name", ""))
 
 
@@ -119,11 +117,9 @@ def _read_inertial(
     moments = np.linalg.eigvalsh(inertia)
     # A principal moment is at most the sum of the others for any real body.
     if moments[0] <= 0 or moments[2] > (moments[0] + moments[1]) * (1 + 1e-6):
-        raise reader.error(
-            element,
-            f"principal moments {', '.join(f'{m:g}' for m in moments)}; allowed: "
-            "positive, none larger than the sum of the other two",
-        )
+        given = Fact(listed([f"{moment:g}" for moment in moments]))
+        allowed = "positive, none larger than the sum of the other two"
+        raise reader.refused(element, "principal moments", given, allowed)
     frame = reader.frame(inertial)
     rotation = rotation_matrix(frame[3:])
     return float(mass), frame[:3], rotation @ inertia @ rotation.T
@@ -152,11 +148,11 @@ def _refuse_limits(reader: XmlReader, limit: ElementTree.Element) -> None:
         if limit.get(key) is None:
             continue
         if abs(reader.numbers(limit, key, 1, finite=False)[0]) < UNLIMITED:
-            raise reader.error(
-                limit,
-                f"{key}={limit.get(key)!r} of a continuous joint; allowed: none, so "
-                "remove lower and upper, or make the joint revolute",
+            allowed = (
+                "none for a continuous joint, so remove lower and upper, or make the "
+                "joint revolute"
             )
+            raise reader.refused(limit, key, limit.get(key), allowed)
 
 
 def _read_limits(reader: XmlReader, joint: ElementTree.Element) -> tuple[float, float]:
@@ -169,7 +165,8 @@ def _read_limits(reader: XmlReader, joint: ElementTree.Element) -> tuple[float, 
     lower = float(reader.numbers(limit, "lower", 1, finite=False)[0])
     upper = float(reader.numbers(limit, "upper", 1, finite=False)[0])
     if lower > upper:
-        raise reader.error(limit, f"lower {lower:g} is above upper {upper:g}")
+        given, allowed = Fact(f"{lower:g}"), f"at most {upper:g}, the upper limit"
+        raise reader.refused(limit, "lower", given, allowed)
     return (
         -math.inf if lower <= -UNLIMITED else lower,
         math.inf if upper >= UNLIMITED else upper,
@@ -185,9 +182,7 @@ def read_joint(reader: XmlReader, element: ElementTree.Element) -> Joint:
     name = reader.text(element, "name")
     kind = reader.text(element, "type")
     if kind not in _JOINT_TYPES:
-        raise reader.error(
-            element, f"type={kind!r} not supported; allowed: {', '.join(_JOINT_TYPES)}"
-        )
+        raise reader.refused(element, "type", kind, listed(_JOINT_TYPES))
     if element.find("mimic") is not None:
         raise reader.error(element, "<mimic> is not supported")
     axis = np.array([1.0, 0.0, 0.0])
@@ -195,15 +190,19 @@ def read_joint(reader: XmlReader, element: ElementTree.Element) -> Joint:
     if axis_element is not None:
         axis = reader.numbers(axis_element, "xyz", 3)
         if not np.linalg.norm(axis) > 0:
-            raise reader.error(axis_element, "xyz is zero; allowed: a direction")
+            given = axis_element.get("xyz")
+            raise reader.refused(axis_element, "xyz", given, "a direction")
     damping = 0.0
     dynamics = element.find("dynamics")
     if dynamics is not None:
         damping = reader.number(dynamics, "damping", "0")
         if damping < 0:
-            raise reader.error(dynamics, f"damping={damping:g}; allowed: not negative")
-        if reader.number(dynamics, "friction", "0") != 0:
-            raise reader.error(dynamics, "joint friction is not supported; allowed: 0")
+            given = Fact(f"{damping:g}")
+            raise reader.refused(dynamics, "damping", given, "numbers from 0")
+        friction = reader.number(dynamics, "friction", "0")
+        if friction != 0:
+            allowed = "0, as joint friction is not supported"
+            raise reader.refused(dynamics, "friction", friction, allowed)
     lower, upper = _read_limits(reader, element)
     return Joint(
         name,

@@ -75,7 +75,8 @@ def read_scene(scene: Scene) -> tuple[SceneLink, ...]:
     checks.instance("scene", scene, Scene, allowed)
     reader = XmlReader(find_urdf(scene.urdf))
     if reader.root.tag != "robot":
-        raise reader.error(reader.root, "allowed as the outermost element: <robot>")
+        given = Fact(f"<{reader.root.tag}>")
+        raise reader.refused(reader.root, "outermost element", given, "<robot>")
     elements = by_name(reader, "link")
     if not elements:
         raise reader.error(reader.root, "element <link> is missing")
