@@ -10,16 +10,18 @@ from __future__ import annotations
 import math
 import numbers
 from collections.abc import Collection
-from typing import Any, TypeGuard, TypeVar
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
+
+if TYPE_CHECKING:
+    import jax
 
 _LONGEST = 100  # characters of a value in an error
 _MOST = 2**31 - 1  # JAX counts in 32 bits
 _FLOATS = ("float32", "float64")
 
 Error = type[Exception]
-Value = TypeVar("Value")
 
 
 class Fact(str):
@@ -320,12 +322,12 @@ def x64(dtype: np.dtype) -> None:
 
 def array(
     name: str,
-    value: Value,
+    value: object,
     shape: tuple[int, ...],
     dtype: Any,
     *,
     scalars: bool = False,
-) -> Value:
+) -> jax.Array:
     """Checks shape and dtype of an array, and returns it strongly typed.
 
     Args:

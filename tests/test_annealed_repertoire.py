@@ -119,8 +119,8 @@ def test_what_is_not_finite_never_enters() -> None:
 @pytest.mark.parametrize(
     ("rate", "floor", "message"),
     [
-        (1.5, 0.0, r"learning_rate must be in \[0, 1\], got 1.5"),
-        (0.1, -np.inf, "threshold_min must be finite, got -inf"),
+        (1.5, 0.0, "learning_rate: got 1.5; .* from 0 to 1"),
+        (0.1, -np.inf, "threshold_min: got -inf; allowed: finite"),
     ],
 )
 def test_refuses(rate: float, floor: float, message: str) -> None:

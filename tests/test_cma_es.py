@@ -113,7 +113,7 @@ def test_stops() -> None:
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
-    [((3, 1, 1.0), "population must be at least 2"), ((3, 4, 0.0), "sigma must be")],
+    [((3, 1, 1.0), "population: got 1; .* from 2"), ((3, 4, 0.0), "sigma: got 0.0; ")],
 )
 def test_refuses(arguments: tuple, message: str) -> None:
     with pytest.raises(ValueError, match=message):

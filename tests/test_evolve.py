@@ -118,7 +118,9 @@ def test_default_grid_is_filled_in() -> None:
     config = SMALL.replace(grid=None)
     assert [config.resolve(n).grid for n in (2, 4)] == [(32, 32), (5, 5, 5, 5)]
     assert config.replace(centroids=9).resolve(2).grid is None
-    with pytest.raises(ConfigError, match=r"descriptor of 5 components.*centroids"):
+    with pytest.raises(
+        ConfigError, match=r"grid: got .*descriptor of 5 components.*centroids"
+    ):
         config.resolve(5)
 
 
@@ -197,7 +199,7 @@ def test_genotypes_of_another_policy_are_refused() -> None:
     score = make_scoring_function(task, policy, SMALL.episode_length)
     for shape in ((5, policy.size + 1), (policy.size,)):
         with pytest.raises(
-            ValueError, match=rf"genotypes: shape .* allowed: \(N, {policy.size}\)"
+            ValueError, match=rf"genotypes: got shape .* allowed: \(N, {policy.size}\)"
         ):
             jax.eval_shape(score, jnp.zeros(shape), jax.random.key(0))
 

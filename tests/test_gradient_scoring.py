@@ -42,7 +42,9 @@ def test_genotypes_that_are_no_weights(make: Any) -> None:
     policy = make_policy(task.env, (4,))
     score, key = make(task, policy, STEPS), jax.random.key(1)
     for shape in ((4, policy.size + 1), (policy.size,)):
-        with pytest.raises(ValueError, match=r"genotypes: shape \(.*allowed: \(N, "):
+        with pytest.raises(
+            ValueError, match=r"genotypes: got shape \(.*allowed: \(N, "
+        ):
             score(jnp.zeros(shape), key)
     whole = score(jnp.ones((2, policy.size), jnp.int32), key)
     real = score(jnp.ones((2, policy.size)), key)

@@ -69,7 +69,7 @@ FOUR_DEVICES = {"XLA_FLAGS": f"{FLAGS} --xla_force_host_platform_device_count=4"
 def test_a_mesh_has_the_devices_that_exist() -> None:
     count = len(jax.devices())
     assert device_mesh().size == count and device_mesh(1).size == 1
-    with pytest.raises(ValueError, match=f"count={count + 1}: allowed: 1 to {count}"):
+    with pytest.raises(ValueError, match=f"count: got {count + 1}; .* 1 to {count}"):
         device_mesh(count + 1)
 
 
@@ -147,7 +147,9 @@ print(json.dumps([mesh.size, *(np.asarray(x).tolist() for x in found[:2])]))
 
 def test_devices_that_do_not_exist_are_refused(tmp_path: Path) -> None:
     count = len(jax.devices())
-    with pytest.raises(ConfigError, match=rf"devices: count=99: allowed: 1 to {count}"):
+    with pytest.raises(
+        ConfigError, match=rf"devices: got 99; allowed: .* 1 to {count}"
+    ):
         evolve(EvolveConfig(), out=tmp_path / "run", devices=99)
     assert not list(tmp_path.iterdir())
 

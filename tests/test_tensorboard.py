@@ -59,5 +59,5 @@ def test_event_files_hold_the_metrics(
 
 
 def test_event_files_need_a_folder() -> None:
-    with pytest.raises(ConfigError, match="tensorboard: needs a results folder"):
+    with pytest.raises(ConfigError, match=r"tensorboard: got True; .*a results folder"):
         run(SMALL, tensorboard=True)

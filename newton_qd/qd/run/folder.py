@@ -91,7 +91,7 @@ class RunFolder:
             return
         if not resume:
             allowed = (
-                "an empty or another folder, or --resume to continue the run in it"
+                "an empty or another folder; add --resume to continue the run in it"
             )
             raise self._refused("which is not empty", allowed)
         if not self.has_config:

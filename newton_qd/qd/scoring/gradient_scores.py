@@ -82,9 +82,9 @@ def read_scores(
     if jnp.shape(gradients) != expected:
         swapped = jnp.shape(gradients) == (expected[0], expected[2], expected[1])
         hint = " (swap the last two axes)" if swapped else ""
-        given = Fact(f"shape {jnp.shape(gradients)}{hint}")
+        given = Fact(f"shape {jnp.shape(gradients)}")
         name = f"extra_scores[{GRADIENTS!r}]"
-        raise GradientsError(message(name, given, f"{allowed}, objective first"))
+        raise GradientsError(message(name, given, f"{allowed}, objective first{hint}"))
     gradients = jnp.swapaxes(jnp.asarray(gradients, genotypes.dtype), 1, 2)
     finite = finite_scores(fitnesses, descriptors) & jnp.all(
         jnp.isfinite(gradients), axis=(1, 2)
