@@ -52,7 +52,7 @@ def test_the_list_names_every_algorithm(capsys: pytest.CaptureFixture[str]) -> N
     printed = capsys.readouterr().out.replace("-\n", "-")
     assert ", ".join(names) in " ".join(printed.split()).replace("me- ", "me-")
     assert cli.main(["algorithms", "ga"]) == cli.BAD_ARGUMENTS
-    assert "'ga' does not exist; allowed: me, cma-me," in capsys.readouterr().err
+    assert "'ga', which does not exist; allowed: me, cma-me," in capsys.readouterr().err
 
 
 def test_options_of_qdax_are_those_of_qdax() -> None:

@@ -71,7 +71,7 @@ def test_default_folder_and_resume(
     resume = ["evolve", "point", "--resume", "--quiet", "--seed", 3]
     assert call(*resume) == cli.OK
     assert call(*resume, "--batch-size", 17) == cli.BAD_ARGUMENTS
-    assert "batch_size: the run in" in capsys.readouterr().err
+    assert "batch_size: got 17; allowed: 16, as the run in" in capsys.readouterr().err
     assert call(*resume, "--centroids", 5) == cli.BAD_ARGUMENTS
     assert {entry.name: entry.read_bytes() for entry in out.iterdir()} == before
 
