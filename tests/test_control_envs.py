@@ -317,5 +317,7 @@ def test_fixed_initial_state_and_unknown_options(name: str) -> None:
     state = jax.jit(env.reset)(jax.random.key(0))
     assert same(state.obs, jax.jit(env.reset)(jax.random.key(1)).obs)
     assert not np.any(state.pipeline_state.v)
-    with pytest.raises(TypeError, match=r"legacy_spring=True: .*reset_noise_scale, "):
+    with pytest.raises(
+        TypeError, match=r"legacy_spring: got True.*reset_noise_scale, "
+    ):
         newton_qd.create(name, legacy_spring=True)
