@@ -166,31 +166,6 @@ def integer(
     raise error(message(name, value, allowed))
 
 
-def integers(
-    name: str,
-    values: Any,
-    *,
-    least: int | None = 1,
-    most: int | None = _MOST,
-    error: Error | None = None,
-) -> None:
-    """Checks that a value is a tuple or list of integers within bounds.
-
-    Raises:
-        TypeError: The value is neither a tuple nor a list.
-        ValueError: An entry is not an integer, or is out of bounds.
-    """
-    instance(name, values, (tuple, list), "a tuple of integers", error=error)
-    for index, value in enumerate(values):
-        integer(
-            f"{name}[{index}]",
-            value,
-            least=least,
-            most=most,
-            error=error or ValueError,
-        )
-
-
 def interval(name: str, value: Any, *, error: Error | None = None) -> None:
     """Checks that a value is two numbers, the first below the second.
 
@@ -226,18 +201,6 @@ def text(
     """
     if not (optional and value is None) and not (isinstance(value, str) and value):
         raise error(message(name, value, f"{_none(optional)}text that is not empty"))
-
-
-def choice(
-    name: str, value: Any, allowed: Collection[Any], *, error: Error = ValueError
-) -> None:
-    """Checks that a value is one of the allowed values.
-
-    Raises:
-        ValueError: The value is not allowed.
-    """
-    if is_array(value) or value not in allowed:
-        raise error(message(name, value, listed(allowed)))
 
 
 def instance(
