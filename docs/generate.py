@@ -34,9 +34,10 @@ HEAD = """# Environments
 This page lists the observation, actions, reward, metrics and options of every
 environment of `newton_qd.create`. It is generated from the code by `docs/generate.py`.
 
-A dash means that there is no state descriptor. Options are keyword arguments of
-`create`. [Differences](differences.md) compares these environments with the original
-ones.
+A dash means that there is no state descriptor. The first table of an environment is
+its `observation_layout`: the entries of the observation. Options are keyword arguments
+of `create`. [Differences](differences.md) compares these environments with those of
+QDax.
 
 | name | robot or task | observation | action | step [s] | state descriptor |
 |---|---|---|---|---|---|
