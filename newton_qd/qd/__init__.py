@@ -1,20 +1,19 @@
-"""Quality-Diversity on the environments: settings, loop and results.
+"""Quality-Diversity with the environments: settings, loop and results.
 
 - ``evolve(EvolveConfig(...), out=...)``: MAP-Elites on a registered environment
-- ``newton_qd.qd.emitters``: emitters of QDax that are fed with exact gradients, and
+- ``newton_qd.qd.emitters``: emitters for QDax that use exact gradients, and
   ``AnnealedRepertoire`` for one of them
-- ``load_archive(folder)``, ``plot_archive(...)``: what a run has found
-- ``make_task``, ``make_policy``, ``make_scoring_function``: the parts, for other
-  algorithms of QDax
-- ``episode_of(task, policy, length)``: the same as a ``newton_qd.Episode``, whose
-  ``scoring(episode.gradient)`` has gradients (``make_gradient_scoring_function`` is
-  deprecated)
-- ``device_mesh``, ``shard_scoring``: evaluation split over several devices
-- ``make_ribs_evaluation``, ``to_ribs``, ``from_ribs``: pyribs on these tasks
+- ``load_archive(folder)``, ``plot_archive(...)``: the result of a run
+- ``make_task``, ``make_policy``, ``make_scoring_function``: parts for other algorithms
+  of QDax
+- ``episode_of(task, policy, length)``: the same as a ``newton_qd.Episode``;
+  ``episode.scoring(episode.gradient)`` has gradients
+  (``make_gradient_scoring_function`` is deprecated)
+- ``device_mesh``, ``shard_scoring``: evaluation on several devices
+- ``make_ribs_evaluation``, ``to_ribs``, ``from_ribs``: pyribs with these tasks
 
-Importing this package imports none of its parts: each name is loaded when it is
-first used. QDax and matplotlib (extra ``qd``) are imported by the functions that
-need them.
+Importing this package imports no other module of it. Each name is loaded when it is
+first used. Functions that need QDax or matplotlib (extra ``qd``) import them.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Old place of what ``newton_qd.qd.emitters`` has."""
+"""Old place of names that are now in ``newton_qd.qd.emitters``."""
 
 from __future__ import annotations
 
@@ -15,5 +15,5 @@ _MOVED = {
 
 
 def __getattr__(name: str) -> Any:
-    """Finds an old name in its new place."""
+    """Returns a moved object by its old name."""
     return moved_name(__name__, name, _MOVED)

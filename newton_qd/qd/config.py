@@ -1,4 +1,4 @@
-"""Settings of an evolution: one frozen dataclass, and the file that holds it."""
+"""Settings of an evolution: one frozen dataclass, and its file."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from newton_qd.checks import Fact, listed, message
 FORMAT = 1
 MAX_CELLS = 1_000_000
 DEFAULT_GRIDS = {1: (64,), 2: (32, 32), 3: (9, 9, 9), 4: (5, 5, 5, 5)}
-"""Cells per descriptor dimension when the user asks for nothing."""
+"""Default number of cells per descriptor dimension."""
 
 _PACKAGES = (
     "newton_qd",
@@ -33,7 +33,7 @@ _PACKAGES = (
 
 
 class ConfigError(ValueError):
-    """A setting is wrong, unknown, or not the one of the run to resume."""
+    """A setting is wrong, unknown, or differs from that of the run to resume."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -56,10 +56,10 @@ class EvolveConfig:
         line_sigma: Standard deviation of the step towards the second parent,
             relative to the distance of the parents [-].
         reevaluations: Evaluations of each elite at the end of the run, for metrics
-            without luck; 0 leaves them out.
+            without luck; 0: none.
         algorithm: Name of one of ``newton_qd.qd.algorithms.ALGORITHMS``.
-        options: Settings that this algorithm alone has, as ``(name, value)`` in the
-            order of their names; may be given as a dictionary.
+        options: Settings of this algorithm, as ``(name, value)`` sorted by name. A
+            dictionary is allowed too.
 
     Raises:
         ConfigError: A value is wrong, or both ``grid`` and ``centroids`` are given.
@@ -80,7 +80,7 @@ class EvolveConfig:
     options: tuple[tuple[str, Any], ...] = ()
 
     def __post_init__(self) -> None:
-        """Normalizes sequences to tuples and checks every value."""
+        """Converts sequences to tuples and checks every value."""
         for name in ("hidden", "grid"):
             value = getattr(self, name)
             if isinstance(value, list):
@@ -113,7 +113,7 @@ class EvolveConfig:
             check_integer("centroids", self.centroids, 2, MAX_CELLS)
 
     def resolve(self, descriptor_length: int) -> EvolveConfig:
-        """Fills in the grid and checks it against the descriptor.
+        """Sets a default grid and checks that it fits the descriptor.
 
         Args:
             descriptor_length: Number of components of the descriptor.
@@ -122,8 +122,8 @@ class EvolveConfig:
             Settings in which exactly one of ``grid`` and ``centroids`` is given.
 
         Raises:
-            ConfigError: There is no default grid for the descriptor, or the grid has
-                another number of dimensions.
+            ConfigError: There is no default grid for this length, or the grid has the
+                wrong number of dimensions.
         """
         if self.centroids is not None:
             return self
@@ -147,7 +147,7 @@ class EvolveConfig:
         """Returns a copy with some settings changed.
 
         Raises:
-            ConfigError: No setting has such a name, or a value is wrong.
+            ConfigError: A setting does not exist, or a value is wrong.
         """
         known = {field.name for field in dataclasses.fields(self)}
         unknown = sorted(set(changes) - known)
@@ -165,10 +165,10 @@ class EvolveConfig:
 
 
 def _pairs(options: Any) -> tuple[tuple[str, Any], ...]:
-    """Brings options into the order of their names; lists become tuples.
+    """Sorts options by name, and converts lists to tuples.
 
     Raises:
-        ConfigError: They are no names with values.
+        ConfigError: They are not names with values.
     """
     items = options.items() if isinstance(options, dict) else options
     try:
@@ -182,21 +182,29 @@ def _pairs(options: Any) -> tuple[tuple[str, Any], ...]:
 
 
 def check_integer(name: str, value: Any, least: int, most: int | None = None) -> None:
-    """Raises ``ConfigError`` for what is not an integer of Python in a range."""
+    """Checks that a value is a Python integer within bounds.
+
+    Raises:
+        ConfigError: The value is not such an integer.
+    """
     checks.integer(name, value, least=least, most=most, error=ConfigError)
-    # others could not be written to the file of settings
+    # the file of settings cannot contain other integers, such as NumPy's
     checks.instance(name, value, int, "integers of Python", error=ConfigError)
 
 
 def check_integers(name: str, values: Any) -> None:
-    """Raises ``ConfigError`` for what is not a tuple of integers from 1 on."""
+    """Checks that values are a tuple of integers of at least 1.
+
+    Raises:
+        ConfigError: The values are not such a tuple.
+    """
     checks.instance(name, values, tuple, "a tuple of integers", error=ConfigError)
     for index, value in enumerate(values):
         check_integer(f"{name}[{index}]", value, 1)
 
 
 def environment_facts() -> dict[str, Any]:
-    """Describes what a bit-exact repetition of a run needs besides its settings."""
+    """Returns versions and machine data that a bit-exact repetition of a run needs."""
     import jax
 
     return {
@@ -216,7 +224,7 @@ def _version(package: str) -> str | None:
 
 
 def config_to_json(config: EvolveConfig, facts: dict[str, Any]) -> str:
-    """Writes settings and the facts of the machine as readable JSON."""
+    """Returns settings and the facts of the machine as readable JSON."""
     document = {
         "format": FORMAT,
         "settings": dataclasses.asdict(config),
@@ -226,31 +234,31 @@ def config_to_json(config: EvolveConfig, facts: dict[str, Any]) -> str:
 
 
 def settings_text(config: EvolveConfig) -> str:
-    """Settings as one line, for ``equal_settings``."""
+    """Returns the settings as one line, for ``equal_settings``."""
     return json.dumps(dataclasses.asdict(config), sort_keys=True)
 
 
 def equal_settings(one: str, other: str) -> bool:
-    """Whether two lines of ``settings_text`` say the same; 1 and 1.0 are equal."""
+    """Returns whether two lines of ``settings_text`` are equal; 1 is equal to 1.0."""
     return json.loads(one) == json.loads(other)
 
 
 def read_config(
     path: Path, env_name: str | None = None
 ) -> tuple[EvolveConfig, dict[str, Any]]:
-    """Reads a ``config.json``, or settings that were written by hand as TOML.
+    """Reads a ``config.json``, or settings in a TOML file.
 
     Args:
-        path: File to read. One that ends in ``.toml`` holds the names of settings
-            with their values, and those of ``options`` in a table of that name.
-        env_name: Environment where the file names none.
+        path: File to read. A ``.toml`` file has settings as ``name = value``, and a
+            table ``options``.
+        env_name: Environment, if the file does not name one.
 
     Returns:
-        Settings and the facts of the machine that wrote them (maybe empty).
+        Settings, and the facts of the machine that wrote them. These may be empty.
 
     Raises:
-        ConfigError: The file is missing, is not such a file, holds a bad setting, or
-            there is no environment.
+        ConfigError: The file is missing, has the wrong format, has a wrong setting, or
+            the environment is missing.
     """
     written_by_hand = path.suffix == ".toml"
     kind, parse = ("TOML", tomllib.loads) if written_by_hand else ("JSON", json.loads)

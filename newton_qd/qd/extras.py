@@ -8,10 +8,10 @@ from newton_qd.errors import MissingExtra
 
 
 def require_extra(package: str, extra: str) -> None:
-    """Refuses to go on without an optional dependency.
+    """Checks that an optional dependency is installed.
 
     Args:
-        package: Name under which it is imported.
+        package: Name of the module to import.
         extra: Extra of ``newton_qd`` that installs it.
 
     Raises:

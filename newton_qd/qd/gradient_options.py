@@ -1,4 +1,4 @@
-"""Old place of the defaults that differ for an environment."""
+"""Old place of the defaults that depend on the environment."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 
 def __getattr__(name: str) -> Any:
-    """Gathers the defaults of all algorithms.
+    """Collects the defaults of all algorithms.
 
     Raises:
         AttributeError: The module never had the name.

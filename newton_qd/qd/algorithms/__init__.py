@@ -1,9 +1,10 @@
-"""The algorithms of ``evolve``: what each of them proposes next.
+"""The algorithms of ``evolve``.
 
-One file is one algorithm: its options with their defaults, the defaults that differ for
-an environment, and the function that makes its emitter of QDax. The file exports one
-``AlgorithmSpec``; ``ALGORITHMS`` lists them. Command line and documentation are written
-from this list, which imports no JAX. Genotypes are weight vectors (size,) throughout.
+One file has one algorithm: its options with their defaults, the defaults that depend on
+the environment, and the function that makes its emitter for QDax. The file exports one
+``AlgorithmSpec``. ``ALGORITHMS`` lists them. The command line and the documentation are
+generated from this list, which does not import JAX. All genotypes are weight vectors
+(size,).
 """
 
 from __future__ import annotations
@@ -42,10 +43,10 @@ ALGORITHMS: tuple[AlgorithmSpec[Any], ...] = (
 
 
 def algorithm_named(name: str) -> AlgorithmSpec[Any]:
-    """Returns the algorithm of a name.
+    """Returns the algorithm with a name.
 
     Raises:
-        ConfigError: There is none.
+        ConfigError: No algorithm has this name.
     """
     for spec in ALGORITHMS:
         if spec.name == name:

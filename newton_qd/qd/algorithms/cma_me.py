@@ -1,4 +1,4 @@
-"""CMA-ME, as QDax has it."""
+"""CMA-ME of QDax."""
 
 from __future__ import annotations
 

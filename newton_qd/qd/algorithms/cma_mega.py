@@ -1,4 +1,4 @@
-"""CMA-MEGA, and what CMA-MAEGA shares with it."""
+"""CMA-MEGA, and code that it shares with CMA-MAEGA."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 _SMALLEST_POPULATION = 3  # a solution point and two offspring
 
 TUNED = {"halfcheetah_uni": CHAOTIC, **on_robots_that_fall(sigma_g=0.02)}
-"""Defaults of ``CMAMEGAOptions`` that differ for an environment."""
+"""Defaults of ``CMAMEGAOptions`` that depend on the environment."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -30,13 +30,13 @@ class CMAMEGAOptions(MixedOptions):
     """Options of CMA-MEGA (Fontaine and Nikolaidis 2021).
 
     Attributes:
-        points: Solution points, among which a generation is divided.
+        points: Number of solution points that share a generation equally.
         sigma_g: Initial standard deviation of the coefficients of the normalized
             gradients, in units of policy weights [-].
         adam: Learning rate of Adam [-]; 0: points move to the weighted mean of their
             best offspring.
-        restart_period: Restart a point after this many generations in any case; 0:
-            by its restart rule alone.
+        restart_period: Restart each point after this many generations; 0: only by its
+            restart rule.
     """
 
     points: int = 4
@@ -45,10 +45,11 @@ class CMAMEGAOptions(MixedOptions):
     restart_period: int = 0
 
     def population(self, config: EvolveConfig) -> int:
-        """Individuals of a generation that belong to one solution point.
+        """Returns the number of individuals of a generation for one solution point.
 
         Raises:
-            ConfigError: The points do not divide a generation, or are too many.
+            ConfigError: A generation cannot be divided by the number of points, or
+                there are too many points.
         """
         if self.points < 1 or config.batch_size % self.points:
             allowed = f"divisors of batch_size = {config.batch_size}"
@@ -64,7 +65,7 @@ class CMAMEGAOptions(MixedOptions):
 def make_search(
     kind: type[ArborescenceEmitter], context: EmitterContext, options: CMAMEGAOptions
 ) -> ArborescenceEmitter:
-    """Makes an emitter of solution points with the options of a run."""
+    """Makes an emitter with solution points from the options of a run."""
     import optax
 
     config = context.config
@@ -80,13 +81,13 @@ def make_search(
 
 
 def gradients(config: EvolveConfig, options: CMAMEGAOptions) -> int:
-    """Episodes of a generation that are differentiated: those of solution points."""
+    """Returns the number of differentiated episodes: those of solution points."""
     del config
     return options.points * options.episodes
 
 
 def evaluations(config: EvolveConfig, options: CMAMEGAOptions) -> int:
-    """Episodes of a generation."""
+    """Returns the number of episodes of a generation."""
     return config.batch_size + gradients(config, options)
 
 

@@ -1,4 +1,4 @@
-"""Options of QDax's emitters that learn with a critic."""
+"""Options of QDax's emitters with a critic."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from newton_qd.qd.config import ConfigError, EvolveConfig
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class CriticOptions(Options):
-    """Options of an emitter that learns a critic, with the names that QDax gives them.
+    """Options of an emitter with a critic, with the names of QDax.
 
     Attributes:
         num_critic_training_steps: Updates of the critic in a generation.
         num_pg_training_steps: Updates of each policy that follows the critic.
-        replay_buffer_size: Transitions that are kept; checkpoints hold them.
+        replay_buffer_size: Transitions in the replay buffer, also in checkpoints.
         critic_hidden_layer_size: Widths of the critic's hidden layers.
         critic_learning_rate: Learning rate of the critic [-].
         policy_learning_rate: Learning rate of policies that follow the critic [-].
-        noise_clip: Largest noise on the actions of the critic's targets [-].
+        noise_clip: Limit of the noise on the actions of the critic's targets [-].
         policy_noise: Standard deviation of this noise [-].
         discount: Discount of a control step [-].
         reward_scaling: Factor of the rewards [-].
@@ -31,7 +31,7 @@ class CriticOptions(Options):
 
     num_critic_training_steps: int = 300
     num_pg_training_steps: int = 100
-    # A million, as QDax has it, would be in every checkpoint.
+    # QDax's default is a million. Each checkpoint contains the buffer.
     replay_buffer_size: int = 100_000
     critic_hidden_layer_size: tuple[int, ...] = (256, 256)
     critic_learning_rate: float = 3e-4
@@ -46,10 +46,10 @@ class CriticOptions(Options):
 
 
 def require_batch_size(config: EvolveConfig, name: str, value: int | None) -> None:
-    """Refuses an option that would give a generation another size.
+    """Checks that an option does not change the size of a generation.
 
     Raises:
-        ConfigError: The value is given, and is not the size of a generation.
+        ConfigError: The value is given, and differs from the size of a generation.
     """
     if value not in (None, config.batch_size):
         allowed = f"batch_size ({config.batch_size})"

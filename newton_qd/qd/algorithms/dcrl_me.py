@@ -1,4 +1,4 @@
-"""DCRL-ME, as QDax has it."""
+"""DCRL-ME of QDax."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class DCRLMEOptions(CriticOptions):
     Attributes:
         ga_batch_size: Iso+line variations in a generation; by default the rest.
         dcrl_batch_size: Individuals that follow the critic; by default a quarter.
-        ai_batch_size: Individuals that the actor makes; by default a quarter.
-        lengthscale: Distance of descriptors over which a reward falls by a factor e.
+        ai_batch_size: Individuals from the actor; by default a quarter.
+        lengthscale: Distance of descriptors at which a reward is smaller by a factor e.
         actor_learning_rate: Learning rate of the actor [-].
     """
 
@@ -37,10 +37,10 @@ class DCRLMEOptions(CriticOptions):
     batch_size: int = 100
 
     def shares(self, config: EvolveConfig) -> dict[str, int]:
-        """Sizes of the three parts of a generation, by the names of the options.
+        """Returns the sizes of the three parts of a generation, by option name.
 
         Raises:
-            ConfigError: One is empty, or they do not add up to a generation.
+            ConfigError: A part is empty, or their sum is not the size of a generation.
         """
         quarter = config.batch_size // 4
         found = {
@@ -66,7 +66,7 @@ def _make(context: EmitterContext, options: DCRLMEOptions) -> Any:
 
     from newton_qd import compat
 
-    compat.install()  # QDax's file imports environments that JAX of today refuses
+    compat.install()  # QDax's file imports environments that fail with today's JAX
     from qdax.core.emitters.dcrl_me_emitter import DCRLMEConfig, DCRLMEEmitter
     from qdax.core.neuroevolution.buffers.buffer import DCRLTransition
     from qdax.core.neuroevolution.networks.networks import MLPDC
@@ -82,10 +82,11 @@ def _make(context: EmitterContext, options: DCRLMEOptions) -> Any:
     )
 
     def convert(steps: dict[str, jax.Array]) -> Any:
-        # It weighs rewards by the distance of descriptors, so none may be negative.
+        # Rewards are weighted by the distance of descriptors, so they must not be
+        # negative.
         rewards = jnp.maximum(steps["rewards"] + task.reward_offset, 0.0)
         shape = (*rewards.shape, task.descriptor_length)
-        unknown = jnp.full(shape, jnp.nan, rewards.dtype)  # the emitter fills it in
+        unknown = jnp.full(shape, jnp.nan, rewards.dtype)  # the emitter sets it
         return DCRLTransition(
             **{**steps, "rewards": rewards}, desc=unknown, desc_prime=unknown
         )

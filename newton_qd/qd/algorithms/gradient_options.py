@@ -1,4 +1,4 @@
-"""Options of the algorithms of ``evolve`` that follow gradients through the physics."""
+"""Options of the algorithms of ``evolve`` that use gradients of the physics."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ class DifferentiableOptions(Options):
     """Options of every algorithm that differentiates an environment.
 
     Attributes:
-        smooth_width: Share of a robot's weight over which the reading of a foot has a
+        smooth_width: Share of a robot's weight over which the contact of a foot has a
             gradient [-]; its value stays 0 or 1.
-        initial_scale: Factor of the weights of the initial population [-]: small
-            feedback keeps gradients small over more control steps.
+        initial_scale: Factor of the weights of the initial population [-]; with small
+            weights, gradients stay small over more control steps.
     """
 
     smooth_width: float = 0.1
@@ -40,7 +40,7 @@ class FlowOptions(DifferentiableOptions):
     Attributes:
         window: Control steps after which the gradient is cut; 0: never.
         clip: Largest norm of the adjoint of a state; 0: no limit.
-        discount: Factor of the adjoint for each control step that it goes back [-].
+        discount: Factor of the adjoint for each control step on the way back [-].
     """
 
     window: int = 0
@@ -48,7 +48,7 @@ class FlowOptions(DifferentiableOptions):
     discount: float = 1.0
 
     def check(self) -> None:
-        """Refuses values that no gradient can have.
+        """Checks the settings of the gradient.
 
         Raises:
             ValueError: A value is out of its range.
@@ -56,7 +56,7 @@ class FlowOptions(DifferentiableOptions):
         self.flow()
 
     def flow(self) -> GradientOptions:
-        """The options of a gradient, in the fastest way, that keeps intermediates.
+        """Returns the options of the gradient; it stores all intermediate values.
 
         Raises:
             ValueError: A value is out of its range.
@@ -85,10 +85,10 @@ class MixedOptions(FlowOptions):
     noise: float = 0.02
 
     def gradient(self, episode: Episode) -> EpisodeGradient:
-        """The gradient of an episode: exact, or mixed with the zeroth order.
+        """Returns the gradient of an episode: exact, or mixed with the zeroth order.
 
         Raises:
-            TypeError: ``noise`` is no number.
+            TypeError: ``noise`` is not a number.
             ValueError: ``samples`` or ``noise`` is out of its range.
         """
         if not self.samples:
@@ -100,18 +100,19 @@ class MixedOptions(FlowOptions):
 
     @property
     def episodes(self) -> int:
-        """Episodes that are differentiated for one gradient."""
+        """Returns the number of differentiated episodes for one gradient."""
         return 2 * self.samples or 1
 
 
-# Its return is chaotic after some ten control steps.
+# The return of a halfcheetah is chaotic after about ten control steps.
 CHAOTIC: Mapping[str, Any] = {"window": 10, "clip": 0.0}
 
 
 def on_robots_that_fall(**defaults: Any) -> dict[str, Mapping[str, Any]]:
-    """Gives robots that fall defaults of their own.
+    """Returns defaults for the robots that can fall.
 
-    A fall ends the episode, which no gradient sees: they take short steps only.
+    A fall ends the episode, and the gradient does not contain this. So these robots
+    need short steps.
 
     Args:
         **defaults: Options with their defaults.
@@ -121,7 +122,7 @@ def on_robots_that_fall(**defaults: Any) -> dict[str, Mapping[str, Any]]:
 
 
 def differentiable(task: Task, smooth_width: float) -> Task:
-    """The task with a descriptor of the same values that has a gradient."""
+    """Returns the task with a descriptor that has the same values and a gradient."""
     from newton_qd.gradients import with_smooth_descriptor
 
     env = with_smooth_descriptor(task.env, smooth_width, straight_through=True)
@@ -131,7 +132,7 @@ def differentiable(task: Task, smooth_width: float) -> Task:
 def gradient_scoring(
     config: EvolveConfig, options: MixedOptions, task: Task, policy: Policy
 ) -> ScoringFunction:
-    """Scores with the gradients of fitness and descriptor."""
+    """Returns a scoring function with the gradients of fitness and descriptor."""
     from newton_qd.qd.scoring.rollout import episode_of
 
     smooth = differentiable(task, options.smooth_width)
@@ -141,5 +142,5 @@ def gradient_scoring(
 
 
 def initial_scale(options: DifferentiableOptions) -> float:
-    """Factor of the weights of the initial population."""
+    """Returns the factor of the weights of the initial population."""
     return options.initial_scale

@@ -19,14 +19,14 @@ from newton_qd.qd.emitters.actor_critic_settings import ActorCriticSettings
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ActorCriticOptions(DifferentiableOptions, ActorCriticSettings):
-    """Options of MAP-Elites with actors that learn by the gradient of the physics.
+    """Options of MAP-Elites with actors that learn with gradients of the physics.
 
     Attributes:
         actors: Number of actors.
         branches: Times per generation that each actor produces offspring.
         copies: Offspring of an actor each time; the rest of the generation are
             iso+line variations.
-        updates: Updates of an actor before each time that it produces offspring.
+        updates: Updates of an actor before each production of offspring.
         steered: Share of the actors that follow directions of the descriptor [-].
         fitness: Weight of the reward of steered actors [-].
         lifetime: Generations after which a steered actor restarts from a random elite.
@@ -41,7 +41,7 @@ class ActorCriticOptions(DifferentiableOptions, ActorCriticSettings):
     lifetime: int = 10
 
     def episodes(self, config: EvolveConfig) -> int:
-        """Episodes that the control steps of a generation's updates amount to."""
+        """Returns the control steps of a generation's updates, counted in episodes."""
         updates = self.actors * self.branches * self.updates
         return -(-updates * self.worlds * self.window // config.episode_length)
 
@@ -50,7 +50,7 @@ def _make(context: EmitterContext, options: ActorCriticOptions) -> Any:
     """MAP-Elites with the policies of actors that learn over short horizons.
 
     Raises:
-        ConfigError: The actors have more offspring than a generation has room for.
+        ConfigError: The actors have more offspring than a generation can contain.
     """
     from newton_qd.qd.emitters import ActorCritic, ActorCriticEmitter
     from newton_qd.qd.emitters.actor_critic_learner import measure_of

@@ -1,4 +1,4 @@
-"""ME-ES, as QDax has it."""
+"""ME-ES of QDax."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ class MEESOptions(Options):
         sample_sigma: Standard deviation of the samples, in units of policy weights
             [-].
         sample_mirror: Whether each sample has a mirror image.
-        sample_rank_norm: Whether samples are weighed by their ranks.
+        sample_rank_norm: Whether samples are weighted by their ranks.
         num_optimizer_steps: Generations after which a new parent is chosen.
-        adam_optimizer: Whether Adam takes the steps, or plain gradient ascent.
+        adam_optimizer: Whether to use Adam instead of plain gradient ascent.
         learning_rate: Learning rate [-].
         l2_coefficient: Weight of the penalty on large policy weights [-].
-        novelty_nearest_neighbors: Nearest neighbours that novelty is measured with.
-        last_updated_size: Newest elites among which parents are chosen.
-        exploit_num_cell_sample: Fittest elites among which parents are chosen.
-        explore_num_cell_sample: Most novel elites among which parents are chosen.
+        novelty_nearest_neighbors: Number of nearest neighbours in the novelty.
+        last_updated_size: Number of newest elites that can be parents.
+        exploit_num_cell_sample: Number of fittest elites that can be parents.
+        explore_num_cell_sample: Number of most novel elites that can be parents.
         use_explore: Whether some generations follow novelty.
         use_exploit: Whether some generations follow fitness.
     """
@@ -54,7 +54,7 @@ class MEESOptions(Options):
 
 
 class _FromOne:
-    """ME-ES, which grows from one individual, in a population of any size."""
+    """ME-ES with an initial population of any size; ME-ES itself starts from one."""
 
     def __init__(self, emitter: Any) -> None:
         self.emit = emitter.emit
@@ -81,7 +81,7 @@ def _make(context: EmitterContext, options: MEESOptions) -> Any:
         raise ConfigError(message("batch_size", samples, allowed))
     emitter = MEESEmitter(
         MEESConfig(**{**dataclasses.asdict(options), "sample_number": samples}),
-        # The archive of its novelty holds one descriptor for each generation.
+        # The novelty archive has one descriptor for each generation.
         total_generations=max(
             context.config.iterations + 1, options.novelty_nearest_neighbors
         ),
@@ -92,7 +92,7 @@ def _make(context: EmitterContext, options: MEESOptions) -> Any:
 
 
 def _evaluations(config: EvolveConfig, options: MEESOptions) -> int:
-    """The samples of a gradient, and the individual that they lead to."""
+    """Returns the number of samples of a gradient, plus 1 for the new individual."""
     del options
     return config.batch_size + 1
 

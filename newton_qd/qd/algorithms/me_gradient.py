@@ -40,10 +40,10 @@ class MEGradientOptions(FlowOptions):
     steered: float = 0.5
 
     def parents(self, config: EvolveConfig) -> int:
-        """Parents of a generation whose gradient is evaluated.
+        """Returns the number of parents with a gradient in each generation.
 
         Raises:
-            ConfigError: A generation is too small, or a value out of its range.
+            ConfigError: A generation is too small, or a value is out of its range.
         """
         checks.number("options: share", self.share, above=0, most=1, error=ConfigError)
         checks.integer("options: branches", self.branches, most=None, error=ConfigError)
@@ -58,7 +58,7 @@ class MEGradientOptions(FlowOptions):
 
 
 def _make(context: EmitterContext, options: MEGradientOptions) -> Any:
-    """MAP-Elites in which a share of the offspring lies along gradients of elites."""
+    """MAP-Elites with a share of the offspring along gradients of elites."""
     from newton_qd.qd.emitters.gradient_line import GradientLineEmitter
     from newton_qd.qd.scoring.rollout import episode_of
 

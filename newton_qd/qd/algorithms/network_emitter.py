@@ -1,4 +1,4 @@
-"""Emitters of QDax that see the parameters of networks, among weight vectors."""
+"""Adapter for emitters of QDax that need network parameters, not weight vectors."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from newton_qd.types import ExtraScores, Genotype, PyTree, Repertoire
 
 
 class OfParameters:
-    """An emitter of network parameters as one of weight vectors.
+    """Converts an emitter of network parameters to an emitter of weight vectors.
 
     Args:
         emitter: Emitter of QDax.
-        policy: Says how weights and parameters belong together.
+        policy: Converts between weights and parameters.
         convert: Makes QDax's transitions from the dictionary of the scores.
     """
 
@@ -37,7 +37,7 @@ class OfParameters:
     def emit(
         self, repertoire: Repertoire, state: PyTree, key: jax.Array
     ) -> tuple[jax.Array, ExtraScores]:
-        """Returns weights (N, size) and what the emitter remembers of them."""
+        """Returns weights (N, size) and the emitter's data about them."""
         parameters, remembered = self._emitter.emit(self._seen(repertoire), state, key)
         return jax.vmap(self._policy.ravel)(parameters), remembered
 

@@ -1,6 +1,6 @@
-"""Options of algorithms: how a run's ``options`` become the fields of a dataclass.
+"""Options of algorithms: converts the ``options`` of a run to a dataclass.
 
-Nothing here imports JAX, so that the command line can list the options at once.
+This module does not import JAX, so that the command line lists options quickly.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from newton_qd.qd.config import (
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Options:
-    """Options of an algorithm; this class has none.
+    """Options of an algorithm; the base class has no options.
 
-    A subclass is a frozen dataclass whose docstring describes each field under
-    ``Attributes:``. Fields are numbers, booleans or tuples of integers; a field whose
-    default is ``None`` follows from the settings of the run.
+    A subclass is a frozen dataclass. Its docstring describes each field under
+    ``Attributes:``. Fields are numbers, booleans or tuples of integers. A default of
+    ``None`` means that the value follows from the settings of the run.
     """
 
     def check(self) -> None:
-        """Refuses values that do not fit together.
+        """Checks that the values fit together.
 
         Raises:
             ValueError: A value is out of its range.
@@ -46,10 +46,10 @@ OptionsT = TypeVar("OptionsT", bound=Options)
 
 @contextlib.contextmanager
 def refused_options() -> Iterator[None]:
-    """Turns a refused value into the error of a refused option.
+    """Converts the error about a value to an error about an option.
 
     Raises:
-        ConfigError: A value was refused.
+        ConfigError: A value is wrong.
     """
     try:
         yield
@@ -67,13 +67,13 @@ def read_options(
     Args:
         kind: Dataclass of the options.
         config: Settings of the run.
-        least: Least value of an option that is an integer.
+        least: Smallest value of an integer option.
         **defaults: Defaults that differ from those of the dataclass.
 
     Raises:
-        ConfigError: There is no option of this name, or its value has the wrong type
-            than the field, not finite, negative, less than ``least`` or refused by
-            the dataclass.
+        ConfigError: An option does not exist, or its value has the wrong type, is not
+            finite, is negative, is less than ``least``, or fails a check of the
+            dataclass.
     """
     hints = typing.get_type_hints(kind)
     allowed = {field.name for field in dataclasses.fields(kind)}
@@ -90,7 +90,7 @@ def read_options(
 
 
 def _without_none(hint: Any) -> Any:
-    """The type in a union of it with ``None``; a user gives no ``None``."""
+    """Returns the type in a union with ``None``; a user never gives ``None``."""
     if typing.get_origin(hint) not in (typing.Union, types.UnionType):
         return hint
     (only,) = (part for part in typing.get_args(hint) if part is not types.NoneType)
@@ -98,11 +98,11 @@ def _without_none(hint: Any) -> Any:
 
 
 def _fitting(name: str, value: Any, wanted: Any, least: int) -> Any:
-    """Returns the value of an option in the type of its field.
+    """Converts the value of an option to the type of its field.
 
     Raises:
-        ConfigError: It has the wrong type, or out of its range.
-        TypeError: The dataclass has a field of a type that no option can have.
+        ConfigError: It has the wrong type, or is out of its range.
+        TypeError: The type of a field is not allowed for options.
     """
     name = f"options: {name}"
     if wanted is float:
@@ -122,14 +122,14 @@ def _fitting(name: str, value: Any, wanted: Any, least: int) -> Any:
 def option_texts(
     kind: type[Options], *, own: bool = False
 ) -> list[tuple[str, str, str]]:
-    """Lists the texts ``(name, default, meaning)`` of options, for help and documents.
+    """Lists texts ``(name, default, meaning)`` of options, for help and documentation.
 
     Args:
-        kind: Dataclass of the options, documented as ``Options`` says.
-        own: Whether to leave out those that it inherits; if not, they come last.
+        kind: Dataclass of the options, with a docstring as in ``Options``.
+        own: Whether to omit inherited options. If not, they are at the end.
 
     Returns:
-        A row for each option; a default that follows from the run is empty.
+        A row for each option. A default that follows from the run is empty.
     """
     fields = {field.name: field.default for field in dataclasses.fields(kind)}
     names: dict[str, None] = {}
@@ -142,7 +142,7 @@ def option_texts(
 
 
 def _attributes(kind: type) -> dict[str, str]:
-    """Meanings of the attributes that the docstring of a class itself describes."""
+    """Returns the meaning of each attribute in the docstring of a class."""
     text = inspect.cleandoc(vars(kind).get("__doc__") or "")
     section = text.partition("\nAttributes:\n")[2]
     rows = re.findall(r"^    (\w+): (.*(?:\n {8,}.*)*)", section, flags=re.MULTILINE)
@@ -150,7 +150,7 @@ def _attributes(kind: type) -> dict[str, str]:
 
 
 def _text(default: Any) -> str:
-    """Writes a default as a user would."""
+    """Returns the text of a default as a user would write it."""
     if default is None:
         return ""
     return str(list(default)) if isinstance(default, tuple) else str(default)

@@ -1,4 +1,4 @@
-"""PGA-ME, as QDax has it."""
+"""PGA-ME of QDax."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def _make(context: EmitterContext, options: PGAMEOptions) -> Any:
     """
     from newton_qd import compat
 
-    compat.install()  # QDax's file imports environments that JAX of today refuses
+    compat.install()  # QDax's file imports environments that fail with today's JAX
     from qdax.core.emitters.pga_me_emitter import PGAMEConfig, PGAMEEmitter
     from qdax.core.neuroevolution.buffers.buffer import QDTransition
 

@@ -1,4 +1,4 @@
-"""What an algorithm of ``evolve`` is, and what its emitter is made of."""
+"""The spec of an algorithm of ``evolve``, and the context of its emitter."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ if TYPE_CHECKING:  # importing a list of algorithms imports no JAX
 
 @dataclasses.dataclass(frozen=True)
 class EmitterContext:
-    """What a run gives to the emitter of its algorithm.
+    """Everything that a run gives to its algorithm to make the emitter.
 
     Attributes:
         config: Settings.
         task: Environment and descriptor.
         policy: Policy whose weights are the genotypes.
-        score: Scoring function of genotypes (N, size) and a key that is not used:
-            all evaluations of a run begin in one state.
-        reset_key: Key of the reset to that state.
+        score: Scoring function of genotypes (N, size) and a key. The key has no effect:
+            all evaluations of a run begin in the same state.
+        reset_key: Key of the reset to this state.
         centroids: (cells, D) centres of the cells.
     """
 
@@ -51,27 +51,28 @@ def _unscaled(options: Any) -> float:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class AlgorithmSpec(Generic[OptionsT]):
-    """An algorithm of ``evolve``: an emitter of QDax, and what the loop asks of it.
+    """An algorithm of ``evolve``: an emitter for QDax, and data for the loop.
 
     Attributes:
-        name: Name by which a run asks for it.
-        summary: What it is, in one sentence.
+        name: Name of the algorithm in the settings of a run.
+        summary: Description in one sentence.
         make: Makes the emitter; raises ``ConfigError`` or ``ValueError`` for options
             that do not fit the run.
-        options: Dataclass of the options that this algorithm alone has.
-        tuned: Defaults of options that differ for an environment, by its name.
-        least: Least value of an option that is an integer.
+        options: Dataclass of the options of this algorithm.
+        tuned: Defaults of options that depend on the environment, by its name.
+        least: Smallest value of an integer option.
         transitions: Whether its emitter learns from the steps of the episodes.
-        evaluates: Whether its emitter evaluates individuals as it learns.
-        evaluations: Episodes of one generation; an episode that is differentiated
-            counts as one, too.
-        gradients: Those of them that are differentiated; ``None``: it does not follow
-            gradients through the physics.
-        scoring: Makes the scoring function of the loop; ``None``: the plain one.
-        takes_faulty: Whether the emitter is told the fitness ``-inf`` of a faulty
-            individual; if not, it is told the worst finite one.
+        evaluates: Whether its emitter itself evaluates individuals.
+        evaluations: Number of episodes of one generation, with those that are
+            differentiated.
+        gradients: Number of differentiated episodes of one generation; ``None``: the
+            algorithm does not use gradients of the physics.
+        scoring: Makes the scoring function of the loop; ``None``: the one without
+            gradients.
+        takes_faulty: Whether the emitter gets the fitness ``-inf`` of a faulty
+            individual. If not, it gets the worst finite fitness.
         initial_scale: Factor of the weights of the initial population.
-        smallest: Least individuals of a generation.
+        smallest: Smallest number of individuals of a generation.
         double: Whether the emitter runs in JAX's 64-bit mode.
     """
 
@@ -97,7 +98,7 @@ class AlgorithmSpec(Generic[OptionsT]):
         """Returns the options of a run, with the defaults of its environment.
 
         Raises:
-            ConfigError: There is no option of this name, or its value is not allowed.
+            ConfigError: An option does not exist, or its value is not allowed.
         """
         tuned = self.tuned.get(config.env_name, {})
         return read_options(self.options, config, least=self.least, **tuned)

@@ -1,4 +1,4 @@
-"""The iso+line variation, which most algorithms have in common."""
+"""The iso+line variation, which most algorithms use."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 def isoline(
     config: EvolveConfig,
 ) -> Callable[[Genotype, Genotype, RNGKey], Genotype]:
-    """The iso+line variation (Vassiliades and Mouret 2018) of a run."""
+    """Returns the iso+line variation (Vassiliades and Mouret 2018) of a run."""
     from qdax.core.emitters.mutation_operators import isoline_variation
 
     return functools.partial(
@@ -27,7 +27,7 @@ def isoline(
 
 
 def isoline_emitter(config: EvolveConfig, batch_size: int) -> Emitter:
-    """Emitter of iso+line variations, as MAP-Elites has it."""
+    """Returns the emitter of iso+line variations of MAP-Elites."""
     from qdax.core.emitters.standard_emitters import MixingEmitter
 
     return MixingEmitter(
@@ -39,7 +39,7 @@ def isoline_emitter(config: EvolveConfig, batch_size: int) -> Emitter:
 
 
 def with_isoline(emitter: Emitter, config: EvolveConfig) -> Emitter:
-    """Fills up a generation with iso+line variations.
+    """Completes a generation with iso+line variations.
 
     Args:
         emitter: Emitter of a part of a generation.

@@ -1,19 +1,19 @@
-"""Emitters that are fed with exact gradients, as emitters of QDax.
+"""Emitters for QDax that use exact gradients.
 
-- ``ActorCriticEmitter``: the policies of actors that learn over short horizons, as
-  ``ActorCritic`` teaches them
+- ``ActorCriticEmitter``: policies of actors that learn over short horizons with
+  ``ActorCritic``
 - ``OMGMEGAEmitter``: random steps along the gradients of elites
 - ``CMAMEGAEmitter``: CMA-ES searches for the steps along the gradients of a solution
   point
-- ``CMAMAEGAEmitter``: the same on an annealed archive, ``AnnealedRepertoire``
+- ``CMAMAEGAEmitter``: the same with an annealed archive, ``AnnealedRepertoire``
 - ``GradientLineEmitter``: several offspring along one gradient of each parent
 - ``GradientVariationEmitter``: elites climb their fitness, or move along descriptors
 - ``SteeringEmitter``: elites move towards empty cells
 
-``ActorCriticEmitter`` and ``GradientLineEmitter`` evaluate their own gradients; all
-others read ``extra_scores["gradients"]`` as ``scoring/gradient_scores.py`` describes.
-All of them run under ``jax.jit`` and ``jax.lax.scan``, and mix with QDax's emitters in
-its ``MultiEmitter``.
+``ActorCriticEmitter`` and ``GradientLineEmitter`` evaluate gradients themselves. All
+others read ``extra_scores["gradients"]``, see ``scoring/gradient_scores.py``. All
+emitters work with ``jax.jit`` and ``jax.lax.scan``, and together with QDax's emitters
+in its ``MultiEmitter``.
 """
 
 from __future__ import annotations

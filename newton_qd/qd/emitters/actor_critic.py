@@ -1,4 +1,4 @@
-"""Actors that learn while the archive grows, and hand it what they know."""
+"""Actors that learn during the search and add their policies to the archive."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ class ActorCriticState:
     """Actors between two generations.
 
     Attributes:
-        learners: The actors, K in front of every leaf.
-        scale: Mean and deviation of observations, (no,) each.
-        snapshots: (branches, K, size) their weights on the way.
-        failed: (K,) updates of the generation whose gradient was not finite.
-        generation: () of the actors.
-        key: Of the next generation.
+        learners: The K actors, leaves (K, ...).
+        scale: Mean and standard deviation of observations, (no,) each.
+        snapshots: (branches, K, size) weights of the actors during the generation.
+        failed: (K,) number of updates of the generation without a finite gradient.
+        generation: () number of generations of the actors.
+        key: Key of the next generation.
     """
 
     learners: Learner
@@ -45,25 +45,26 @@ class ActorCriticState:
 
 
 class ActorCriticEmitter(Emitter):
-    r"""Emits the policies of actors that learn by the gradient of the physics.
+    r"""Emits the policies of actors that learn with gradients of the physics.
 
-    As PGA-ME (Nilsson and Cully 2021) hands on the policy of its greedy actor, with
-    the actor-critic of short horizons (Xu et al. 2022) in the place of TD3, and with
-    several actors. Some climb the fitness. The others follow a direction u in
-    descriptor space, drawn uniformly from the sphere,
+    PGA-ME (Nilsson and Cully 2021) emits the policy of its greedy actor. This emitter
+    does the same with several actors, and with the short-horizon actor-critic (Xu et
+    al. 2022) instead of TD3. Some actors maximize the fitness. The others follow a
+    direction u in descriptor space, drawn uniformly from the sphere. They maximize the
+    sum of
 
     .. math:: \lambda r_t + u \cdot m_t,
 
-    with the measure :math:`m_t` that a control step adds to the descriptor, so that
-    they leave the archive in that direction; they begin again from a random elite, with
-    another direction, after a number of generations.
+    where :math:`m_t` is the measure that a control step adds to the descriptor. So they
+    move in this direction, to the border of the archive. After a number of generations,
+    they restart from a random elite with another direction.
 
-    Of what an actor a is at some time of its learning, one individual is a copy. The
-    others lie between it and elites e,
+    An actor a emits several individuals at several times. One of them is a copy of its
+    weights. The others lie between the actor and elites e,
 
     .. math:: a + s (e - a) + \sigma \epsilon, \qquad s \sim U(0, 1),
 
-    with a standard deviation that is drawn evenly, in proportion, from a range.
+    with a standard deviation that is drawn log-uniformly from a range.
     """
 
     def __init__(
@@ -84,17 +85,17 @@ class ActorCriticEmitter(Emitter):
         """Sets the actors and how much they learn.
 
         Args:
-            method: How an actor learns.
-            first: State that every episode begins in.
+            method: Learning method of an actor.
+            first: Initial state of every episode.
             actors: Number of actors.
-            branches: Times in a generation that actors have offspring.
-            copies: Offspring of an actor then.
-            updates: Updates of each actor between two of these times.
+            branches: Times per generation that actors produce offspring.
+            copies: Offspring of an actor each time.
+            updates: Updates of each actor before each time.
             spread: Range of the standard deviation of the noise, in units of the
                 genotype.
             steered: Share of the actors that follow directions of the descriptor [-].
-            fitness: Weight of the reward of these [-].
-            lifetime: Generations after which these begin again.
+            fitness: Weight of the reward for steered actors [-].
+            lifetime: Generations after which a steered actor restarts.
             measures: Length of the descriptor.
 
         Raises:
@@ -133,10 +134,10 @@ class ActorCriticEmitter(Emitter):
         descriptors: jax.Array,
         extra_scores: ExtraScores,
     ) -> PyTree:
-        """Begins from the best of the initial population, which it emits once more."""
+        """Starts from the best of the initial population, which it emits again."""
         del repertoire, descriptors, extra_scores
         key, scale_key, aim_key, critic_key = jax.random.split(key, 4)
-        # the best several times over where there are more actors than individuals
+        # repeats the best if there are more actors than individuals
         order = jnp.resize(jnp.argsort(-fitnesses.reshape(-1)), (self._actors,))
         weights = genotypes[order]
         learners = self._begun(critic_key, weights, self._aims(aim_key))
@@ -155,7 +156,7 @@ class ActorCriticEmitter(Emitter):
         """Draws individuals between actors and elites.
 
         Returns:
-            (copies * branches * actors, size) weights, and how many gradients
+            (copies * branches * actors, size) weights, and the number of gradients that
             ``overflowed``, (actors,).
         """
         snapshots = emitter_state.snapshots
@@ -184,7 +185,7 @@ class ActorCriticEmitter(Emitter):
         descriptors: jax.Array | None = None,
         extra_scores: ExtraScores | None = None,
     ) -> PyTree:
-        """Learns for one generation; actors that are due begin again before it."""
+        """Restarts actors at the end of their lifetime; learns for a generation."""
         del genotypes, fitnesses, descriptors, extra_scores
         state = emitter_state
         key, renewal_key, learn_key = jax.random.split(state.key, 3)
@@ -210,20 +211,20 @@ class ActorCriticEmitter(Emitter):
         )
 
     def _worlds(self) -> PyTree:
-        """States that the worlds of an actor begin in."""
+        """Returns the initial states of the worlds of an actor."""
         number = self._method.settings.worlds
         return jax.tree.map(
             lambda leaf: jnp.broadcast_to(leaf, (number, *jnp.shape(leaf))), self._first
         )
 
     def _begun(self, key: jax.Array, weights: jax.Array, aims: jax.Array) -> Learner:
-        """Actors (K, size) that have learned nothing yet."""
+        """Returns K new actors with weights (K, size)."""
         keys = jax.random.split(key, self._actors)
         begin = jax.vmap(self._method.begin, in_axes=(0, 0, 0, None))
         return begin(keys, weights, aims, self._worlds())
 
     def _aims(self, key: jax.Array) -> jax.Array:
-        """(K, 1 + D) what the actors aim at: those that are steered come last."""
+        """Returns the aims (K, 1 + D) of the actors; steered actors are last."""
         shape = (self._actors, self._measures)
         ways = jax.random.normal(key, shape, jnp.float32)
         ways = ways / jnp.linalg.norm(ways, axis=1, keepdims=True)
@@ -239,14 +240,14 @@ class ActorCriticEmitter(Emitter):
     def _renewed(
         self, state: ActorCriticState, repertoire: Repertoire, key: jax.Array
     ) -> Learner:
-        """The actors, of which those that are due begin again from elites."""
+        """Returns the actors; restarts those with a finished lifetime from elites."""
         aim_key, cell_key, critic_key = jax.random.split(key, 3)
         filled = repertoire.fitnesses[:, 0] > -jnp.inf
         cells = draw_cells(cell_key, filled, self._actors)
         weights = repertoire.genotypes[cells]
         new = self._begun(critic_key, weights, self._aims(aim_key))
         number = jnp.arange(self._actors)
-        # in turn, so that there are actors of all ages
+        # one after the other, so that there are actors of all ages
         turn = number * self._lifetime // max(self._actors, 1)
         due = (state.generation + turn) % self._lifetime == 0
         steered = number >= self._actors - self._steered

@@ -1,4 +1,4 @@
-"""Actors that learn over short horizons, by the gradient of the physics."""
+"""Actors that learn over short horizons with gradients of the physics."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ from newton_qd.types import Environment, PyTree, StateLike
 Layers: TypeAlias = list[tuple[jax.Array, jax.Array]]
 """Weights and bias of each layer of a perceptron."""
 
-_SETTLING = 100  # random steps that observations are scaled by
+_SETTLING = 100  # random steps to measure the scale of observations
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Learner:
-    """One actor between two updates; of K actors, every leaf has K in front.
+    """One actor between two updates; for K actors, leaves (K, ...).
 
     Attributes:
-        weights: (size,) of the policy.
+        weights: (size,) weights of the policy.
         aim: (1 + D,) weights of the reward and of each component of the measure.
         critic: The critic.
-        target: A slower copy of it, which the actor is taught by.
+        target: A slower copy of the critic, from which the actor learns.
         moments: States of the optimizers of actor and critic.
-        first: States that the worlds begin in, (W, ...) every leaf.
-        worlds: States of the worlds now, as ``first``.
-        age: (W,) control steps since each began.
+        first: Initial states of the W worlds, leaves (W, ...).
+        worlds: Current states of the worlds, leaves (W, ...).
+        age: (W,) control steps since the start of each world's episode.
     """
 
     weights: jax.Array
@@ -53,24 +53,24 @@ class Learner:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ActorCritic:
-    r"""Short-horizon actor-critic of a return that weighs rewards and measures.
+    r"""Short-horizon actor-critic for a weighted sum of rewards and measures.
 
-    Xu et al. 2022, "Accelerated policy learning with parallel differentiable
-    simulation", equations 4 to 8: with the aim :math:`w`, the policy climbs the
-    gradient of
+    It follows Xu et al. 2022, "Accelerated policy learning with parallel differentiable
+    simulation", equations 4 to 8. With the aim :math:`w`, the policy maximizes, with
+    gradients of the physics,
 
     .. math:: \sum_{t<h} \gamma^t w \cdot (r_t, m_t) + \gamma^h V(s_h)
 
-    through the physics, over a window of h control steps that ends with the value V of
-    its last state. The worlds go on from there, and V is fitted to TD(lambda) targets.
+    over a window of h control steps, where V is the value of the last state. The next
+    window continues from this state. V is fitted to TD(lambda) targets.
 
     Attributes:
         env: Environment of one world without auto-reset.
         policy: Maps weights (size,) and an observation to an action.
-        measure: Maps the states before and after a control step to what it adds to
-            the measures, (D,).
+        measure: Maps the states before and after a control step to the measures (D,)
+            of this step.
         episode_length: Control steps of an episode.
-        settings: How to learn.
+        settings: Settings of the learning.
     """
 
     env: Environment
@@ -94,11 +94,11 @@ class ActorCritic:
         return actor, critic
 
     def scale(self, key: jax.Array, first: PyTree) -> tuple[jax.Array, jax.Array]:
-        """Mean and deviation (no,) of observations under random actions.
+        """Returns mean and deviation (no,) of observations with random actions.
 
         Args:
-            key: Of the actions.
-            first: States that worlds begin in, (W, ...) every leaf.
+            key: Key of the actions.
+            first: Initial states of the worlds, leaves (W, ...).
         """
         shape = (_SETTLING, len(first.done), self.env.action_size)
         actions = jax.random.uniform(key, shape, first.obs.dtype, -1, 1)
@@ -114,13 +114,13 @@ class ActorCritic:
     def begin(
         self, key: jax.Array, weights: jax.Array, aim: jax.Array, first: PyTree
     ) -> Learner:
-        """An actor with a critic that knows nothing yet.
+        """Returns a new actor with a new critic.
 
         Args:
-            key: Of the weights of the critic.
-            weights: (size,) of the actor.
-            aim: (1 + D,) what it aims at.
-            first: States that its worlds begin in, (W, ...) every leaf.
+            key: Key of the weights of the critic.
+            weights: (size,) weights of the actor.
+            aim: (1 + D,) weights of the reward and of each measure.
+            first: Initial states of its worlds, leaves (W, ...).
         """
         number = self.settings.worlds
         critic = _network(key, (first.obs.shape[-1], *self.settings.critic, 1))
@@ -133,23 +133,23 @@ class ActorCritic:
             moments=(actor_optimizer.init(weights), critic_optimizer.init(critic)),
             first=first,
             worlds=first,
-            # worlds of all ages, so that they do not begin again at once
+            # worlds of all ages, so that they do not restart at the same time
             age=jnp.arange(number, dtype=jnp.int32) * self.episode_length // number,
         )
 
     def update(
         self, learner: Learner, scale: tuple[jax.Array, jax.Array], key: jax.Array
     ) -> tuple[Learner, jax.Array]:
-        """One window: a step of the actor, several of the critic.
+        """Runs one window: one step of the actor, several steps of the critic.
 
         Args:
             learner: The actor.
             scale: Mean and deviation of observations.
-            key: Of the noise and of the order in which the critic learns.
+            key: Key of the noise and of the order of the critic's batches.
 
         Returns:
-            The actor after it, and whether the gradient was not finite (): then the
-            actor is as it was, and its worlds begin again.
+            The actor after the window, and whether the gradient was not finite (). If
+            it was not finite, the actor does not change, and its worlds restart.
         """
         settings = self.settings
         noise_key, order_key = jax.random.split(key)
@@ -194,7 +194,7 @@ class ActorCritic:
             obs = jnp.tanh(((obs - mean) / deviation) @ weights + bias)
             mean, deviation = 0.0, 1.0
         weights, bias = critic[-1]
-        # the network's numbers are rewards of a step
+        # the output of the network has the scale of the reward of one step
         return (obs @ weights + bias)[0] / (1 - self.settings.discount)
 
     def _window(
@@ -206,7 +206,7 @@ class ActorCritic:
         state: PyTree,
         noise: jax.Array,
     ) -> tuple[jax.Array, PyTree]:
-        """One world's window: its return, last state, observations and targets."""
+        """Runs one world's window; gives return, last state, observations, targets."""
         settings = self.settings
 
         def advance(state: PyTree, noise: jax.Array) -> tuple[PyTree, PyTree]:
@@ -243,7 +243,7 @@ class ActorCritic:
         obs: PyTree,
         targets: PyTree,
     ) -> tuple[Layers, PyTree]:
-        """Some steps of the critic towards its targets (worlds, window)."""
+        """Fits the critic to its targets (worlds, window) in several steps."""
         optimizer = self._optimizers[1]
         obs, targets = obs.reshape(self.steps, -1), targets.reshape(self.steps)
         factor = 1 - self.settings.discount
@@ -268,10 +268,11 @@ class ActorCritic:
 
 
 def measure_of(task: Task) -> Callable[[StateLike, StateLike], jax.Array]:
-    """What a control step adds to the measures of a task, (D,).
+    """Returns the function of the measures (D,) of a control step of a task.
 
-    Of a task that is described by the final position, the velocity [m/s]; of others,
-    whose descriptor is a mean over the episode, the state descriptor.
+    If the descriptor is the final position, the measure is the velocity [m/s]. For
+    other tasks, the descriptor is a mean over the episode, and the measure is the state
+    descriptor.
     """
     if task.descriptor_extractor is not get_final_xy_position:
         return lambda before, after: after.info["state_descriptor"]
@@ -284,12 +285,12 @@ def measure_of(task: Task) -> Callable[[StateLike, StateLike], jax.Array]:
 
 
 def _sound(state: PyTree) -> jax.Array:
-    """Whether a world holds finite numbers, as far as its observation shows."""
+    """Returns whether the observation of a world is finite."""
     return jnp.all(jnp.isfinite(state.obs), axis=-1)
 
 
 def _network(key: jax.Array, sizes: tuple[int, ...]) -> Layers:
-    """Weights of a perceptron whose outputs are small."""
+    """Returns weights of a perceptron with small outputs."""
     layers = []
     for index, (rows, columns) in enumerate(itertools.pairwise(sizes)):
         scale = (0.01 if index == len(sizes) - 2 else 1.0) / rows**0.5

@@ -1,4 +1,4 @@
-"""Settings of actors that learn over short horizons; importing them imports no JAX."""
+"""Settings of actors that learn over short horizons; this module imports no JAX."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from newton_qd.checks import message
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ActorCriticSettings:
-    """How an actor and its critic learn.
+    """Settings of the learning of an actor and its critic.
 
     Attributes:
         worlds: Worlds of each actor.
@@ -22,7 +22,7 @@ class ActorCriticSettings:
         critic: Widths of the critic's hidden layers.
         discount: Discount of a control step [-].
         trace: Lambda of the critic's TD(lambda) targets [-].
-        epochs: Times that the critic sees a window.
+        epochs: Number of times that the critic learns from a window.
         batches: Optimizer steps of the critic in each epoch.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Emitters of an annealed archive in a loop that keeps an elitist one."""
+"""Emitters with an annealed archive in a loop with an elitist archive."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from newton_qd.types import ExtraScores, Genotype, PyTree, Repertoire
 
 
 class AnnealedState(EmitterState):
-    """An annealed archive, and the state of the emitter that searches on it.
+    """An annealed archive, and the state of its emitter.
 
     Attributes:
         repertoire: The archive.
@@ -27,9 +27,9 @@ class AnnealedState(EmitterState):
 
 
 class OnAnnealedRepertoire(Emitter):
-    """Shows an emitter an annealed archive of its own in place of the loop's.
+    """Gives an emitter an annealed archive instead of the loop's archive.
 
-    The loop's archive stays elitist: it is the ``result`` of the annealed one.
+    The loop's archive stays elitist. It is the ``result`` of the annealed archive.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class OnAnnealedRepertoire(Emitter):
         descriptors: jax.Array,
         extra_scores: ExtraScores,
     ) -> AnnealedState:
-        """Makes the annealed archive of the initial population."""
+        """Makes the annealed archive from the initial population."""
         annealed = AnnealedRepertoire.init(
             genotypes,
             fitnesses,
@@ -81,7 +81,7 @@ class OnAnnealedRepertoire(Emitter):
     def emit(
         self, repertoire: Repertoire, emitter_state: PyTree, key: jax.Array
     ) -> tuple[Genotype, ExtraScores]:
-        """Lets the emitter emit from the annealed archive."""
+        """Emits individuals from the annealed archive."""
         del repertoire
         return self._emitter.emit(emitter_state.repertoire, emitter_state.emitter, key)
 
@@ -94,7 +94,7 @@ class OnAnnealedRepertoire(Emitter):
         descriptors: Any = None,
         extra_scores: ExtraScores | None = None,
     ) -> AnnealedState:
-        """Adds a generation to the annealed archive and tells the emitter of it."""
+        """Adds a generation to the annealed archive, and updates the emitter."""
         del repertoire
         annealed = emitter_state.repertoire.add(genotypes, descriptors, fitnesses)
         state = self._emitter.state_update(

@@ -1,4 +1,4 @@
-"""An archive whose cells become harder to enter little by little."""
+"""An archive with a threshold in each cell that rises slowly."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from newton_qd.types import ExtraScores, Genotype
 
 
 class AnnealedRepertoire(MapElitesRepertoire, kw_only=True):
-    r"""Repertoire of CMA-MAE and CMA-MAEGA, with the elitist archive beside it.
+    r"""Repertoire of CMA-MAE and CMA-MAEGA, together with an elitist archive.
 
-    An individual of fitness f enters its cell if f exceeds the threshold t of the
-    cell, not the fitness of the elite; then
+    An individual with fitness f enters its cell if f is above the threshold t of the
+    cell. The fitness of the elite does not matter. Then
 
     .. math:: t \leftarrow (1 - \alpha) t + \alpha f
 
-    with the learning rate alpha. If k individuals of one batch exceed t,
+    with the learning rate alpha. If k individuals of one batch are above t,
 
     .. math:: t \leftarrow (1 - \alpha)^k t + (1 - (1 - \alpha)^k) \bar f
 
     with their mean fitness, and the best of them enters (Fontaine & Nikolaidis,
-    "Covariance Matrix Adaptation MAP-Annealing", GECCO 2023). An elite may be replaced
-    by a worse one, so what was found is in ``result``: report metrics of that one,
+    "Covariance Matrix Adaptation MAP-Annealing", GECCO 2023). A worse individual may
+    replace an elite. ``result`` has the best individuals, so report its metrics:
     ``metrics_function=lambda repertoire: default_qd_metrics(repertoire.result, 0.0)``.
 
     Individuals whose fitness or descriptor is not finite never enter.
 
     Attributes:
-        thresholds: (cells,) what an individual must exceed to enter.
-        result: Every cell's best individual so far.
+        thresholds: (cells,) fitness above which an individual enters.
+        result: The elitist archive: the best individual of each cell so far.
         learning_rate: Learning rate alpha in [0, 1].
     """
 
@@ -53,10 +53,10 @@ class AnnealedRepertoire(MapElitesRepertoire, kw_only=True):
         """Adds a batch of individuals.
 
         Args:
-            batch_of_genotypes: Genotypes; leaves have the axis N in front.
+            batch_of_genotypes: Genotypes, leaves (N, ...).
             batch_of_descriptors: (N, D) descriptors.
             batch_of_fitnesses: (N,) or (N, 1) fitnesses.
-            batch_of_extra_scores: Extra scores to keep, axis N in front.
+            batch_of_extra_scores: Extra scores to store, leaves (N, ...).
         """
         extra, descriptors = batch_of_extra_scores, batch_of_descriptors
         fitnesses = jnp.reshape(batch_of_fitnesses, (-1,))
@@ -69,7 +69,7 @@ class AnnealedRepertoire(MapElitesRepertoire, kw_only=True):
         keep = (1 - self.learning_rate) ** count
         mean = total / jnp.maximum(count, 1)
 
-        # QDax's addition, with the thresholds in place of the elites' fitnesses.
+        # QDax's addition, with thresholds instead of the elites' fitnesses.
         lowered = MapElitesRepertoire.add(
             self.replace(fitnesses=self.thresholds[:, None]),
             batch_of_genotypes,
@@ -105,22 +105,22 @@ class AnnealedRepertoire(MapElitesRepertoire, kw_only=True):
         threshold_min: float,
         keys_extra_scores: tuple[str, ...] = (),
     ) -> AnnealedRepertoire:
-        """Makes a repertoire of the initial population.
+        """Makes a repertoire from the initial population.
 
         ``functools.partial(AnnealedRepertoire.init, learning_rate=..., threshold_min=
         ...)`` is the ``repertoire_init`` of QDax's ``MAPElites``.
 
         Args:
-            genotypes: Initial genotypes; leaves have the axis N in front.
+            genotypes: Initial genotypes, leaves (N, ...).
             fitnesses: (N,) their fitnesses.
             descriptors: (N, D) their descriptors.
             centroids: (cells, D) centres of the cells.
             extra_scores: Their extra scores.
-            learning_rate: Learning rate alpha in [0, 1]: 1 makes the threshold the
-                fitness of the last one that entered, 0 never raises it.
+            learning_rate: Learning rate alpha in [0, 1]. With 1, the threshold is the
+                fitness of the last individual that entered. With 0, it never changes.
             threshold_min: First threshold of every cell, in units of the fitness: the
-                worst fitness worth keeping.
-            keys_extra_scores: Extra scores to keep.
+                lowest useful fitness.
+            keys_extra_scores: Extra scores to store.
 
         Raises:
             ValueError: ``learning_rate`` or ``threshold_min`` is out of its range.
@@ -141,7 +141,7 @@ class AnnealedRepertoire(MapElitesRepertoire, kw_only=True):
             extra_scores=empty.extra_scores,
             keys_extra_scores=keys_extra_scores,
             thresholds=jnp.full(centroids.shape[0], threshold_min, dtype),
-            # No buffer is shared with the repertoire: both can be donated to a jit.
+            # copies, so that a jitted function can donate both
             result=jax.tree.map(jnp.copy, empty),
             learning_rate=learning_rate,
         )

@@ -1,15 +1,15 @@
 """Gradient arborescence: CMA-ES searches for steps along the gradients of a point.
 
-What CMA-MEGA (Fontaine & Nikolaidis, "Differentiable Quality Diversity", NeurIPS 2021)
-and CMA-MAEGA share. A solution point theta has the offspring
+This is the shared part of CMA-MEGA (Fontaine & Nikolaidis, "Differentiable Quality
+Diversity", NeurIPS 2021) and CMA-MAEGA. A solution point theta has the offspring
 
     theta + c_0 grad f(theta) + sum_j c_j grad m_j(theta),    c ~ N(mu, Sigma)
 
-with normalized gradients. The offspring are ranked by what they would do to the
-archive; CMA-ES moves mu and Sigma towards the better half, and theta takes a gradient
+with normalized gradients. The offspring are ranked by their effect on the
+archive. CMA-ES moves mu and Sigma towards the better half, and theta takes a gradient
 step towards their weighted mean. A point that has converged restarts from an elite.
 
-Any number of points search in parallel; their states carry a leading axis E.
+E points search in parallel; their states have leaves (E, ...).
 """
 
 from __future__ import annotations
@@ -49,22 +49,22 @@ from newton_qd.types import (
 class ArborescenceState(EmitterState):
     """State of E solution points.
 
-    The coefficients of the next offspring are drawn when the state is made, so that
-    emitting and updating cannot disagree about them.
+    The state contains the coefficients of the next offspring, so that emitting and
+    updating use the same ones.
 
     Attributes:
         key: Random key of the next update.
         points: (E, size) solution points theta.
         gradients: (E, 1 + D, size) normalized gradients of the points.
         finite: (E,) whether scores and gradients of the points are finite.
-        bars: (cells,) what an offspring must exceed to enter the archive.
-        cma_es: Search distributions of the coefficients, leading axis E.
-        optimizer: State of the gradient optimizer, leading axis E.
+        bars: (cells,) fitness above which an offspring enters the archive.
+        cma_es: Search distributions of the coefficients, leaves (E, ...).
+        optimizer: State of the gradient optimizer, leaves (E, ...).
         coefficients: (E, B - 1, 1 + D) coefficients of the offspring.
         age: (E,) updates since the last restart.
-        restarts: () restarts so far, of all points.
-        rejected: () individuals so far with a score that is not finite, and points
-            with such a gradient.
+        restarts: () number of restarts of all points so far.
+        rejected: () number of individuals so far with a score that is not finite, plus
+            the number of points with a gradient that is not finite.
     """
 
     key: jax.Array
@@ -81,10 +81,10 @@ class ArborescenceState(EmitterState):
 
 
 class ArborescenceEmitter(Emitter, abc.ABC):
-    """Emitter of E solution points; subclasses say how offspring rank.
+    """Emitter with E solution points; subclasses define the rank of offspring.
 
     Attributes:
-        default_restart_rule: When a point restarts, if nothing else is asked for.
+        default_restart_rule: Default rule for the restart of a point.
     """
 
     default_restart_rule: ClassVar[RestartRule]
@@ -104,20 +104,20 @@ class ArborescenceEmitter(Emitter, abc.ABC):
         """Sets up the search; evaluates nothing.
 
         Args:
-            scoring_function: Scores solution points (E, size) with gradients, as
-                ``gradient_scores.py`` describes. The loop may use a cheaper one
-                without.
+            scoring_function: Scores solution points (E, size) with gradients, see
+                ``gradient_scores.py``. The loop may use a cheaper function without
+                gradients.
             sigma_g: Initial standard deviation of the coefficients, in units of the
                 genotype.
             batch_size: Individuals that each point emits in one iteration: the point
                 itself and ``batch_size - 1`` offspring.
             num_emitters: Number E of solution points.
-            optimizer: Takes the gradient steps of the points, such as
-                ``optax.adam(0.002)``. None is gradient ascent with rate 1, which
-                moves a point to the weighted mean of its best offspring.
-            restart_rule: When a point restarts; None is the rule of the paper.
-            restart_period: Restart after this many updates in any case.
-            start: (size,) first solution point. None draws elites of the initial
+            optimizer: Optimizer of the points, such as ``optax.adam(0.002)``. ``None``:
+                gradient ascent with rate 1, which moves a point to the weighted mean of
+                its best offspring.
+            restart_rule: Rule for restarts; ``None``: the rule of the paper.
+            restart_period: Restart always after this many updates.
+            start: (size,) first solution point. ``None``: random elites of the initial
                 repertoire.
 
         Raises:
@@ -146,13 +146,13 @@ class ArborescenceEmitter(Emitter, abc.ABC):
 
     @abc.abstractmethod
     def _bars(self, repertoire: Repertoire) -> jax.Array:
-        """(cells,) what an individual must exceed to enter the repertoire."""
+        """Returns the fitness (cells,) above which an individual enters."""
 
     @abc.abstractmethod
     def _rank(
         self, fitnesses: jax.Array, bars: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Values offspring by what they would do to the archive.
+        """Rates offspring by their effect on the archive.
 
         Args:
             fitnesses: (B,) fitnesses, finite.
@@ -174,9 +174,9 @@ class ArborescenceEmitter(Emitter, abc.ABC):
         """Scores the first solution points.
 
         Raises:
-            GradientsError: The scoring function returns no gradients of the right
-                shape, or none that are finite (outside ``jit``), or ``start`` has
-                another shape than the genotypes.
+            GradientsError: The scoring function returns no gradients, gradients with a
+                wrong shape, or (outside ``jit``) gradients that are not finite. Or
+                ``start`` has another shape than the genotypes.
         """
         del fitnesses, extra_scores
         size, dtype = check_genotypes(genotypes).shape[1], genotypes.dtype
@@ -211,7 +211,7 @@ class ArborescenceEmitter(Emitter, abc.ABC):
         """Moves the solution points along their gradients.
 
         Args:
-            repertoire: Not used: all randomness is in the state already.
+            repertoire: Not used, because the state has all random numbers.
             emitter_state: State to emit from.
             key: Not used.
 
@@ -239,8 +239,8 @@ class ArborescenceEmitter(Emitter, abc.ABC):
             emitter_state: State that emitted.
             repertoire: Repertoire after the addition.
             genotypes: Not used.
-            fitnesses: (E * B,) fitnesses of the emitted.
-            descriptors: (E * B, D) descriptors of the emitted.
+            fitnesses: (E * B,) fitnesses of the emitted individuals.
+            descriptors: (E * B, D) descriptors of the emitted individuals.
             extra_scores: Not used.
 
         Raises:
@@ -284,7 +284,7 @@ class ArborescenceEmitter(Emitter, abc.ABC):
         )
 
     def _given_up(self, improved: jax.Array, age: jax.Array) -> jax.Array:
-        """(E,) whether points restart by the rule or by their age."""
+        """Returns whether points restart, by the rule or by their age (E,)."""
         restart = jnp.zeros_like(improved)
         if self._restart_rule is RestartRule.NO_IMPROVEMENT:
             restart |= ~improved
@@ -296,7 +296,7 @@ class ArborescenceEmitter(Emitter, abc.ABC):
         return CMAES(1 + descriptor_length, self._population - 1, self._sigma_g)
 
     def _fresh(self, points: jax.Array, descriptor_length: int) -> tuple:
-        """Searches that start at some points: points, CMA-ES, optimizer and age."""
+        """Returns new searches from points: points, CMA-ES, optimizer and age."""
         strategy = self._strategy(descriptor_length)
         return (
             points,
@@ -316,15 +316,15 @@ class ArborescenceEmitter(Emitter, abc.ABC):
         """Scores points and draws the coefficients of their offspring.
 
         Args:
-            repertoire: Repertoire that the offspring are to improve.
-            search: Points, CMA-ES, optimizer and age, leading axis E.
+            repertoire: Repertoire that the offspring must improve.
+            search: Points, CMA-ES, optimizer and age, leaves (E, ...).
             keys: Keys of the state, of scoring and of sampling.
             restarts: () restarts so far.
             rejected: () individuals rejected so far, without the points.
         """
         (points, cma_es, optimizer, age), (key, score_key, sample_key) = search, keys
         scores = read_scores(points, *self._scoring_function(points, score_key))
-        # Of the repertoire with the points, only the bars are ever computed.
+        # Only the bars are computed from the repertoire with the points.
         added = repertoire.add(points, scores.descriptors, scores.fitnesses)
         strategy = self._strategy(scores.descriptors.shape[-1])
         return ArborescenceState(
@@ -354,7 +354,7 @@ class ArborescenceEmitter(Emitter, abc.ABC):
         """Updates the distribution of one point.
 
         Args:
-            cma_es: Its distribution.
+            cma_es: Distribution of the point.
             coefficients: (B, 1 + D) coefficients of its offspring.
             fitnesses: (B,) fitnesses of the offspring, zero if not finite.
             bars: (B,) bars of their cells.
@@ -365,7 +365,7 @@ class ArborescenceEmitter(Emitter, abc.ABC):
             whether all of them are equally good.
         """
         best_first, flat = best_of(*self._rank(fitnesses, bars), finite)
-        # What failed pulls the distribution nowhere.
+        # Failed offspring do not move the distribution.
         pull = jnp.where(finite[:, None], coefficients, cma_es.mean)
         strategy = self._strategy(coefficients.shape[1] - 1)
         improved = jnp.any(finite & (fitnesses > bars))
@@ -374,8 +374,8 @@ class ArborescenceEmitter(Emitter, abc.ABC):
     def _climb(
         self, point: jax.Array, gradients: jax.Array, mean: jax.Array, optimizer: Any
     ) -> tuple[jax.Array, Any]:
-        """Steps one point towards the weighted mean of its best offspring."""
-        # optax descends.
+        """Moves one point towards the weighted mean of its best offspring."""
+        # optax minimizes.
         update, optimizer = self._optimizer.update(
             -(mean @ gradients), optimizer, point
         )
@@ -383,7 +383,7 @@ class ArborescenceEmitter(Emitter, abc.ABC):
 
 
 def _where(choose: jax.Array, new: Any, old: Any) -> Any:
-    """Chooses between trees whose leaves have the axis of ``choose`` (E,) in front."""
+    """Chooses between trees with leaves (E, ...) by ``choose`` (E,)."""
 
     def leaf(a: jax.Array, b: jax.Array) -> jax.Array:
         return jnp.where(choose.reshape(-1, *(1,) * (b.ndim - 1)), a, b)

@@ -1,4 +1,4 @@
-"""Which cells of a repertoire an emitter starts from and aims at."""
+"""Choice of cells of a repertoire: parents and targets of an emitter."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ def draw_cells(key: jax.Array, wanted: jax.Array, count: int) -> jax.Array:
 
     Args:
         key: Random key.
-        wanted: (cells,) which ones; all of them if none is.
+        wanted: (cells,) whether a cell can be drawn. If none can, all can.
         count: Number of cells.
 
     Returns:
@@ -25,7 +25,7 @@ def draw_cells(key: jax.Array, wanted: jax.Array, count: int) -> jax.Array:
 
 
 def empty_targets(repertoire: Repertoire, key: jax.Array, count: int) -> jax.Array:
-    """(count, D) centres of empty cells; of any cells once none is empty."""
+    """Draws centres (count, D) of empty cells, or of any cells if none is empty."""
     cells = draw_cells(key, repertoire.fitnesses[:, 0] == -jnp.inf, count)
     return repertoire.centroids[cells]
 
@@ -37,7 +37,7 @@ def nearest_cells(
 
     Args:
         descriptors: (cells, D) descriptors of the individuals.
-        wanted: (cells,) which cells hold one that counts.
+        wanted: (cells,) whether the individual of a cell counts.
         targets: (N, D) targets.
 
     Returns:

@@ -1,9 +1,9 @@
 """Covariance matrix adaptation evolution strategy, for a few coefficients.
 
-Hansen, "The CMA Evolution Strategy: A Tutorial", arXiv:1604.00772, with positive
-recombination weights. QDax 0.5.0's implementation is not used: it decomposes the
-covariance every twelfth update at these sizes, takes the whole population as parents,
-and divides by zero in its first update.
+It follows Hansen, "The CMA Evolution Strategy: A Tutorial", arXiv:1604.00772, with
+positive recombination weights. The implementation of QDax 0.5.0 does not fit. It
+decomposes the covariance only in every twelfth update at these sizes, it takes the
+whole population as parents, and it divides by zero in its first update.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class CMAESState(flax.struct.PyTreeNode):
         mean: (n,) mean.
         sigma: () step size.
         covariance: (n, n) covariance C.
-        basis: (n, n) eigenvectors of C, one a column.
+        basis: (n, n) eigenvectors of C, one per column.
         scales: (n,) square roots of the eigenvalues of C.
         path_sigma: (n,) evolution path of the step size.
         path_covariance: (n,) evolution path of the covariance.
@@ -77,7 +77,7 @@ class CMAES:
         return weights / np.sum(weights)
 
     def init(self, dtype: jnp.dtype) -> CMAESState:
-        """Isotropic distribution about zero."""
+        """Returns an isotropic distribution about zero."""
         n = self.dimension
         return CMAESState(
             mean=jnp.zeros(n, dtype),
@@ -91,7 +91,7 @@ class CMAES:
         )
 
     def sample(self, state: CMAESState, key: jax.Array) -> jax.Array:
-        """(population, n) samples (eqs. 38 to 40)."""
+        """Draws samples (population, n) (eqs. 38 to 40)."""
         shape = (self.population, self.dimension)
         normal = jax.random.normal(key, shape, state.mean.dtype)
         return state.mean + state.sigma * (normal * state.scales) @ state.basis.T
@@ -101,7 +101,7 @@ class CMAES:
 
         Args:
             state: Distribution that the samples were drawn from.
-            ranked: (population, n) samples, the best first.
+            ranked: (population, n) samples, best first.
         """
         n = self.dimension
         weights = self.weights
@@ -125,7 +125,7 @@ class CMAES:
         ) * whitened
         length = jnp.linalg.norm(path_sigma)
         sigma = state.sigma * jnp.exp(c_sigma / damping * (length / chi - 1))
-        # Covariance (eqs. 45 and 47); the path stalls while sigma grows fast.
+        # Covariance (eqs. 45 and 47); the path stops while sigma grows fast.
         updates = state.updates + 1
         settled = jnp.sqrt(1 - (1 - c_sigma) ** (2 * updates.astype(w.dtype)))
         moving = (length / settled < (1.4 + 2 / (n + 1)) * chi).astype(w.dtype)
@@ -152,7 +152,7 @@ class CMAES:
         )
 
     def stopped(self, state: CMAESState) -> jax.Array:
-        """() whether the distribution is too flat, too narrow or not finite."""
+        """Returns whether the distribution is too flat, too narrow or not finite ()."""
         widest, narrowest = jnp.max(state.scales), jnp.min(state.scales)
         extent = state.sigma * widest
         # Above this ratio the smallest eigenvalue is rounding error.

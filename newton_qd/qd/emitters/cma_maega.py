@@ -13,11 +13,11 @@ from newton_qd.types import Repertoire
 
 
 class CMAMAEGAEmitter(ArborescenceEmitter):
-    """CMA-ES searches for the steps along the gradients that exceed thresholds.
+    """CMA-ES searches for steps along the gradients that exceed thresholds.
 
     Fontaine & Nikolaidis, "Covariance Matrix Adaptation MAP-Annealing", GECCO 2023:
-    offspring are ordered by f - t, their fitness above the threshold of their cell.
-    Needs an ``AnnealedRepertoire``.
+    offspring are sorted by f - t, their fitness minus the threshold of their cell. The
+    emitter needs an ``AnnealedRepertoire``.
     """
 
     default_restart_rule = RestartRule.BASIC

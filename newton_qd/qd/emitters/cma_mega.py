@@ -12,11 +12,11 @@ from newton_qd.types import Repertoire
 
 
 class CMAMEGAEmitter(ArborescenceEmitter):
-    """CMA-ES searches for the steps along the gradients that improve the archive.
+    """CMA-ES searches for steps along the gradients that improve the archive.
 
     Fontaine & Nikolaidis, "Differentiable Quality Diversity", NeurIPS 2021: offspring
-    that fill an empty cell come first, then those that improve an elite, each ordered
-    by improvement (two-stage improvement ranking, Fontaine et al. 2020).
+    for empty cells come first, then offspring that improve an elite. Both groups are
+    sorted by improvement (two-stage improvement ranking, Fontaine et al. 2020).
     """
 
     default_restart_rule = RestartRule.NO_IMPROVEMENT

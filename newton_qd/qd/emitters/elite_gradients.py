@@ -1,7 +1,7 @@
-"""The gradients of the elites, kept beside the repertoire, and emitters that use them.
+"""The stored gradients of the elites, and emitters that use them.
 
-The loop evaluates every individual once and gets its gradients with its scores.
-Keeping those of the elites saves evaluating a parent again when it is chosen.
+The loop evaluates every individual once, with its gradients. The gradients of elites
+are stored, so that parents do not need another evaluation.
 """
 
 from __future__ import annotations
@@ -30,14 +30,15 @@ _ROUNDINGS = 16
 
 
 class EliteGradients(EmitterState):
-    """Gradients of the individuals that a repertoire holds.
+    """Gradients of the individuals in a repertoire.
 
     Attributes:
         gradients: (cells, 1 + D, size) gradients of the elite of each cell.
-        fitnesses: (cells,) fitness of the individual that the gradients belong to,
-            ``-inf`` where there is none. Gradients count only while the cell holds
-            an individual of this fitness.
-        rejected: () individuals so far with a score or gradient that is not finite.
+        fitnesses: (cells,) fitness of the individual with these gradients, ``-inf`` if
+            there are no gradients. Gradients count only while the cell has an
+            individual with this fitness.
+        rejected: () number of individuals so far with a score or gradient that is not
+            finite.
     """
 
     gradients: jax.Array
@@ -45,19 +46,19 @@ class EliteGradients(EmitterState):
     rejected: jax.Array
 
     def add(self, repertoire: Repertoire, scores: Scores) -> EliteGradients:
-        """Keeps the gradients of those individuals that the repertoire took.
+        """Stores the gradients of the individuals that the repertoire accepted.
 
-        The repertoire decides: an individual counts as taken if its cell holds it.
-        That is right for every rule of addition.
+        An individual was accepted if its cell contains it now. This is correct for
+        every rule of addition.
 
         Args:
             repertoire: Repertoire after the addition.
-            scores: The individuals that were added.
+            scores: The evaluated individuals.
         """
         cells = get_cells_indices(scores.descriptors, repertoire.centroids)
         elites, fitnesses = repertoire.genotypes[cells], repertoire.fitnesses[cells, 0]
-        # XLA may compute a genotype once for the repertoire and once for this, with
-        # other roundings.
+        # XLA may compute a genotype twice, for the repertoire and for this state, with
+        # different rounding errors.
         allowed = _ROUNDINGS * jnp.finfo(elites.dtype).eps
         distance = jnp.max(jnp.abs(elites - scores.genotypes), axis=-1)
         held = distance <= allowed * jnp.max(jnp.abs(elites), axis=-1)
@@ -69,12 +70,12 @@ class EliteGradients(EmitterState):
         )
 
     def known(self, repertoire: Repertoire) -> jax.Array:
-        """(cells,) whether a cell holds an elite whose gradients are known."""
+        """Returns whether a cell has an elite with known gradients (cells,)."""
         filled = repertoire.fitnesses[:, 0] > -jnp.inf
         return filled & (repertoire.fitnesses[:, 0] == self.fitnesses)
 
     def at(self, repertoire: Repertoire, cells: jax.Array) -> jax.Array:
-        """(N, 1 + D, size) gradients of the elites of some cells, zero if unknown."""
+        """Returns gradients (N, 1 + D, size) of elites of N cells, zero if unknown."""
         known = self.known(repertoire)[cells]
         return jnp.where(known[:, None, None], self.gradients[cells], 0)
 
@@ -85,13 +86,13 @@ class EliteGradients(EmitterState):
         count: int,
         selector: Selector | None = None,
     ) -> jax.Array:
-        """Draws cells whose elites have gradients; any filled ones if none has.
+        """Draws cells whose elites have gradients, or any filled cells if none has.
 
         Args:
             repertoire: Repertoire of the elites.
             key: Random key.
             count: Number of parents.
-            selector: Selector of QDax; None draws uniformly with replacement.
+            selector: Selector of QDax; ``None``: uniform, with replacement.
 
         Returns:
             (count,) cells.
@@ -109,11 +110,11 @@ class EliteGradientEmitter(Emitter, abc.ABC):
     """An emitter whose parents are elites with known gradients."""
 
     def __init__(self, batch_size: int, selector: Selector | None = None) -> None:
-        """Sets how parents are drawn.
+        """Sets the batch size and the selection of parents.
 
         Args:
             batch_size: Individuals emitted in one iteration.
-            selector: Selector of QDax; None draws uniformly with replacement.
+            selector: Selector of QDax; ``None``: uniform, with replacement.
 
         Raises:
             ValueError: The batch is empty.
@@ -129,7 +130,7 @@ class EliteGradientEmitter(Emitter, abc.ABC):
 
     @property
     def use_all_data(self) -> bool:
-        """Elites that other emitters found are parents too."""
+        """Whether elites of other emitters can be parents: always true."""
         return True
 
     def init(
@@ -141,10 +142,10 @@ class EliteGradientEmitter(Emitter, abc.ABC):
         descriptors: jax.Array,
         extra_scores: ExtraScores,
     ) -> EliteGradients:
-        """Keeps the gradients of the initial elites.
+        """Stores the gradients of the initial elites.
 
         Raises:
-            GradientsError: ``extra_scores`` holds no gradients of the right shape.
+            GradientsError: ``extra_scores`` has no gradients with the right shape.
         """
         del key
         scores = read_scores(genotypes, fitnesses, descriptors, extra_scores)
@@ -165,10 +166,10 @@ class EliteGradientEmitter(Emitter, abc.ABC):
         descriptors: Any = None,
         extra_scores: ExtraScores | None = None,
     ) -> EliteGradients:
-        """Keeps the gradients of the new elites.
+        """Stores the gradients of the new elites.
 
         Raises:
-            GradientsError: ``extra_scores`` holds no gradients of the right shape.
+            GradientsError: ``extra_scores`` has no gradients with the right shape.
         """
         scores = read_scores(genotypes, fitnesses, descriptors, extra_scores)
         return emitter_state.add(repertoire, scores)
@@ -178,7 +179,7 @@ def check_steps(steps: int, scoring_function: ScoringFunction | None) -> None:
     """Checks the number of gradient steps of an offspring.
 
     Raises:
-        ValueError: It is below 1, or needs a scoring function that is not given.
+        ValueError: It is below 1, or it needs a missing scoring function.
     """
     checks.integer("steps", steps, most=None)
     if steps > 1 and scoring_function is None:

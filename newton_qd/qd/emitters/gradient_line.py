@@ -16,22 +16,23 @@ from newton_qd.types import ExtraScores, PyTree, Repertoire
 
 
 class GradientLineEmitter(Emitter):
-    r"""Spreads offspring along the gradient of a parent.
+    r"""Places several offspring along the gradient of each parent.
 
     A parent :math:`\theta` has the offspring
 
     .. math:: \theta + s_i \frac{g}{|g|}, \qquad \log s_i \sim U
 
-    whose step lengths are spread evenly, in proportion, from the shortest to the
-    longest, one in each of as many strata as there are offspring. Some parents climb,
-    :math:`g = \nabla f(\theta)`, and are drawn uniformly from the elites. The others
-    steer towards the centre c of an empty cell, :math:`g = -\nabla |m(\theta) - c|^2
-    / 2`, and are the elites with the descriptors m nearest to it.
+    with log-uniform step lengths from the shortest to the longest. They are stratified:
+    there are as many strata as offspring, and each has one step length. Some parents
+    increase their fitness, :math:`g = \nabla f(\theta)`. They are drawn uniformly from
+    the elites. The others move towards the centre c of an empty cell, :math:`g =
+    -\nabla |m(\theta) - c|^2 / 2`. They are the elites whose descriptors m are nearest
+    to c.
 
-    One row of one gradient serves several offspring, and the search for the step
-    length is left to the archive: where a gradient costs many evaluations, this is
-    cheaper than ``GradientVariationEmitter``, and its steps are in no units that depend
-    on the task. Its state is empty.
+    Several offspring use one row of a gradient, and the archive selects the best step
+    length. If a gradient costs many evaluations, this is cheaper than
+    ``GradientVariationEmitter``. Step lengths do not depend on the units of the task.
+    The state of this emitter is empty.
     """
 
     def __init__(
@@ -47,13 +48,13 @@ class GradientLineEmitter(Emitter):
         """Sets the parents and the steps.
 
         Args:
-            gradient: Gradient along directions, as
-                :meth:`newton_qd.Episode.directional` gives it.
+            gradient: Gradient along directions, such as
+                :meth:`newton_qd.Episode.directional`.
             parents: Parents in one iteration.
             branches: Offspring of each parent.
             shortest: Shortest step, in units of the genotype.
             longest: Longest step.
-            steered: Share of the parents that steer towards empty cells [-].
+            steered: Share of the parents that move towards empty cells [-].
 
         Raises:
             ValueError: A number is out of its range.
@@ -82,8 +83,8 @@ class GradientLineEmitter(Emitter):
         """Draws parents and follows one gradient of each.
 
         Returns:
-            (parents * branches, size) offspring, and which gradients ``overflowed``,
-            (parents,). Where a gradient is zero or not finite, the direction is random.
+            (parents * branches, size) offspring, and whether a gradient ``overflowed``,
+            (parents,). If a gradient is zero or not finite, the direction is random.
         """
         del emitter_state
         climb_key, target_key, step_key, way_key, score_key = jax.random.split(key, 5)
@@ -107,7 +108,7 @@ class GradientLineEmitter(Emitter):
         return offspring.reshape(-1, offspring.shape[-1]), {"overflowed": lost}
 
     def _draw(self, key: jax.Array, dtype: Any) -> jax.Array:
-        """(parents, branches) lengths of steps."""
+        """Draws step lengths (parents, branches)."""
         drawn = jax.random.uniform(key, (self._parents, self._branches), dtype)
         stratum = (jnp.arange(self._branches, dtype=dtype) + drawn) / self._branches
         shortest, longest = self._steps
@@ -115,9 +116,9 @@ class GradientLineEmitter(Emitter):
 
 
 def _units(gradients: jax.Array, key: jax.Array) -> jax.Array:
-    """(N, size) unit vectors along gradients, random where there is none."""
+    """Returns unit vectors (N, size) along gradients, random if a gradient is zero."""
     random = jax.random.normal(key, gradients.shape, gradients.dtype)
-    # Scaled first: the square of a large gradient may be beyond the numbers.
+    # Scaled first, because the square of a large gradient may overflow.
     largest = jnp.max(jnp.abs(gradients), axis=1, keepdims=True)
     usable = (largest > 0) & jnp.isfinite(largest)
     ways = jnp.where(usable, gradients / jnp.where(usable, largest, 1), random)

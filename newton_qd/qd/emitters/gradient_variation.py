@@ -24,18 +24,18 @@ from newton_qd.types import (
 
 
 class GradientVariationEmitter(EliteGradientEmitter):
-    r"""Elites climb their fitness, or move along descriptors, by analytic gradients.
+    r"""Elites increase their fitness, or move along descriptors, by exact gradients.
 
     Each parent draws one of the given directions d and takes ``steps`` steps of an
-    optimizer that ascends
+    optimizer along
 
     .. math:: d_0 \nabla f(\theta) + \sum_j d_j \nabla m_j(\theta)
 
     with normalized gradients. This is the policy-gradient variation of PGA-ME (Nilsson
-    & Cully, "Policy Gradient Assisted MAP-Elites", GECCO 2021) with the
-    exact gradient of the return in place of a critic's, and with descriptors beside
-    the fitness as in Fontaine & Nikolaidis 2021. Mix it with an emitter of
-    random variations, such as QDax's ``MixingEmitter``.
+    & Cully, "Policy Gradient Assisted MAP-Elites", GECCO 2021), with the exact gradient
+    of the return instead of the gradient of a critic. Like Fontaine & Nikolaidis 2021,
+    it can also use gradients of descriptors. Combine it with an emitter of random
+    variations, such as QDax's ``MixingEmitter``.
     """
 
     def __init__(
@@ -52,19 +52,19 @@ class GradientVariationEmitter(EliteGradientEmitter):
 
         Args:
             batch_size: Individuals emitted in one iteration.
-            optimizer: Takes the steps, such as ``optax.adam(0.01)``; its state is
-                made anew for each offspring.
-            steps: Gradient steps of each offspring. The first uses the gradients
-                that the parent was evaluated with.
-            scoring_function: Scores with gradients, as ``gradient_scores.py``
-                describes; needed for a second step.
-            directions: (K, 1 + D) coefficients of the normalized gradients, fitness
-                first. None climbs the fitness: (1, 0, ..., 0).
-            selector: Selector of QDax; None draws uniformly with replacement.
+            optimizer: Optimizer, such as ``optax.adam(0.01)``. Each offspring starts
+                with a new state.
+            steps: Gradient steps of each offspring. The first step uses the stored
+                gradients of the parent.
+            scoring_function: Function of scores with gradients, see
+                ``gradient_scores.py``. A second step needs it.
+            directions: (K, 1 + D) coefficients of the normalized gradients, first of
+                the fitness. ``None``: only the fitness, (1, 0, ..., 0).
+            selector: Selector of QDax; ``None``: uniform, with replacement.
 
         Raises:
-            ValueError: ``steps`` asks for a ``scoring_function``, ``directions`` is
-                not a finite matrix, or a number is out of its range.
+            ValueError: ``steps`` needs a ``scoring_function``, ``directions`` is not a
+                finite matrix, or a number is out of its range.
         """
         super().__init__(batch_size, selector)
         check_steps(steps, scoring_function)
@@ -81,14 +81,14 @@ class GradientVariationEmitter(EliteGradientEmitter):
     def emit(
         self, repertoire: Repertoire, emitter_state: PyTree, key: jax.Array
     ) -> tuple[jax.Array, ExtraScores]:
-        """Draws parents and lets each climb along its direction.
+        """Draws parents and moves each along its direction.
 
         Returns:
-            (batch_size, size) offspring and an empty dictionary. An offspring stays
-            where its gradients are not finite.
+            (batch_size, size) offspring and an empty dictionary. If gradients are not
+            finite, the offspring does not move.
 
         Raises:
-            GradientsError: The scoring function returns no gradients of the right
+            GradientsError: The scoring function returns no gradients with the right
                 shape.
             ValueError: ``directions`` does not fit the number of descriptors.
         """
@@ -103,10 +103,10 @@ class GradientVariationEmitter(EliteGradientEmitter):
 
         def climb(genotypes: Genotype, states: Any, gradients: Any) -> tuple[Any, Any]:
             ascent = jnp.einsum("nr,nrs->ns", directions, normalize(gradients))
-            # optax descends.
+            # optax minimizes.
             update: Any = jax.vmap(self._optimizer.update)
             updates, states = update(-ascent, states, genotypes)
-            # A momentum must not carry on what has no gradient.
+            # Momentum must not move an offspring without a gradient.
             moves = jnp.any(gradients != 0, axis=(1, 2))[:, None]
             return genotypes + jnp.where(moves, updates, 0), states
 
@@ -124,10 +124,10 @@ class GradientVariationEmitter(EliteGradientEmitter):
         return carry[0], {}
 
     def _draw(self, key: jax.Array, gradients: jax.Array) -> jax.Array:
-        """(N, 1 + D) a direction for each of gradients (N, 1 + D, size).
+        """Draws directions (N, 1 + D) for gradients (N, 1 + D, size).
 
         Raises:
-            ValueError: A direction has another length than 1 + D.
+            ValueError: The length of a direction is not 1 + D.
         """
         count, rows = gradients.shape[:2]
         directions = self._directions

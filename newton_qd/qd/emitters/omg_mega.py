@@ -24,20 +24,20 @@ class OMGMEGAEmitter(EliteGradientEmitter):
 
     with normalized gradients of fitness f and descriptors m_j (OMG-MEGA of Fontaine &
     Nikolaidis, "Differentiable Quality Diversity", NeurIPS 2021). The gradients of the
-    elites are kept, so that no parent is evaluated again: with the same number of
-    evaluations this emits twice as many individuals as the paper's implementation.
+    elites are stored, so parents need no second evaluation. With the same number of
+    evaluations, this emits twice as many individuals as the paper's implementation.
     """
 
     def __init__(
         self, batch_size: int, sigma_g: float, selector: Selector | None = None
     ) -> None:
-        """Sets the size of steps.
+        """Sets the batch size and the step size.
 
         Args:
             batch_size: Individuals emitted in one iteration.
             sigma_g: Standard deviation of the coefficients, in units of the genotype
                 (QDax's parameter of this name is its square).
-            selector: Selector of QDax; None draws uniformly with replacement.
+            selector: Selector of QDax; ``None``: uniform, with replacement.
 
         Raises:
             ValueError: ``sigma_g`` is not positive, or the batch is empty.

@@ -1,4 +1,4 @@
-"""When a solution point gives up and starts again from an elite."""
+"""Rules for the restart of a solution point from an elite."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import enum
 
 
 class RestartRule(enum.Enum):
-    """When an emitter restarts besides when its CMA-ES has converged.
+    """Rule for restarts; a point with a converged CMA-ES always restarts.
 
     Attributes:
-        NO_IMPROVEMENT: None of its offspring would enter the archive (Fontaine &
+        NO_IMPROVEMENT: Restart if no offspring would enter the archive (Fontaine &
             Nikolaidis 2021).
-        BASIC: Never (Fontaine & Nikolaidis 2023).
+        BASIC: No other restarts (Fontaine & Nikolaidis 2023).
     """
 
     NO_IMPROVEMENT = "no_improvement"

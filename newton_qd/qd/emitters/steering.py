@@ -1,4 +1,4 @@
-"""Elites that are steered towards empty cells."""
+"""Elites that move towards empty cells."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from newton_qd.qd.emitters.elite_gradients import EliteGradientEmitter, check_st
 from newton_qd.qd.scoring.gradient_scores import read_scores
 from newton_qd.types import ExtraScores, PyTree, Repertoire, ScoringFunction
 
-# Keeps the system regular where no descriptor has a gradient.
+# Keeps the system regular if no descriptor has a gradient.
 _TINY = 1e-12
 
 
 class SteeringEmitter(EliteGradientEmitter):
-    r"""Moves elites to the centres of empty cells, by the descriptors' gradients.
+    r"""Moves elites to the centres of empty cells, with gradients of descriptors.
 
-    Draws empty cells with centres c, takes as parents the elites whose descriptors m
-    are nearest to them, and takes ``steps`` damped Gauss-Newton steps
+    It draws empty cells with centres c. Parents are the elites whose descriptors m are
+    nearest to c. Each parent takes ``steps`` damped Gauss-Newton steps
 
     .. math::
 
         \theta \leftarrow \theta + J^T (J J^T + \lambda I)^{-1} (c - m),
         \qquad \lambda = \textrm{damping} \cdot \textrm{tr}(J J^T) / D
 
-    with the descriptors' Jacobian J (D, size) (Levenberg 1944 and Marquardt 1963, in
-    the dual form for more unknowns than equations: the shortest step that does it).
-    Once no cell is empty, it draws from all cells.
+    with the Jacobian J (D, size) of the descriptors (Levenberg 1944 and Marquardt
+    1963). The dual form is for more unknowns than equations; it gives the shortest
+    step. If no cell is empty, the emitter draws from all cells.
     """
 
     def __init__(
@@ -45,15 +45,15 @@ class SteeringEmitter(EliteGradientEmitter):
         Args:
             batch_size: Individuals emitted in one iteration.
             max_step: Longest step, in units of the genotype.
-            steps: Steps of each offspring. The first uses the gradients that the
-                parent was evaluated with.
-            scoring_function: Scores with gradients, as ``gradient_scores.py``
-                describes; needed for a second step.
+            steps: Steps of each offspring. The first step uses the stored gradients of
+                the parent.
+            scoring_function: Function of scores with gradients, see
+                ``gradient_scores.py``. A second step needs it.
             damping: Relative damping [-].
 
         Raises:
-            ValueError: ``steps`` asks for a ``scoring_function``, or a number is out
-                of its range.
+            ValueError: ``steps`` needs a ``scoring_function``, or a number is out of
+                its range.
         """
         super().__init__(batch_size)
         check_steps(steps, scoring_function)
@@ -67,14 +67,14 @@ class SteeringEmitter(EliteGradientEmitter):
     def emit(
         self, repertoire: Repertoire, emitter_state: PyTree, key: jax.Array
     ) -> tuple[jax.Array, ExtraScores]:
-        """Draws empty cells and steers the nearest elites towards them.
+        """Draws empty cells and moves the nearest elites towards them.
 
         Returns:
-            (batch_size, size) offspring and an empty dictionary. An offspring stays
-            where its gradients are not finite.
+            (batch_size, size) offspring and an empty dictionary. If gradients are not
+            finite, the offspring does not move.
 
         Raises:
-            GradientsError: The scoring function returns no gradients of the right
+            GradientsError: The scoring function returns no gradients with the right
                 shape.
         """
         target_key, score_key = jax.random.split(key)
@@ -99,7 +99,7 @@ class SteeringEmitter(EliteGradientEmitter):
         return genotypes, {}
 
     def _step(self, jacobian: jax.Array, error: jax.Array) -> jax.Array:
-        """(N, size) steps that reduce errors (N, D), for Jacobians (N, D, size)."""
+        """Returns steps (N, size) against errors (N, D), for Jacobians (N, D, size)."""
         size = jacobian.shape[1]
         error = error.astype(jacobian.dtype)
         gram = jnp.einsum("nds,nes->nde", jacobian, jacobian)

@@ -1,7 +1,7 @@
-"""A run: its search loop, its results folder, and what it shows and draws.
+"""A run: its search loop, its results folder, its display and its pictures.
 
-- ``generation``: one generation as pure functions; ``search``: one after the other;
-  ``evolution``: the loop
-- ``archive``, ``checkpoint``, ``folder``: what a run writes and reads
-- ``interrupt``, ``progress``, ``plot``, ``tensorboard``: signals, and what a user sees
+- ``generation``: one generation as pure functions; ``search``: the step from one
+  generation to the next; ``evolution``: the loop
+- ``archive``, ``checkpoint``, ``folder``: the files of a run
+- ``interrupt``, ``progress``, ``plot``, ``tensorboard``: signals, display and pictures
 """

@@ -1,4 +1,4 @@
-"""What an evolution has kept, and its file, which later versions read too."""
+"""The archive of an evolution and its file, which later versions can read too."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from newton_qd.qd.run.checkpoint import npz_bytes
 
 ARCHIVE = "archive.npz"
 FORMAT = 1
-"""Number of the file's format. Who changes it keeps a reader for each earlier one."""
+"""Number of the file's format. Keep a reader for each earlier format."""
 
 
-# What NumPy and zipfile raise for bytes that are not what they seem.
+# Errors of NumPy and zipfile for a damaged file.
 _DAMAGE = (
     AttributeError,
     EOFError,
@@ -35,12 +35,12 @@ _DAMAGE = (
 
 
 class ArchiveError(RuntimeError):
-    """The file of an archive is damaged, or of a format that is not known."""
+    """The file of an archive is damaged, or has an unknown format."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Archive:
-    """The individuals that an evolution has kept, one row per cell.
+    """The elites of an evolution, one row per cell.
 
     Attributes:
         genotypes: (cells, parameters) policy weights, zero in empty cells.
@@ -74,17 +74,17 @@ def load_archive(folder: str | os.PathLike[str]) -> Archive:
 
     Raises:
         ArchiveError: The file is damaged, or was written by a later version.
-        FileNotFoundError: There is none.
+        FileNotFoundError: The file does not exist.
     """
     path = Path(folder) / ARCHIVE
-    # NumPy leaves a file that it cannot read open.
+    # NumPy does not close a file that it cannot read.
     content = io.BytesIO(path.read_bytes())
     try:
         with np.load(content, allow_pickle=False) as arrays:
             found = {name: arrays[name] for name in arrays.files}
     except _DAMAGE as error:
         raise ArchiveError(f"{path} is damaged: {error}") from error
-    # The first files of format 1 carry no number.
+    # The first files of format 1 have no number.
     version = found.pop("format", np.asarray(FORMAT))
     if version.shape != () or version.dtype.kind not in "iu" or version != FORMAT:
         raise ArchiveError(
@@ -95,10 +95,10 @@ def load_archive(folder: str | os.PathLike[str]) -> Archive:
 
 
 def _from_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> Archive:
-    """Makes an archive of the arrays of a file of format 1.
+    """Makes an archive from the arrays of a file of format 1.
 
     Raises:
-        ArchiveError: The arrays are not those of an archive.
+        ArchiveError: Arrays are missing or do not fit together.
     """
     names = [field.name for field in dataclasses.fields(Archive)]
     if sorted(arrays) != sorted(names):

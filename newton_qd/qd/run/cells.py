@@ -16,15 +16,15 @@ _CVT_MIN_SAMPLES = 10_000
 def cell_centroids(
     config: EvolveConfig, limits: tuple[np.ndarray, np.ndarray], key: jax.Array
 ) -> jax.Array:
-    """Centres (cells, D) of the cells of an archive.
+    """Returns the centres (cells, D) of the cells of an archive.
 
     Args:
-        config: Settings with the grid filled in.
+        config: Settings with a grid or a number of centroids.
         limits: Lowest and highest descriptor, (D,) each.
         key: Key of the samples of a Voronoi tessellation.
 
     Raises:
-        ConfigError: The limits are no finite box.
+        ConfigError: The limits are not a finite box.
     """
     from qdax.core.containers.mapelites_repertoire import compute_euclidean_centroids
 
@@ -49,7 +49,7 @@ def _voronoi_centroids(
 
     cells = config.centroids
     assert cells is not None
-    # Threads add up the clusters in changing order: one keeps runs equal.
+    # With several threads, the order of sums changes. One thread keeps runs equal.
     with threadpool_limits(limits=1):
         return compute_cvt_centroids(
             num_descriptors=len(low),

@@ -1,7 +1,7 @@
 """The checkpoint of a run.
 
 A checkpoint is one file: a line with a format number and the SHA-256 of the rest,
-then a NumPy archive. The digest turns every kind of damage into one clear error.
+then a NumPy archive. With the digest, every damage leads to the same clear error.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 
 from newton_qd.files import write_atomically
 
-# The number changes with what a checkpoint holds, columns of the metrics included.
+# Change the number if the contents of a checkpoint or the columns of metrics change.
 _MAGIC = b"newton_qd checkpoint 2 "
 
 
@@ -28,14 +28,14 @@ class Checkpoint:
     """State of an evolution between two generations.
 
     Attributes:
-        settings: Settings of the run as JSON; guards against mixed folders.
+        settings: Settings of the run as JSON, to detect files of another run.
         iteration: Generations that are finished.
         genotypes: (cells, parameters) policy weights, zero in empty cells.
         fitnesses: (cells,) returns, ``-inf`` in empty cells.
         descriptors: (cells, D) descriptors, zero in empty cells.
         centroids: (cells, D) centres of the cells.
         metrics: (iteration + 1, columns) rows of ``metrics.csv``.
-        emitter: What the algorithm has learned: the leaves of its emitter's state.
+        emitter: The leaves of the state of the algorithm's emitter.
     """
 
     settings: str
@@ -75,7 +75,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
         path: File written by ``save_checkpoint``.
 
     Raises:
-        CheckpointError: The file is damaged or of another kind.
+        CheckpointError: The file is damaged or has another format.
     """
     content = path.read_bytes()
     head, separator, payload = content.partition(b"\n")

@@ -34,10 +34,10 @@ from newton_qd.qd.scoring.task import Task, make_task
 
 @dataclasses.dataclass(frozen=True)
 class EvolveResult:
-    """What an evolution has found.
+    """The result of an evolution.
 
     Attributes:
-        config: Settings with the grid filled in.
+        config: Settings with a grid or a number of centroids.
         archive: The individuals, one row per cell.
         metrics: Name of each column of ``metrics.csv`` to its values
             (iteration + 1,).
@@ -45,8 +45,8 @@ class EvolveResult:
             initial population.
         interrupted: Whether a signal ended the run before its last generation.
         out: Results folder, if there is one.
-        seconds: Time that this call took [s].
-        reevaluated: Metrics from evaluating the elites again, of a finished run.
+        seconds: Duration of this call [s].
+        reevaluated: Metrics of a finished run, from re-evaluated elites.
     """
 
     config: EvolveConfig
@@ -80,10 +80,10 @@ def evolve(
     devices: int | None = None,
     task_factory: Callable[[EvolveConfig], Task] = make_task,
 ) -> EvolveResult:
-    """Evolves an archive of policies with an algorithm of MAP-Elites' family.
+    """Evolves an archive of policies with an algorithm of the MAP-Elites family.
 
-    SIGINT and SIGTERM end the run after the current generation; its state is saved
-    and ``interrupted`` is true in the result.
+    SIGINT and SIGTERM end the run after the current generation. The state is saved, and
+    ``interrupted`` is true in the result.
 
     Args:
         config: Settings.
@@ -91,21 +91,21 @@ def evolve(
         resume: Continue the run in ``out``; starts it if there is none yet.
         progress: Whether to show progress on standard error.
         tensorboard: Whether to write the metrics for TensorBoard too.
-        checkpoint_seconds: Least time between two checkpoints [s]; does not change
-            the result.
-        devices: Devices that share each evaluation, which does not change the result
-            either; ``None``: the default device alone.
-        task_factory: Makes the task; the default takes registered environments.
+        checkpoint_seconds: Shortest time between two checkpoints [s]. It does not
+            change the result.
+        devices: Number of devices that share each evaluation. It does not change the
+            result. ``None``: only the default device.
+        task_factory: Makes the task; by default from registered environments.
 
     Returns:
         Archive and metrics.
 
     Raises:
-        ConfigError: A setting is wrong, the folder is not free, or the run to resume
-            has other settings.
+        ConfigError: A setting is wrong, the folder is in use, or the run to resume has
+            other settings.
         CheckpointError: The checkpoint of the run to resume is damaged.
         MissingExtra: QDax, matplotlib or tensorboardX is not installed.
-        SearchError: No individual of the initial population can be kept.
+        SearchError: No individual of the initial population has finite scores.
     """
     begin = time.monotonic()
     folder = _folder(out, resume, tensorboard)
@@ -134,10 +134,10 @@ def evolve(
 def _folder(
     out: str | os.PathLike[str] | None, resume: bool, tensorboard: bool
 ) -> RunFolder | None:
-    """Checks folder and packages before anything takes time.
+    """Checks folder and packages before the slow part of a run.
 
     Raises:
-        ConfigError: The folder is not free, or TensorBoard's files have no folder.
+        ConfigError: The folder is in use, or TensorBoard's files have no folder.
         MissingExtra: QDax, matplotlib or tensorboardX is not installed.
     """
     require_extra("qdax", "qd")
@@ -156,10 +156,10 @@ def _folder(
 
 
 def _mesh(devices: int | None, resume: bool) -> Mesh | None:
-    """Devices that share the evaluations; ``None`` for the default one.
+    """Returns the devices that share the evaluations; ``None``: the default device.
 
     Raises:
-        ConfigError: There are fewer devices, or several processes resume a run.
+        ConfigError: There are too few devices, or several processes resume a run.
     """
     if resume and jax.process_count() > 1:
         why = f"with {jax.process_count()} processes"
@@ -179,7 +179,7 @@ def _first(
     resume: bool,
     display: Progress,
 ) -> SearchState:
-    """The state in which this call begins."""
+    """Returns the state at the start of this call."""
     checkpoint = None
     if folder is not None:
         checkpoint = _open(folder, config, resume, display)
@@ -192,8 +192,8 @@ def _first(
 def _open(
     folder: RunFolder, config: EvolveConfig, resume: bool, display: Progress
 ) -> Checkpoint | None:
-    """Starts a new run in the folder or reads the state of the one in it."""
-    # Another process may have started a run here since the first check.
+    """Starts a new run in the folder, or reads the state of the run in it."""
+    # Another process may have started a run here after the first check.
     folder.check(resume=resume)
     facts = environment_facts()
     if not folder.has_config:
@@ -212,7 +212,7 @@ def _open(
 
 
 class _Saver:
-    """Writes checkpoints, but not more often than asked for."""
+    """Writes checkpoints, with a shortest time between them."""
 
     def __init__(
         self, search: Search, folder: RunFolder | None, least_seconds: float
@@ -228,7 +228,7 @@ class _Saver:
             self.now(state)
 
     def now(self, state: SearchState) -> None:
-        """Saves, if there is anything yet and a folder for it."""
+        """Saves, if there is a state and a folder."""
         if self._folder is not None and state.iteration >= 0:
             self._folder.save(self._search.checkpoint(state))
         self._saved_at = time.monotonic()
@@ -242,7 +242,7 @@ def _loop(
     stop: StopFlag,
     save: _Saver,
 ) -> SearchState:
-    """Advances until the last generation or a signal, and saves."""
+    """Runs until the last generation or a signal, and saves."""
     while state.iteration < iterations and not stop.requested:
         state = search.advance(state)
         for watch in watchers:
@@ -284,7 +284,7 @@ def _finished(
     stop: StopFlag,
     begin: float,
 ) -> EvolveResult:
-    """Adds the metrics of re-evaluated elites, and writes what is known at the end."""
+    """Adds the metrics of re-evaluated elites, and writes the last files."""
     if not result.interrupted:
         display.note("evaluating the elites again, for metrics without luck")
         again = search.reevaluate(result.archive, lambda: stop.requested)

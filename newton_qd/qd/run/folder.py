@@ -1,9 +1,9 @@
-"""The results folder of a run: what is in it, and who may write to it.
+"""The results folder of a run: its files and its lock.
 
 ``config.json`` (settings), ``checkpoint.bin`` (state to resume from),
 ``metrics.csv`` (one row per generation), ``archive.npz``, ``archive.png`` and
-``corrected.json`` (metrics of the finished run, from evaluating its elites again).
-``tensorboard`` holds event files, if they are asked for.
+``corrected.json`` (metrics of the finished run, from re-evaluated elites).
+``tensorboard`` has event files, if the run writes them.
 """
 
 from __future__ import annotations
@@ -64,10 +64,10 @@ class RunFolder:
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
-        """Names the folder; touches nothing.
+        """Stores the path of the folder; does not create it.
 
         Args:
-            path: Folder, which need not exist yet.
+            path: Folder. It does not have to exist yet.
         """
         self.path = Path(path)
 
@@ -77,13 +77,13 @@ class RunFolder:
         return (self.path / CONFIG).is_file()
 
     def check(self, *, resume: bool) -> None:
-        """Refuses a folder that is not free, or not a run to resume.
+        """Checks that the folder is empty, or has a run to resume.
 
         Args:
-            resume: Whether an earlier run shall be continued.
+            resume: Whether to continue an earlier run.
 
         Raises:
-            ConfigError: The folder cannot be used like this.
+            ConfigError: The folder is not empty, or has no run to resume.
         """
         if self.path.exists() and not self.path.is_dir():
             raise self._refused("which is a file", "a folder")
@@ -102,7 +102,7 @@ class RunFolder:
         return ConfigError(message("out", Fact(self.path), allowed, why=why))
 
     def _occupied(self) -> bool:
-        """Whether anything but the unfinished files of a killed run is here."""
+        """Whether the folder has other files than unfinished files of a killed run."""
         if not self.path.exists():
             return False
         ignored = {temporary_name(Path(name)).name for name in _FILES}
@@ -113,7 +113,7 @@ class RunFolder:
         """Creates the folder and keeps other processes from writing to it.
 
         Raises:
-            ConfigError: The folder cannot be made, or another run writes to it.
+            ConfigError: The folder cannot be created, or another run writes to it.
         """
         try:
             self.path.mkdir(parents=True, exist_ok=True)
@@ -122,10 +122,10 @@ class RunFolder:
             raise self._refused(why, "a folder that can be made") from error
         try:
             import fcntl
-        except ImportError:  # Windows: a second writer is the user's affair
+        except ImportError:  # Windows: the user must avoid a second writer
             yield
             return
-        # The kernel frees this lock when the process dies, however it dies.
+        # The kernel releases this lock when the process ends for any reason.
         descriptor = os.open(self.path, os.O_RDONLY)
         try:
             try:
@@ -157,7 +157,7 @@ class RunFolder:
 
         Raises:
             ConfigError: A setting differs from the run's.
-            CheckpointError: The checkpoint is damaged or of another run.
+            CheckpointError: The checkpoint is damaged or belongs to another run.
         """
         stored, old_facts = read_config(self.path / CONFIG)
         for name, old, new in stored.differences(config):
@@ -209,7 +209,7 @@ def metrics_to_csv(metrics: np.ndarray) -> str:
     lines = [",".join(COLUMNS)]
     for row in metrics:
         whole = [str(int(value)) for value in row[:_WHOLE_COLUMNS]]
-        # The metrics are single precision: more digits would be noise.
+        # The metrics are single precision: more digits have no meaning.
         rest = [str(np.float32(value)) for value in row[_WHOLE_COLUMNS:]]
         lines.append(",".join(whole + rest))
     return "\n".join(lines) + "\n"

@@ -1,4 +1,4 @@
-"""One generation as pure functions: what becomes of an archive and an emitter."""
+"""One generation as pure functions of an archive and an emitter's state."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ class Generation:
     Attributes:
         emitter: Emitter of QDax.
         key: Key of the emitter's first state.
-        takes_faulty: Whether the emitter is told the fitness ``-inf`` of a faulty
-            individual; if not, it is told the worst finite one.
+        takes_faulty: Whether the emitter gets the fitness ``-inf`` of a faulty
+            individual. If not, it gets the worst finite fitness.
         offset: Number that makes returns positive.
     """
 
@@ -31,16 +31,16 @@ class Generation:
     def propose(
         self, repertoire: Repertoire, emitter: PyTree, key: jax.Array
     ) -> PyTree:
-        """Next genotypes (N, size), and what the emitter wants told with them."""
+        """Returns the next genotypes (N, size), and the emitter's data about them."""
         _, key = jax.random.split(key)
         genotypes, remembered = self.emitter.emit(repertoire, emitter, key)
-        # Under x64 QDax draws its noise in double precision.
+        # With JAX x64, QDax draws its noise in double precision.
         return genotypes.astype(jnp.float32), remembered
 
     def begin(
         self, repertoire: Repertoire, genotypes: Genotype, scores: PyTree
     ) -> PyTree:
-        """Archive, emitter's state and metrics after the initial population."""
+        """Returns archive, emitter's state and metrics after the initial population."""
         repertoire, told = self._added(repertoire, genotypes, scores)
         emitter = self.emitter.init(key=self.key, **told)
         return repertoire, _strongly_typed(emitter), self._measured(repertoire, scores)
@@ -53,7 +53,7 @@ class Generation:
         remembered: ExtraScores,
         scores: PyTree,
     ) -> PyTree:
-        """Archive, emitter's state and metrics after another generation."""
+        """Returns archive, emitter's state and metrics after another generation."""
         repertoire, told = self._added(repertoire, genotypes, scores)
         told["extra_scores"] = {**told["extra_scores"], **remembered}
         emitter = self.emitter.state_update(emitter, **told)
@@ -64,7 +64,7 @@ class Generation:
     def _added(
         self, repertoire: Repertoire, genotypes: Genotype, scores: PyTree
     ) -> tuple[Any, dict]:
-        """The archive with a generation in it, and what the emitter hears of that."""
+        """Returns the archive with a generation added, and the emitter's arguments."""
         fitnesses, found, extra = scores
         kept = _break_ties(fitnesses, found, repertoire.centroids)
         repertoire = repertoire.add(genotypes, found, kept, {})
@@ -79,7 +79,7 @@ class Generation:
         }
 
     def _measured(self, repertoire: Repertoire, scores: PyTree) -> PyTree:
-        """QD score, coverage [%], best fitness and individuals that were rejected."""
+        """Returns QD score, coverage [%], best fitness and number of rejected ones."""
         from qdax.utils.metrics import default_qd_metrics
 
         fitnesses, found, _ = scores
@@ -89,7 +89,7 @@ class Generation:
 
 
 def _strongly_typed(tree: PyTree) -> PyTree:
-    """Takes weak types off; those of the next generation differ, and compile again."""
+    """Removes weak types, which would make JAX compile the next generation again."""
 
     def strong(leaf: Any) -> jax.Array:
         leaf = jnp.asarray(leaf)
@@ -105,8 +105,8 @@ def _break_ties(
 ) -> jax.Array:
     """Keeps the first of several equally fit individuals of one cell.
 
-    QDax would write all of them to the same row of the archive, in an order that XLA
-    leaves open on a GPU.
+    QDax would write all of them to the same row of the archive. XLA does not define the
+    order on a GPU.
 
     Args:
         fitnesses: (N,) returns.

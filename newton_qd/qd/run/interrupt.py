@@ -1,7 +1,7 @@
-"""Ctrl-C and SIGTERM as a flag that long loops look at.
+"""Ctrl-C and SIGTERM as a flag for long loops.
 
-An exception raised by a signal could surface inside a callback of the physics
-and be lost there, or end the interpreter; a flag cannot.
+A signal could raise an exception inside a callback of the physics. The exception could
+be lost there, or could end the interpreter. A flag avoids this.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from types import FrameType
 
 INTERRUPTED = 130
-"""Exit code of a run that a signal has ended, as shells count it."""
+"""Exit code of a run that ended by a signal, as in shells."""
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _NOTICE = b"\nstopping after this generation, then saving (a second signal quits now)\n"
@@ -23,21 +23,21 @@ _NOTICE = b"\nstopping after this generation, then saving (a second signal quits
 
 @dataclasses.dataclass
 class StopFlag:
-    """Says whether somebody asked the loop to stop."""
+    """The flag: whether a signal has asked the loop to stop."""
 
     requested: bool = False
 
 
 @contextlib.contextmanager
 def graceful_stop(notice: bytes = _NOTICE) -> Iterator[StopFlag]:
-    """Turns SIGINT and SIGTERM into a flag while the block runs.
+    """Converts SIGINT and SIGTERM to a flag while the block runs.
 
-    A second signal ends the process at once with exit code 130. Outside the main
-    thread Python allows no handlers: then the flag stays unset. A signal that the
-    process was told to ignore stays ignored.
+    A second signal ends the process at once with exit code 130. Python allows handlers
+    in the main thread only. In another thread, the flag stays unset. A signal that the
+    process ignores stays ignored.
 
     Args:
-        notice: What the first signal prints at once.
+        notice: Text that the first signal prints at once.
     """
     flag = StopFlag()
     if threading.current_thread() is not threading.main_thread():
@@ -62,14 +62,14 @@ def graceful_stop(notice: bytes = _NOTICE) -> Iterator[StopFlag]:
 
 @contextlib.contextmanager
 def _answer_at_once(numbers: list[signal.Signals], notice: bytes) -> Iterator[None]:
-    """Lets a thread answer to signals.
+    """Starts a thread that prints a text at a signal.
 
-    Python runs handlers between two of its own instructions only, which can be a
-    minute away while a compiler works. The thread hears of a signal at once.
+    Python runs handlers only between two of its own instructions. During a compilation
+    this can take a minute. The thread gets a signal at once.
 
     Args:
-        numbers: Signals to answer to.
-        notice: The answer to the first.
+        numbers: Signals.
+        notice: Text to print at the first signal.
     """
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
@@ -81,7 +81,7 @@ def _answer_at_once(numbers: list[signal.Signals], notice: bytes) -> Iterator[No
             if seen > 1:
                 os._exit(INTERRUPTED)
             if received[0] in numbers:
-                # Not through sys.stderr: its buffer may be in use.
+                # not with sys.stderr, whose buffer may be in use
                 with contextlib.suppress(OSError):
                     os.write(2, notice)
         os.close(reader)

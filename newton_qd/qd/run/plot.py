@@ -30,8 +30,8 @@ def archive_png(
 
     Args:
         archive: Archive to draw.
-        config: Settings of the run with the grid filled in.
-        task: Task of the run; its limits and labels are drawn.
+        config: Settings of the run, with a grid or a number of centroids.
+        task: Task of the run, with limits and labels for the picture.
         iteration: Generations that are finished.
 
     Returns:
@@ -70,20 +70,20 @@ def plot_archive(
 ) -> Figure:
     """Draws an archive.
 
-    A grid of up to four dimensions becomes one heat map: dimensions 1 and 2 choose
-    a block, dimensions 3 and 4 the cell inside the block. Anything else becomes one
-    scatter plot for each pair of dimensions.
+    A grid of up to four dimensions becomes one heat map. Dimensions 1 and 2 select a
+    block, and dimensions 3 and 4 select a cell inside the block. All other archives
+    become one scatter plot for each pair of dimensions.
 
     Args:
         archive: Archive to draw.
-        grid: Cells along each dimension, ``None`` if the cells are no grid.
+        grid: Cells along each dimension; ``None`` if the cells are not a grid.
         limits: Lowest and highest descriptor, (D,) each.
         labels: D names of the descriptor's components.
         title: Title of the picture.
         fitness_label: Label of the colour bar.
 
     Returns:
-        A matplotlib figure that belongs to no window.
+        A matplotlib figure without a window.
 
     Raises:
         MissingExtra: matplotlib is not installed.
@@ -140,7 +140,7 @@ def _draw_nested(
 def _grid_indices(
     centroids: np.ndarray, grid: tuple[int, ...], limits: tuple[np.ndarray, np.ndarray]
 ) -> np.ndarray:
-    """(cells, D) place of each cell in the grid, whatever the order of the cells."""
+    """Returns the grid indices (cells, D) of cells in any order."""
     low, high = limits
     counts = np.asarray(grid)
     return np.rint((centroids - low) / (high - low) * counts - 0.5).astype(int)
@@ -149,7 +149,7 @@ def _grid_indices(
 def _nest(
     cells: np.ndarray, dimensions: tuple[int, ...], grid: tuple[int, ...]
 ) -> np.ndarray:
-    """(cells,) place along an axis on which later dimensions vary faster."""
+    """Returns positions (cells,) on an axis on which later dimensions vary faster."""
     place = np.zeros(len(cells), int)
     for dimension in dimensions:
         place = place * grid[dimension] + cells[:, dimension]
@@ -164,7 +164,7 @@ def _label_nested(
     limits: tuple[np.ndarray, np.ndarray],
     labels: tuple[str, ...],
 ) -> None:
-    """Writes the outer dimension on one side and the inner on the other."""
+    """Labels the outer dimension on one side and the inner dimension on the other."""
     low, high = limits
     outer = dimensions[0]
     inner = dimensions[1] if len(dimensions) > 1 else None
@@ -200,7 +200,7 @@ def _draw_pairs(
     limits: tuple[np.ndarray, np.ndarray],
     labels: tuple[str, ...],
 ) -> tuple[list[Axes], Any]:
-    """Draws the descriptors of all individuals, one panel a pair of dimensions."""
+    """Draws the descriptors of all individuals, one panel per pair of dimensions."""
     low, high = limits
     points = archive.descriptors[archive.filled]
     fitnesses = archive.fitnesses[archive.filled]
@@ -213,7 +213,7 @@ def _draw_pairs(
     columns = math.ceil(math.sqrt(len(pairs)))
     panels = []
     mappable = None
-    # The best on top: they are what one looks for.
+    # The best individuals are on top, because they are the most interesting.
     order = np.argsort(fitnesses)
     for index, (a, b) in enumerate(pairs):
         axes = figure.add_subplot(math.ceil(len(pairs) / columns), columns, index + 1)

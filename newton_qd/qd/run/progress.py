@@ -10,11 +10,11 @@ from typing import TextIO
 _PLAIN_SECONDS = 10.0
 _REDRAW_SECONDS = 0.1
 _BAR_WIDTH = 20
-_COMPILING_UPDATES = 2  # their time says nothing about the generations to come
+_COMPILING_UPDATES = 2  # first updates compile, so their time is not typical
 
 
 class Progress:
-    """Shows how far a run is and what it has found.
+    """Shows the progress of a run and its metrics.
 
     Attributes:
         total: Generations of the whole run.
@@ -33,8 +33,8 @@ class Progress:
         Args:
             name: Label at the beginning of every line.
             total: Generations of the whole run.
-            stream: Where to write; standard error by default.
-            enabled: ``False`` shows nothing at all.
+            stream: Stream for the text; by default standard error.
+            enabled: Whether to show anything.
         """
         self.total = total
         self._name = name
@@ -98,7 +98,7 @@ class Progress:
         )
         if not self._tty:
             return f"{head}  {tail}"
-        # One column is left free: a full line would wrap on some terminals.
+        # One column stays free, because a full line would wrap on some terminals.
         columns = shutil.get_terminal_size().columns - 1
         room = columns - len(head) - len(tail) - 3
         bar = f" {self._bar(fraction, min(room, _BAR_WIDTH))}" if room > 0 else ""

@@ -1,4 +1,4 @@
-"""The metrics of an archive without luck: its elites, evaluated again."""
+"""Metrics of an archive without luck, from re-evaluated elites."""
 
 from __future__ import annotations
 
@@ -48,13 +48,13 @@ def reevaluate(
     Args:
         archive: Archive with at least one elite.
         score: Compiled scoring function; all elites share a start state in each call.
-        key: Split into a key for each call.
+        key: Key that is split into one key for each call.
         reevaluations: Number of calls.
         offset: Added to each elite's fitness in the QD score.
-        stop: Asked before each call whether to give up.
+        stop: Called before each call of ``score``; true ends the re-evaluation.
 
     Returns:
-        The metrics; ``None`` if ``stop`` said so.
+        The metrics; ``None`` if ``stop`` returned true.
     """
     genotypes = jnp.asarray(archive.genotypes[archive.filled])
     fitnesses, descriptors = [], []
@@ -78,7 +78,7 @@ def reevaluate(
 
 
 def _cells(descriptors: np.ndarray, centroids: np.ndarray) -> np.ndarray:
-    """(N,) nearest centroid of each descriptor, as QDax finds it."""
+    """Returns the nearest centroid (N,) of each descriptor, computed as in QDax."""
     from qdax.core.containers.mapelites_repertoire import get_cells_indices
 
     return np.asarray(

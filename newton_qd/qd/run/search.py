@@ -1,4 +1,4 @@
-"""Algorithms as a pure step from generation to generation, built from QDax."""
+"""Algorithms as a pure step from one generation to the next, built with QDax."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from newton_qd.types import (
 
 
 class SearchError(RuntimeError):
-    """The search cannot go on."""
+    """The search cannot continue."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,9 +57,9 @@ class SearchState:
 
 
 class Search:
-    """One algorithm of the family of MAP-Elites on one task.
+    """One algorithm of the MAP-Elites family on one task.
 
-    Generation ``i`` draws its random numbers from a key folded with ``i``; the state
+    Generation ``i`` draws its random numbers from a key folded with ``i``. So the state
     after it depends on the settings only.
 
     Attributes:
@@ -72,10 +72,10 @@ class Search:
         """Builds the parts; compiles and evaluates nothing.
 
         Args:
-            config: Settings with the grid filled in.
+            config: Settings with a grid or a number of centroids.
             task: Task to solve.
-            mesh: Devices that share each evaluation; everything else happens on the
-                default one. ``None``: evaluations too.
+            mesh: Devices that share each evaluation. All else runs on the default
+                device. ``None``: evaluations run on the default device too.
 
         Raises:
             MissingExtra: QDax is not installed.
@@ -132,10 +132,10 @@ class Search:
         return SearchState(iteration=-1, repertoire=repertoire, metrics=rows)
 
     def advance(self, state: SearchState) -> SearchState:
-        """Evaluates one generation and puts it into the archive.
+        """Evaluates one generation and adds it to the archive.
 
         Raises:
-            SearchError: No individual of the initial population can be kept.
+            SearchError: No individual of the initial population has finite scores.
         """
         iteration = state.iteration + 1
         if iteration == 0:
@@ -185,7 +185,7 @@ class Search:
     def reevaluate(
         self, archive: Archive, stop: Callable[[], bool] = lambda: False
     ) -> Reevaluated | None:
-        """Evaluates the elites of an archive again; ``None`` where none are asked."""
+        """Evaluates the elites again; ``None`` if the settings do not ask for it."""
         if not self._config.reevaluations:
             return None
         return reevaluate(
@@ -198,10 +198,10 @@ class Search:
         )
 
     def restore(self, checkpoint: Checkpoint) -> SearchState:
-        """Makes the state that a checkpoint describes.
+        """Makes the state of a checkpoint.
 
         Raises:
-            CheckpointError: It holds other arrays than this version of the algorithm.
+            CheckpointError: Its arrays do not fit this version of the algorithm.
         """
         from qdax.core.containers.mapelites_repertoire import MapElitesRepertoire
 
@@ -221,10 +221,10 @@ class Search:
         )
 
     def _restore_emitter(self, leaves: tuple[np.ndarray, ...]) -> PyTree:
-        """Puts the leaves of a checkpoint where they belong.
+        """Makes the emitter's state from the leaves of a checkpoint.
 
         Raises:
-            CheckpointError: They are not those of this algorithm.
+            CheckpointError: The leaves do not fit this algorithm.
         """
         shape = (self._config.batch_size, self._policy.size)
         genotypes = jax.ShapeDtypeStruct(shape, jnp.float32)
@@ -252,12 +252,12 @@ class Search:
         return jax.tree.unflatten(structure, restored)
 
     def _initial(self, key: jax.Array) -> jax.Array:
-        """Weights (size,) of an individual of the initial population."""
+        """Returns weights (size,) of an individual of the initial population."""
         scale = self._algorithm.initial_scale(self.options)
         return scale * self._policy.init(key)
 
     def _scoring(self) -> ScoringFunction:
-        """The scoring function of the loop, split over the mesh."""
+        """Returns the scoring function of the loop, split over the mesh."""
         if self._algorithm.scoring is None:
             return self._plain_scoring(self._algorithm.transitions)
         return self._split(
@@ -267,7 +267,7 @@ class Search:
         )
 
     def _plain_scoring(self, transitions: bool = False) -> ScoringFunction:
-        """A scoring function without gradients, split over the mesh."""
+        """Returns a scoring function without gradients, split over the mesh."""
         length = self._config.episode_length
         return self._split(
             make_scoring_function(
@@ -303,14 +303,14 @@ def _runnable(config: EvolveConfig) -> AlgorithmSpec[Any]:
 
 
 def _leaf_to_host(leaf: Any) -> np.ndarray:
-    """Copies a leaf; a key becomes its numbers."""
+    """Copies a leaf to the host; a key becomes its integers."""
     if jnp.issubdtype(jnp.asarray(leaf).dtype, jax.dtypes.prng_key):
         leaf = jax.random.key_data(leaf)
     return np.asarray(leaf)
 
 
 def _leaf_to_device(leaf: np.ndarray, like: Any) -> jax.Array:
-    """Undoes ``_leaf_to_host``."""
+    """Inverts ``_leaf_to_host``."""
     if jnp.issubdtype(like.dtype, jax.dtypes.prng_key):
         return jax.random.wrap_key_data(jnp.asarray(leaf))
     return jnp.asarray(leaf, like.dtype)

@@ -8,19 +8,19 @@ from typing import Any, Self
 
 from newton_qd.qd.extras import require_extra
 
-_FLUSH_SECONDS = 1  # what a killed run loses of its curves; metrics.csv loses nothing
+_FLUSH_SECONDS = 1  # a killed run loses this part of its curves, but no metrics.csv
 
 
 class EventLog:
-    """Writes the metrics of each generation, as scalars of their names."""
+    """Writes the metrics of each generation as scalars."""
 
     def __init__(self, folder: Path, first: int) -> None:
         """Begins an event file.
 
         Args:
-            folder: Folder of event files; those of earlier parts of a run stay.
-            first: Generation that comes next. TensorBoard then forgets this one and
-                later ones of a part that was killed after its last checkpoint.
+            folder: Folder of event files; earlier files stay.
+            first: Next generation. TensorBoard then drops this and later generations
+                from files of a run that was killed after its last checkpoint.
 
         Raises:
             MissingExtra: tensorboardX is not installed.
@@ -32,7 +32,7 @@ class EventLog:
             str(folder),
             purge_step=first,
             flush_secs=_FLUSH_SECONDS,
-            # Files are named after the second in which they begin.
+            # Without this, two files of the same second would have the same name.
             filename_suffix=f".{first}",
         )
 

@@ -1,14 +1,14 @@
-"""What emitters read: scores with gradients, checked once, in one place.
+"""Scores with gradients for emitters, checked in one place.
 
 A scoring function maps genotypes (N, size) and a key to fitnesses (N,), descriptors
 (N, D) and ``extra_scores``, with
 
     extra_scores["gradients"]: (N, size, 1 + D)
 
-the gradients with respect to the genotype, laid out as QDax's emitters want them:
-column 0 is that of the fitness, column 1 + j that of descriptor j, in their own units
-(emitters normalize where their paper does). An individual that could not be evaluated
-has fitness ``-inf``. ``Episode.scoring`` makes such functions.
+the gradients with respect to the genotype, in the layout of QDax's emitters. Column 0
+is the gradient of the fitness, column 1 + j that of descriptor j. They are not
+normalized; emitters normalize them if their paper does. An individual without a valid
+evaluation has fitness ``-inf``. ``Episode.scoring`` makes such functions.
 """
 
 from __future__ import annotations
@@ -26,12 +26,13 @@ from newton_qd.types import Genotype
 GRADIENTS = "gradients"
 """Key of the gradients in ``extra_scores``."""
 
-# pyribs' epsilon: a gradient shorter than this stays shorter than one.
+# pyribs' epsilon: a normalized gradient is shorter than 1 if the gradient is this
+# small.
 _EPSILON = 1e-8
 
 
 class GradientsError(ValueError):
-    """Scores do not hold the gradients that an emitter needs."""
+    """Scores do not have the gradients that an emitter needs."""
 
 
 class Scores(flax.struct.PyTreeNode):
@@ -39,9 +40,10 @@ class Scores(flax.struct.PyTreeNode):
 
     Attributes:
         genotypes: (N, size) policy weights or other solutions.
-        fitnesses: (N,) fitnesses, ``-inf`` where anything is not finite.
+        fitnesses: (N,) fitnesses, ``-inf`` if a score or gradient is not finite.
         descriptors: (N, D) descriptors.
-        gradients: (N, 1 + D, size) gradients, zero where anything is not finite.
+        gradients: (N, 1 + D, size) gradients, zero if a score or gradient is not
+            finite.
         finite: (N,) whether fitness, descriptor and gradients are finite.
     """
 
@@ -58,7 +60,7 @@ def read_scores(
     descriptors: jax.Array,
     extra_scores: Mapping[str, Any] | None,
 ) -> Scores:
-    """Checks what a scoring function returned and sets aside what is not finite.
+    """Checks the result of a scoring function and marks what is not finite.
 
     Args:
         genotypes: (N, size) the individuals.
@@ -67,7 +69,7 @@ def read_scores(
         extra_scores: Dictionary with ``"gradients"`` (N, size, 1 + D).
 
     Raises:
-        GradientsError: The gradients are missing or have another shape, or genotypes
+        GradientsError: The gradients are missing or have the wrong shape, or genotypes
             are not one array.
     """
     count, size = check_genotypes(genotypes).shape
@@ -99,10 +101,10 @@ def read_scores(
 
 
 def check_genotypes(genotypes: Genotype) -> jax.Array:
-    """Returns genotypes that are one array (N, size).
+    """Checks that genotypes are one array (N, size), and returns it.
 
     Raises:
-        GradientsError: They are not.
+        GradientsError: They are not one array.
     """
     if not isinstance(genotypes, jax.Array) or genotypes.ndim != 2:
         shapes = jax.tree.map(jnp.shape, genotypes)
@@ -115,12 +117,12 @@ def check_genotypes(genotypes: Genotype) -> jax.Array:
 
 
 def finite_scores(fitnesses: jax.Array, descriptors: jax.Array) -> jax.Array:
-    """(N,) whether fitness and descriptor of an individual are finite."""
+    """Returns whether fitness and descriptor of an individual are finite (N,)."""
     finite = jnp.isfinite(jnp.reshape(fitnesses, (-1,)))
     return finite & jnp.all(jnp.isfinite(descriptors), axis=-1)
 
 
 def normalize(gradients: jax.Array) -> jax.Array:
-    """(..., size) gradients of length one; a zero gradient stays zero."""
+    """Returns gradients (..., size) of length 1; a zero gradient stays zero."""
     lengths = jnp.linalg.norm(gradients, axis=-1, keepdims=True)
     return gradients / (lengths + _EPSILON)

@@ -29,31 +29,32 @@ def make_gradient_scoring_function(
     Deprecated: use ``episode.scoring(episode.gradient)`` of an
     :class:`~newton_qd.gradients.Episode`.
 
-    :func:`~newton_qd.qd.make_scoring_function` with gradients, laid out for QDax's
-    emitters: their last axis has the fitness first, then each descriptor component.
+    This is :func:`~newton_qd.qd.make_scoring_function` with gradients in the layout of
+    QDax's emitters. Their last axis has the fitness first, then each component of the
+    descriptor.
 
     Args:
-        task: Environment and descriptor. A descriptor of feet contacts has a gradient
-            where :func:`~newton_qd.gradients.with_smooth_descriptor` gave it one.
-        policy: A :class:`~newton_qd.qd.Policy`, with flat genotypes; any function of a
-            pytree genotype and an observation, as the ``apply`` of a module of Flax or
-            ``lambda module, obs: module(obs)``; ``None``: genotypes are the actions.
+        task: Environment and descriptor. A descriptor of feet contacts needs
+            :func:`~newton_qd.gradients.with_smooth_descriptor` to have a gradient.
+        policy: A :class:`~newton_qd.qd.Policy`, with flat genotypes. Or any function of
+            a pytree genotype and an observation, such as the ``apply`` of a module of
+            Flax. ``None``: genotypes are the actions.
         episode_length: Control steps of an evaluation.
         options: Windows, clipping, discounting and memory of the gradients.
         estimator: Builds the gradient, from the arguments of
             :func:`~newton_qd.gradients.make_episode_gradient`.
 
     Returns:
-        Function of genotypes (N, ...) and a key for the reset; returns fitnesses (N,),
-        descriptors (N, D) and a dict: ``gradients``, every leaf of the genotypes with
-        an axis of 1 + D behind; ``normalized_grads``, the same with Euclidean norm 1
-        over a genotype, or 0 where the gradient is; ``faulty`` (N,) and ``overflowed``
-        (N, 1 + D), whose gradients were set to 0. The fitness of a faulty individual
-        is ``-inf``. With a :class:`~newton_qd.qd.Policy` it raises ``ValueError`` for
-        genotypes that are not weights of it.
+        Function of genotypes (N, ...) and a key for the reset. It returns fitnesses
+        (N,), descriptors (N, D) and a dictionary: ``gradients``, every leaf of the
+        genotypes with an axis 1 + D at the end; ``normalized_grads``, the same with
+        Euclidean norm 1 over a genotype (0 stays 0); ``faulty`` (N,) and ``overflowed``
+        (N, 1 + D), which mark gradients that were set to 0. The fitness of a faulty
+        individual is ``-inf``. With a :class:`~newton_qd.qd.Policy`, the function
+        raises ``ValueError`` for genotypes that are not weights of this policy.
 
     Raises:
-        TypeError: The environment, the policy or the options are of another type.
+        TypeError: The environment, the policy or the options have the wrong type.
         ValueError: ``episode_length`` is not an integer from 1.
     """
     flat = isinstance(policy, Policy)

@@ -1,4 +1,4 @@
-"""pyribs on these tasks: evaluation for its schedulers, archives both ways."""
+"""pyribs with these tasks: evaluation for its schedulers, conversion of archives."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ def make_ribs_evaluation(
 ) -> Callable[[np.ndarray], tuple[np.ndarray, ...]]:
     """Makes the function between ``ask`` and ``tell`` of a ``ribs`` scheduler.
 
-    ``scheduler.tell(*evaluate(scheduler.ask()))``, and with ``jacobian``
-    ``scheduler.tell_dqd(*evaluate(scheduler.ask_dqd()))``. One call evaluates the
-    whole batch in one jitted function, compiled once for each size of a batch.
+    Use it as ``scheduler.tell(*evaluate(scheduler.ask()))``, or with ``jacobian`` as
+    ``scheduler.tell_dqd(*evaluate(scheduler.ask_dqd()))``. One call evaluates the whole
+    batch in one jitted function, which is compiled once for each batch size.
 
     Args:
-        score: As made by ``make_scoring_function``; with ``jacobian`` its third
-            result holds ``"gradients"`` (N, size, 1 + D): of the fitness, then of
-            each descriptor, not normalized; ``Episode.scoring``. An
-            individual with anything that is not finite counts as faulty.
+        score: Result of ``make_scoring_function``. With ``jacobian``: result of
+            ``Episode.scoring``, which also returns ``"gradients"`` (N, size, 1 + D),
+            first of the fitness, then of each descriptor, not normalized. An individual
+            counts as faulty if a value is not finite.
         key: Key for the resets.
         limits: Lowest and highest descriptor, (D,) each, as in ``Task.limits``.
-        worst: Objective of an individual whose world was faulty; pyribs takes no
-            infinite one. ``-task.reward_offset * episode_length`` adds nothing to
-            the QD score. Its measures are the lowest ones, its gradients 0.
+        worst: Objective of a faulty individual, because pyribs does not allow infinite
+            objectives. ``-task.reward_offset * episode_length`` adds 0 to the QD score.
+            The measures of a faulty individual are the lowest ones, its gradients 0.
         jacobian: Whether to return gradients too.
 
     Returns:
@@ -49,8 +49,8 @@ def make_ribs_evaluation(
         and, with ``jacobian``, gradients (N, 1 + D, size).
 
     Raises:
-        ValueError: ``worst`` is not finite. The function raises ``GradientsError``
-            where gradients are missing or have another shape.
+        ValueError: ``worst`` is not finite. The returned function raises
+            ``GradientsError`` if gradients are missing or have the wrong shape.
     """
     checks.number("worst", worst)
     low = jnp.asarray(limits[0], jnp.float32)
@@ -70,7 +70,7 @@ def make_ribs_evaluation(
 
     def evaluate(solutions: np.ndarray) -> tuple[np.ndarray, ...]:
         results = run(jnp.asarray(solutions, jnp.float32))
-        # Copies: pyribs normalizes the gradients in place.
+        # copies, because pyribs normalizes the gradients in place
         return tuple(np.array(result) for result in results)
 
     return evaluate
@@ -81,13 +81,13 @@ def to_ribs(
 ) -> Any:
     """Makes a ``ribs`` archive with the elites of a repertoire.
 
-    pyribs puts each elite where its measures belong; where two share a cell, as may
-    happen for measures on the border of cells, the fitter one stays.
+    pyribs computes the cell of each elite from its measures. At the border of cells,
+    two elites may get the same cell. Then the fitter one stays.
 
     Args:
         repertoire: ``MapElitesRepertoire`` of QDax, or ``Archive`` of ``evolve``.
         limits: Lowest and highest descriptor, (D,) each.
-        grid: Cells along each dimension, if the cells are those of a grid.
+        grid: Cells along each dimension, if the cells are a grid.
 
     Returns:
         ``GridArchive`` if ``grid`` is given, else ``CVTArchive`` with the centroids
@@ -170,7 +170,7 @@ def _centroids(archive: Any) -> np.ndarray:
     """
     from ribs.archives import CVTArchive, GridArchive
 
-    # Others have grid indices, too, but cells that move.
+    # Other archives may have grid indices too, but their cells move.
     if not isinstance(archive, CVTArchive | GridArchive):
         given = Fact(type(archive).__name__)
         raise TypeError(message("archive", given, "GridArchive, CVTArchive"))

@@ -1,4 +1,4 @@
-"""Policies with their own weights per individual, and the return they earn."""
+"""Policies with weights per individual, and their evaluation."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Policy:
         unravel: Maps weights (size,) to the parameters that ``apply`` takes.
         apply: Maps parameters and an observation (O,) to an action (A,) inside
             [-1, 1].
-        ravel: Maps parameters to weights (size,); undoes ``unravel``.
+        ravel: Maps parameters to weights (size,); the inverse of ``unravel``.
         network: The Flax module that ``apply`` calls.
     """
 
@@ -49,10 +49,10 @@ class Policy:
     network: Any
 
     def weights(self, genotypes: Genotype) -> jax.Array:
-        """Genotypes (N, size) as floating-point numbers.
+        """Returns genotypes (N, size) as floating-point numbers.
 
         Raises:
-            ValueError: They have another shape.
+            ValueError: They have the wrong shape.
         """
         if jnp.shape(genotypes)[1:] != (self.size,):
             given = Fact(f"shape {jnp.shape(genotypes)}")
@@ -110,14 +110,14 @@ def episode_of(
     options: GradientOptions = EXACT,
     transitions: bool = False,
 ) -> Episode:
-    """Makes the episode of a task in which individuals are weights of a policy.
+    """Makes the episode of a task whose genotypes are weights of a policy.
 
     Args:
         task: Environment and descriptor.
         policy: Policy whose weights are the genotypes.
         episode_length: Control steps.
         options: Windows, clipping, discounting and memory of its gradients.
-        transitions: Whether it returns its steps.
+        transitions: Whether to return the steps.
 
     Raises:
         ValueError: ``episode_length`` is not an integer from 1.
@@ -138,24 +138,25 @@ def make_scoring_function(
 ) -> ScoringFunction:
     """Builds the function that evaluates a batch of individuals.
 
-    All individuals start from the same reset state, so that the return of an
-    individual depends on nothing but its weights.
+    All individuals start from the same reset state, so that the return of an individual
+    depends on its weights only.
 
     Args:
         task: Environment and descriptor.
         policy: Policy whose weights are the genotypes.
         episode_length: Control steps of an evaluation.
-        transitions: Whether to return the steps, for algorithms that learn from
-            them. An individual whose episode ends early begins another one then,
-            which counts for nothing else.
+        transitions: Whether to return the steps, for algorithms that learn from them.
+            If an episode ends early, another one then follows. It has no effect on
+            fitness and descriptor.
 
     Returns:
-        Function of genotypes (N, size) and a key for the reset; returns fitnesses
-        (N,), descriptors (N, D) and a dict, which is empty or holds ``transitions``:
-        the fields of QDax's ``QDTransition`` by name, (N, T, ...) each. An individual
-        whose world was faulty or whose result is not finite has fitness ``-inf``:
-        archives do not take it. It raises ``ValueError`` for genotypes that are not
-        weights of this policy.
+        Function of genotypes (N, size) and a key for the reset. It returns fitnesses
+        (N,), descriptors (N, D) and a dictionary. The dictionary is empty or contains
+        ``transitions``: the fields of QDax's ``QDTransition`` by name, (N, T, ...)
+            each.
+        If the world had a fault or a result is not finite, the fitness is ``-inf``, and
+        archives do not take the individual. The function raises ``ValueError`` for
+        genotypes that are not weights of this policy.
 
     Raises:
         ValueError: ``episode_length`` is not an integer from 1.

@@ -1,4 +1,4 @@
-"""Evaluation spread over the devices of a mesh."""
+"""Evaluation on several devices of a mesh."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ def device_mesh(count: int | None = None) -> Mesh:
     """Returns a mesh of devices, along one axis.
 
     Args:
-        count: Number of devices; ``None``: all, those of other processes of
-            ``jax.distributed`` included.
+        count: Number of devices; ``None``: all devices, with those of other processes
+            of ``jax.distributed``.
 
     Raises:
-        ValueError: There are not as many devices.
+        ValueError: There are not so many devices.
     """
     devices = jax.devices()
     if count is None:
@@ -36,21 +36,20 @@ def device_mesh(count: int | None = None) -> Mesh:
 def shard_scoring(score: ScoringFunction, mesh: Mesh) -> ScoringFunction:
     """Makes a scoring function whose batch is split over devices.
 
-    Each device evaluates an equal part of the individuals; a batch that does not
-    divide is filled up with copies of its last individual, whose results are dropped.
-    Every device then holds all results, which are bitwise the same for every number of
-    devices.
+    Each device evaluates an equal part of the individuals. If necessary, the batch is
+    extended with copies of the last individual, and their results are dropped. Every
+    device then has all results. They are bitwise equal for any number of devices.
 
     Args:
         score: Scoring function of genotypes (N, size) or a pytree of (N, ...), and a
             key; each leaf of its results has the leading axis N.
-        mesh: Devices, as made by ``device_mesh``.
+        mesh: Devices, from ``device_mesh``.
 
     Returns:
         Function with the arguments and results of ``score``, for ``jax.jit``.
     """
     split, whole = PartitionSpec(AXIS), PartitionSpec()
-    # Varying axes are not checked: foreign calls do not state theirs.
+    # JAX cannot check varying axes, because foreign calls do not declare theirs.
     sharded = jax.shard_map(
         score, mesh=mesh, in_specs=(split, whole), out_specs=split, check_vma=False
     )
@@ -74,14 +73,14 @@ def shard_scoring(score: ScoringFunction, mesh: Mesh) -> ScoringFunction:
 
 
 def on_mesh(function: Callable[..., Any], mesh: Mesh) -> Callable[..., Any]:
-    """Compiles a function for a mesh, between functions of one device.
+    """Compiles a function for a mesh, with arguments and results on one device.
 
-    What follows an evaluation then is one program, whatever the number of devices,
-    and its results are the same to the last bit.
+    The program after an evaluation is then the same for any number of devices, and its
+    results are bitwise equal.
 
     Args:
-        function: Function of pytrees that every device shall have as a whole, made
-            with ``shard_scoring``; every device has its results as a whole.
+        function: Function that uses ``shard_scoring``. Every device has its complete
+            arguments (pytrees) and results.
         mesh: Devices.
 
     Returns:
@@ -100,7 +99,7 @@ def on_mesh(function: Callable[..., Any], mesh: Mesh) -> Callable[..., Any]:
 
 
 def _copied(leaf: jax.Array, everywhere: NamedSharding) -> jax.Array:
-    """Gives an array to all devices; those of other processes take NumPy's only."""
+    """Copies an array to all devices; other processes accept arrays of NumPy only."""
     if jax.process_count() == 1:
         return jax.device_put(leaf, everywhere)
     if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):

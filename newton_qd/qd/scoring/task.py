@@ -1,4 +1,4 @@
-"""What an evolution optimizes: an environment, its descriptor and their names."""
+"""The task of an evolution: an environment, its descriptor and their names."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ class Task:
             end of an episode.
         limits: Lowest and highest descriptor, (D,) each.
         labels: D names for the axes of plots.
-        reward_offset: Number per control step that makes returns positive; used by
-            the QD score only.
+        reward_offset: Number per control step that makes returns positive, for the QD
+            score only.
     """
 
     env: Any
@@ -45,13 +45,13 @@ def make_task(config: EvolveConfig) -> Task:
     """Creates the registered task of a configuration.
 
     Args:
-        config: Settings; ``env_name`` and ``episode_length`` matter here.
+        config: Settings, of which ``env_name`` and ``episode_length`` are used.
 
     Raises:
         UnknownEnvironment: No environment of this name is registered.
         ConfigError: The environment has no descriptor.
     """
-    # The registry imports every environment; the settings alone stay light.
+    # imported here, because the registry imports every environment
     import newton_qd
 
     name = config.env_name
