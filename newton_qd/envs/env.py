@@ -170,12 +170,12 @@ class QDEnv(Env):
 
 
 def not_simulated(name: str, value: object, env: Env) -> str:
-    """Returns the message where something needs a simulated robot.
+    """Returns the error message for an environment that is not a simulated robot.
 
     Args:
-        name: Argument that needs it.
+        name: Argument that needs a simulated robot.
         value: Its value.
-        env: The environment, which is none.
+        env: The environment.
     """
     why = f"and {env.name} is not a simulated robot"
     allowed = "environments whose unwrapped is a PhysicsEnv"

@@ -81,14 +81,14 @@ def default_params(system: System) -> PhysicsParams:
 
 
 def check_bounds(name: str, values: np.ndarray) -> None:
-    """Raises where a number is none that a parameter may have.
+    """Checks that all numbers are allowed values of a parameter.
 
     Args:
         name: Name of the parameter.
         values: Numbers, of any shape.
 
     Raises:
-        ValueError: One is not finite, negative, or zero where it may not be.
+        ValueError: A number is not finite, is negative, or is 0 if that is not allowed.
     """
     positive = name in _POSITIVE
     valid = np.isfinite(values) & ((values > 0) if positive else (values >= 0))

@@ -87,6 +87,10 @@ class RobotSpec:
         substeps: Physics steps in a control step [-].
         gravity: Downward acceleration [m/s^2].
         material: Softness of contacts and limits.
+
+    Raises:
+        TypeError: ``original_names`` is given; it has moved to
+            ``newton_qd.brax_views``.
     """
 
     name: str

@@ -121,7 +121,7 @@ def _check_limits(kind: type[DescriptorWrapper]) -> None:
     """Checks the limits of a class.
 
     Raises:
-        ValueError: They are none.
+        ValueError: They are missing, or not two rows of numbers, lowest first.
     """
     limits = getattr(kind, "limits", None)
     try:

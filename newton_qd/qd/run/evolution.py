@@ -88,7 +88,7 @@ def evolve(
     Args:
         config: Settings.
         out: Results folder to create; ``None`` writes no files.
-        resume: Continue the run in ``out``; starts it if there is none yet.
+        resume: Whether to continue the run in ``out``. Without a run, a new one starts.
         progress: Whether to show progress on standard error.
         tensorboard: Whether to write the metrics for TensorBoard too.
         checkpoint_seconds: Shortest time between two checkpoints [s]. It does not
