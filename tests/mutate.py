@@ -55,7 +55,7 @@ MUTATIONS = {
     ),
     # an adjoint has the wrong sign
     "adjoint": Mutation(
-        "physics/kernels/cpp/algebra.py",
+        "physics/kernels/cpp/operators.py",
         '"Real x = adj_RET / B; adj_A += x; adj_B -= x * RET;"',
         '"Real x = adj_RET / B; adj_A += x; adj_B += x * RET;"',
         "test_algebra.py",
@@ -90,7 +90,7 @@ MUTATIONS = {
     ),
     # of the individuals of a cell only the first counts
     "ties": Mutation(
-        "qd/run/search.py",
+        "qd/run/generation.py",
         "fitnesses[order][1:] == fitnesses[order][:-1]",
         "fitnesses[order][1:] >= fitnesses[order][:-1]",
         "test_evolve.py",
@@ -102,11 +102,11 @@ MUTATIONS = {
         "factors[:: self.window + 1] = 0.0",
         "test_episode_gradients.py",
     ),
-    # a robot is scaled by the wrong weight
-    "registry": Mutation(
+    # an offset is not the one that was measured
+    "offset": Mutation(
         "tasks.py",
-        "reward_offset=offsets[0]",
-        "reward_offset=offsets[1]",
+        '"ant_uni": _uni(Ant, "ant", (4.35, 3.24))',
+        '"ant_uni": _uni(Ant, "ant", (4.53, 3.24))',
         "test_survey.py",
     ),
 }
