@@ -81,11 +81,11 @@ MUTATIONS = {
         "return folded_sum(data.state_desc, 1)",
         "test_extractors.py",
     ),
-    # a fault is forgotten by the next step
+    # a world at fault goes on
     "fault": Mutation(
         "envs/base.py",
-        'fault = jnp.maximum(state.info["fault"], fault)',
-        "fault = 1 * fault",
+        "done=jnp.where(faulty, jnp.ones_like(done), done)",
+        "done=done",
         "test_bad_input.py",
     ),
     # of the individuals of a cell only the first counts
