@@ -183,7 +183,7 @@ class SystemView:
     def default_angle(self) -> jax.Array:
         """Returns the joint angles (num_joint_dof,) of the default pose [rad].
 
-        They are in the order of the URDF file, joint by joint.
+        They are in depth-first order along the tree of links, joint by joint.
         """
         system = self._system
         q, _ = joint_indices(system)

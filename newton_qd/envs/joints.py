@@ -39,7 +39,7 @@ def joint_chains(system: System) -> list[list[int]]:
 def joint_indices(system: System) -> tuple[np.ndarray, np.ndarray]:
     """Returns coordinates (n,) and degrees of freedom (n,) of the axes of all joints.
 
-    They are in the order of the URDF file, joint by joint.
+    They are in depth-first order along the tree of links, joint by joint.
     """
     axes = [axis for chain in joint_chains(system) for axis in chain]
     q, v = system.q_start[axes], system.v_start[axes]
