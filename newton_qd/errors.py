@@ -26,7 +26,7 @@ class UnknownEnvironment(NotImplementedError):  # noqa: N818 - a name, not an ev
 
 
 class FaultError(FloatingPointError):
-    """A world was frozen because a value was not finite or a speed was too high."""
+    """A world has a fault, or a value of its state is not finite."""
 
 
 class MissingExtra(ImportError):  # noqa: N818 - likewise

@@ -141,6 +141,32 @@ def test_a_pose_of_ones_own(page: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize(
+    ("part", "words"),
+    [
+        ("reward", "^reward not finite: world 1; no fault, so not frozen$"),
+        ("obs", "^obs not finite: world 1; no fault, so not frozen$"),
+        ("state_descriptor", "^state descriptor not finite: world 1; no fault"),
+    ],
+)
+def test_check_names_what_is_not_finite(part: str, words: str) -> None:
+    fields = {"obs": jnp.zeros((3, 2)), "reward": jnp.zeros(3)}
+    info = {"fault": jnp.zeros(3, int), "state_descriptor": jnp.zeros((3, 2))}
+    held = info if part in info else fields
+    held[part] = held[part].at[1].set(jnp.nan)
+    state = nq.State(
+        pipeline_state=None, done=jnp.zeros(3), metrics={}, info=info, **fields
+    )
+    with pytest.raises(newton_qd.FaultError, match=words):
+        nq.check(state)
+    info["fault"] = jnp.array([1, 1, 0])
+    with pytest.raises(
+        newton_qd.FaultError, match=r"^at fault: world 0, world 1; f"
+    ) as e:
+        nq.check(state)
+    assert "no fault" not in str(e.value)
+
+
+@pytest.mark.parametrize(
     ("method", "returned", "error", "message"),
     [
         (

@@ -178,6 +178,35 @@ def test_a_run_in_which_everything_is_faulty_ends() -> None:
         )
 
 
+@pytest.mark.parametrize(
+    ("part", "words"),
+    [
+        (
+            "reward",
+            "return is not finite in 16, the descriptor is not finite in 0,",
+        ),
+        ("descriptor", "return is not finite in 0, the descriptor is not finite in 1"),
+    ],
+)
+def test_a_search_error_says_what_is_not_finite(part: str, words: str) -> None:
+    class Undefined(PointEnv):
+        def step(self, state: Any, action: Any) -> Any:
+            after = super().step(state, action)
+            lost = after.reward * (jnp.nan if part == "reward" else 1)
+            return dataclasses.replace(after, reward=lost)
+
+    def task(config: Any) -> Any:
+        made = point_task(config, Undefined())
+        if part == "reward":
+            return made
+        return dataclasses.replace(
+            made, descriptor_extractor=lambda data, mask: data.state_desc[:, 0] / 0 * 0
+        )
+
+    with pytest.raises(SearchError, match=words):
+        evolve(SMALL, progress=False, task_factory=task)
+
+
 def test_descriptors_out_of_bounds_go_to_the_nearest_cell() -> None:
     class Narrow(PointEnv):
         pass

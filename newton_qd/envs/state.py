@@ -104,12 +104,15 @@ def per_world(read: Callable[[Any], Tree], state: State) -> Tree:
 def check(state: State) -> None:
     """Raises an error if a world has a fault; call it outside ``jax.jit``.
 
+    The physics freezes a world with a fault. It does not freeze a world for a reward,
+    an observation or a state descriptor that is not finite. The error names these too.
+
     Args:
         state: State of one world or of any batch.
 
     Raises:
-        FaultError: A world has a fault. The error names the worlds, and their steps if
-            ``info`` has them.
+        FaultError: A world has a fault, or a value of its state is not finite. The
+            error names the worlds, and their steps if ``info`` has them.
         TypeError: ``state`` is traced.
     """
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(state)):
@@ -120,20 +123,45 @@ def check(state: State) -> None:
         raise TypeError(message("state", Fact("traced values"), allowed))
     info: Mapping[str, Any] = state.info
     faulty = np.asarray(info["fault"]) != 0
-    for leaf in jax.tree.leaves((state.pipeline_state, state.obs, state.reward)):
-        finite = np.isfinite(np.asarray(leaf)).reshape((*faulty.shape, -1))
-        faulty = faulty | ~finite.all(axis=-1)
-    worlds = [tuple(int(i) for i in world) for world in np.argwhere(faulty)]
-    if not worlds:
-        return
     steps = np.asarray(info["steps"]) if "steps" in info else None
+    found = []
+    if faulty.any():
+        found.append(
+            f"at fault: {_named(faulty, steps)}; frozen there with reward 0 and done 1 "
+            "(an action or a state that is not finite, or a step that diverged)"
+        )
+    parts = {
+        "state of the physics": state.pipeline_state,
+        "reward": state.reward,
+        "obs": state.obs,
+        "state descriptor": info.get("state_descriptor"),
+    }
+    for name, part in parts.items():
+        wrong = _not_finite(part, faulty.shape) & ~faulty
+        if wrong.any():
+            found.append(
+                f"{name} not finite: {_named(wrong, steps)}; no fault, so not frozen"
+            )
+    if found:
+        raise FaultError(". ".join(found))
+
+
+def _not_finite(part: Any, worlds: tuple[int, ...]) -> np.ndarray:
+    """Returns which worlds have a value that is not finite, of the shape ``worlds``."""
+    found = np.zeros(worlds, bool)
+    for leaf in jax.tree.leaves(part):
+        finite = np.isfinite(np.asarray(leaf)).reshape((*worlds, -1))
+        found = found | ~finite.all(axis=-1)
+    return found
+
+
+def _named(chosen: np.ndarray, steps: np.ndarray | None) -> str:
+    """Returns the text of the chosen worlds, at most 8 of them by name."""
+    worlds = [tuple(int(i) for i in world) for world in np.argwhere(chosen)]
     named = []
     for world in worlds[:8]:
         index = world[0] if len(world) == 1 else world
         at = "" if steps is None else f" at step {int(steps[world])}"
         named.append(f"world {index}{at}" if world else f"the world{at}")
     more = f" and {len(worlds) - 8} more" if len(worlds) > 8 else ""
-    raise FaultError(
-        f"at fault: {', '.join(named)}{more}; frozen there with reward 0 and done 1 "
-        "(an action or a state that is not finite, or a step that diverged)"
-    )
+    return f"{', '.join(named)}{more}"

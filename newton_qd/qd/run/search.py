@@ -23,6 +23,7 @@ from newton_qd.qd.run.folder import COLUMNS
 from newton_qd.qd.run.generation import Generation
 from newton_qd.qd.run.reevaluation import Reevaluated, reevaluate
 from newton_qd.qd.scoring.rollout import (
+    episode_of,
     make_policy,
     make_scoring_function,
 )
@@ -161,12 +162,25 @@ class Search:
             **{name: float(value) for name, value in metrics.items()},
         }
         if row["coverage"] == 0:
-            raise SearchError(
-                "no individual of the initial population has a finite return and "
-                "descriptor: the environment is faulty for every one of them"
-            )
+            raise SearchError(self._emptiness(genotypes))
         rows = np.vstack([state.metrics, [row[name] for name in COLUMNS]])
         return SearchState(iteration, repertoire, rows, emitter)
+
+    def _emptiness(self, genotypes: jax.Array) -> str:
+        """Returns the text of the error about genotypes that no archive takes."""
+        # scores do not say why: the fitness is -inf for all reasons
+        length = self._config.episode_length
+        episode = episode_of(self._task, self._policy, length)
+        found = jax.jit(jax.vmap(episode, (0, None)))(genotypes, self._key_reset)
+        returns = ~np.isfinite(found.fitness)
+        descriptors = ~np.isfinite(found.descriptor).all(axis=-1)
+        faults = np.asarray(found.faulty) & ~returns & ~descriptors
+        return (
+            "no individual of the initial population has a finite return and "
+            f"descriptor: of {len(returns)} individuals, the return is not finite in "
+            f"{returns.sum()}, the descriptor is not finite in {descriptors.sum()}, "
+            f"and the physics had a fault in {faults.sum()}"
+        )
 
     def checkpoint(self, state: SearchState) -> Checkpoint:
         """Copies a state to the host."""
