@@ -226,6 +226,10 @@ BAD_ROWS = {
         changed(contacts=(Contact("x"),), feet=()),
         f"contacts: got 'x'.* {LINKS}",
     ),
+    "contact of a foot": (
+        changed(contacts=(Contact("foot_x", 1), *ANT.contacts[1:])),
+        f"contacts: got 'foot_x'.* {LINKS}",
+    ),
     "actuator": (changed(actuators=(("x", 1.0),)), f"actuators: got 'x'.* {JOINTS}"),
     "unnamed": (changed(actuators=(("", 1.0),)), f"actuators: got ''.* {JOINTS}"),
     "rest": (changed(rest_pose=(("x", 1.0),)), f"rest_pose: got 'x'.* {JOINTS}"),
@@ -340,6 +344,17 @@ def test_rest_height_without_a_height(tmp_path: Path) -> None:
     assert build_system(row(path, "arm"), "float32").rest_q.tolist() == [0.0]
     with pytest.raises(RobotDescriptionError, match="no coordinate raises the torso"):
         build_system(row(path, "arm", rest_height=1.0), "float32")
+
+
+def test_actuators_of_fixed_joints(tmp_path: Path) -> None:
+    text = f"""<robot name="stiff">{link("body")}{link("arm")}<link name="hand"/>
+    {joint("elbow", "revolute", "body", "arm")}
+    {joint("wrist", "fixed", "arm", "hand")}</robot>"""
+    robot = row(write(tmp_path, text), "body", actuators=(("wrist", 1.0),))
+    with pytest.raises(
+        RobotDescriptionError, match=r"got 'wrist', which is fixed; allowed: elbow$"
+    ):
+        build_system(robot, "float32")
 
 
 def test_missing_file(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from newton_qd.physics.model.contacts import body_of, contact_tables, pair_share
 from newton_qd.physics.model.description import Body, Description, read_description
 from newton_qd.physics.model.elements import UNLIMITED, Shape
 from newton_qd.physics.model.rest import rest_coordinates
-from newton_qd.physics.model.robot_checks import check_robot, index_of
+from newton_qd.physics.model.robot_checks import check_robot, index_of, refusal
 from newton_qd.physics.model.scene import obstacle_tables, read_scene
 from newton_qd.physics.model.verify import BuiltModel, ModelMismatchError, verify
 from newton_qd.physics.model.xml_reader import IDENTITY, RobotDescriptionError
@@ -157,7 +157,13 @@ def _read_newton(model: newton.Model, description: Description) -> BuiltModel:
     )
 
 
-def _control(robot: RobotSpec, built: BuiltModel) -> dict[str, np.ndarray]:
+def _control(
+    robot: RobotSpec, built: BuiltModel, fixed: tuple[str, ...]
+) -> dict[str, np.ndarray]:
+    for joint, _ in robot.actuators:
+        if joint in fixed:
+            allowed = listed([name for name in built.joint_names if name])
+            raise refusal(robot, "actuators", joint, allowed, why="which is fixed")
     joints = [
         index_of(robot, "actuators", joint, built.joint_names)
         for joint, _ in robot.actuators
@@ -238,7 +244,10 @@ def build_system(robot: RobotSpec, dtype: str, scene: Scene | None = None) -> Sy
     bodies = [description.bodies[name] for name in built.body_names]
     links = () if scene is None else read_scene(scene)
     still = description.still | {link.name: link.frame for link in links}
-    control, obstacles = _control(robot, built), obstacle_tables(links)
+    control, obstacles = (
+        _control(robot, built, description.fixed),
+        obstacle_tables(links),
+    )
     total_mass = sum(body.link.mass for body in bodies)
     weight = total_mass * (robot.gravity or _EARTH_GRAVITY)
     material = robot.material
@@ -253,6 +262,7 @@ def build_system(robot: RobotSpec, dtype: str, scene: Scene | None = None) -> Sy
         q_start=built.q_start,
         v_start=built.v_start,
         contact_stiffness=weight / (material.support * material.static_penetration),
+        **contact_tables(robot, scene, bodies, len(obstacles["obstacle_kind"])),
         feet=np.array(
             [body_of(robot, "feet", foot, bodies) for foot in robot.feet],
             dtype=np.int32,
@@ -264,7 +274,6 @@ def build_system(robot: RobotSpec, dtype: str, scene: Scene | None = None) -> Sy
         **_body_arrays(bodies),
         **_dof_arrays(robot, built, bodies, control),
         **control,
-        **contact_tables(robot, scene, bodies, len(obstacles["obstacle_kind"])),
         **obstacles,
         scene_links=tuple(still),
         scene_frames=np.array(list(still.values())).reshape(-1, 7),

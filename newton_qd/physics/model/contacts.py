@@ -10,7 +10,7 @@ from newton_qd.checks import Fact, listed
 from newton_qd.physics import reference
 from newton_qd.physics.model.description import Body
 from newton_qd.physics.model.elements import Shape
-from newton_qd.physics.model.robot_checks import index_of, refusal
+from newton_qd.physics.model.robot_checks import check_feet, index_of, refusal
 from newton_qd.physics.model.scene import (
     TOUCHING,
     ContactRow,
@@ -127,6 +127,8 @@ def contact_tables(
         RobotDescriptionError: A row names links or colliders that are not there.
     """
     rows = list(_ground_contacts(robot, bodies))
+    # after the contacts: a foot may lack its contact because of a typo in the contact
+    check_feet(robot)
     if scene is not None:
         colliders = {
             name: (i, tuple(shape for shape in body.shapes if shape.link == name))

@@ -62,6 +62,7 @@ class Description:
         floating: Whether the root link moves freely.
         bodies: By name, parents first, in depth-first order.
         still: Frames (7,) in the world of the links that are fixed to it.
+        fixed: Names of the fixed joints.
     """
 
     path: Path
@@ -69,6 +70,7 @@ class Description:
     floating: bool
     bodies: dict[str, Body]
     still: dict[str, np.ndarray]
+    fixed: tuple[str, ...]
 
 
 def read_joints(reader: XmlReader, links: dict[str, Link]) -> dict[str, list[Joint]]:
@@ -205,4 +207,7 @@ def read_description(path: Path) -> Description:
     if not bodies:
         raise reader.error(reader.root, "nothing in it moves")
     _check_masses(path, bodies)
-    return Description(path, reader.root.get("name", ""), floating, bodies, still)
+    joints = [joint for found in children.values() for joint in found]
+    fixed = tuple(joint.name for joint in joints if joint.kind == "fixed")
+    name = reader.root.get("name", "")
+    return Description(path, name, floating, bodies, still, fixed)

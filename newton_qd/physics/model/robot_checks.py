@@ -174,6 +174,14 @@ def check_robot(robot: RobotSpec) -> None:
     _check_unique(robot, "rest_pose", [joint for joint, _ in robot.rest_pose])
     _check_unique(robot, "feet", list(robot.feet))
     _check_unique(robot, "pairs", [_pair_name(pair) for pair in robot.pairs])
+
+
+def check_feet(robot: RobotSpec) -> None:
+    """Checks that each foot has a contact; the contacts are checked before.
+
+    Raises:
+        RobotDescriptionError: A foot has no contact.
+    """
     touching = {contact.link for contact in robot.contacts}
     for foot in robot.feet:
         if foot not in touching:
