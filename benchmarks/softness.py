@@ -59,7 +59,7 @@ def main() -> None:
             env = newton_qd.create(
                 name, episode_length=None, auto_reset=False, dtype="float64"
             )
-            envs = soft_to_stiff(env, FACTORS)
+            envs: Any = soft_to_stiff(env, FACTORS)
             reached = [torso(soft, 1.0) for soft in envs]
         for factor, soft, where in zip(FACTORS, envs, reached, strict=True):
             report = newton_qd.diagnose_gradients(

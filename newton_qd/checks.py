@@ -10,18 +10,27 @@ from __future__ import annotations
 import math
 import numbers
 from collections.abc import Collection
-from typing import TYPE_CHECKING, Any, TypeGuard
+from typing import TYPE_CHECKING, Any, Protocol, TypeGuard
 
 import numpy as np
 
 if TYPE_CHECKING:
     import jax
+    from numpy.typing import DTypeLike
 
 _LONGEST = 100  # characters of a value in an error
 _MOST = 2**31 - 1  # JAX counts in 32 bits
 _FLOATS = ("float32", "float64")
 
 Error = type[Exception]
+
+
+class _Array(Protocol):
+    @property
+    def shape(self) -> tuple[int, ...]: ...
+
+    @property
+    def dtype(self) -> object: ...
 
 
 class Fact(str):
@@ -31,7 +40,7 @@ class Fact(str):
     __repr__ = str.__str__
 
 
-def message(name: str, value: Any, allowed: str, *, why: str = "") -> str:
+def message(name: str, value: object, allowed: str, *, why: str = "") -> str:
     """Returns the text of an error about an argument.
 
     Args:
@@ -44,7 +53,7 @@ def message(name: str, value: Any, allowed: str, *, why: str = "") -> str:
     return f"{name}: got {got}; allowed: {allowed}"
 
 
-def shown(value: Any) -> str:
+def shown(value: object) -> str:
     """Returns the text of a value in errors: the shape of an array, long text cut."""
     if isinstance(value, Fact):
         return value
@@ -58,12 +67,12 @@ def shown(value: Any) -> str:
     return f"{cut} ({type(value).__name__})"
 
 
-def listed(names: Collection[Any], otherwise: str = "none") -> str:
+def listed(names: Collection[object], otherwise: str = "none") -> str:
     """Returns the text of a list of names in errors; ``otherwise`` if it is empty."""
     return ", ".join(str(name) for name in names) or otherwise
 
 
-def is_array(value: Any) -> bool:
+def is_array(value: object) -> TypeGuard[_Array]:
     """Returns whether a value is an array of NumPy or JAX, traced or not."""
     if isinstance(value, (type, np.generic)):
         return False
@@ -82,7 +91,7 @@ def is_integer(value: object) -> TypeGuard[int]:
 
 def number(
     name: str,
-    value: Any,
+    value: object,
     *,
     least: float | None = None,
     above: float | None = None,
@@ -131,7 +140,7 @@ def number(
 
 def integer(
     name: str,
-    value: Any,
+    value: object,
     *,
     least: int | None = 1,
     most: int | None = _MOST,
@@ -166,22 +175,23 @@ def integer(
     raise error(message(name, value, allowed))
 
 
-def interval(name: str, value: Any, *, error: Error | None = None) -> None:
+def interval(name: str, value: object, *, error: Error | None = None) -> None:
     """Checks that a value is two numbers, the first below the second.
 
     Raises:
         TypeError: The value is not two numbers.
         ValueError: The first is not below the second.
     """
-    pair = isinstance(value, (tuple, list, np.ndarray)) and len(value) == 2
-    numeric = pair and all(is_number(end) for end in value)
-    if not numeric or not value[0] < value[1]:
+    ends: Any = value
+    pair = isinstance(ends, (tuple, list, np.ndarray)) and len(ends) == 2
+    numeric = pair and all(is_number(end) for end in ends)
+    if not numeric or not ends[0] < ends[1]:
         raise (error or (ValueError if numeric else TypeError))(
             message(name, value, "two numbers, lowest below highest")
         )
 
 
-def flag(name: str, value: Any, *, error: Error = TypeError) -> None:
+def flag(name: str, value: object, *, error: Error = TypeError) -> None:
     """Checks that a value is ``True``, ``False``, 1 or 0.
 
     Raises:
@@ -192,7 +202,7 @@ def flag(name: str, value: Any, *, error: Error = TypeError) -> None:
 
 
 def text(
-    name: str, value: Any, *, optional: bool = False, error: Error = ValueError
+    name: str, value: object, *, optional: bool = False, error: Error = ValueError
 ) -> None:
     """Checks that a value is text and not empty.
 
@@ -205,7 +215,7 @@ def text(
 
 def instance(
     name: str,
-    value: Any,
+    value: object,
     kinds: type | tuple[type, ...],
     allowed: str,
     *,
@@ -229,7 +239,7 @@ def instance(
         raise (error or TypeError)(message(name, value, _none(optional) + allowed))
 
 
-def function(name: str, value: Any, allowed: str, *, optional: bool = False) -> None:
+def function(name: str, value: object, allowed: str, *, optional: bool = False) -> None:
     """Checks that a value can be called.
 
     Raises:
@@ -239,7 +249,7 @@ def function(name: str, value: Any, allowed: str, *, optional: bool = False) -> 
         raise TypeError(message(name, value, _none(optional) + allowed))
 
 
-def environment(value: Any, *, needs: str = "step") -> None:
+def environment(value: object, *, needs: str = "step") -> None:
     """Checks that ``env`` is an environment: it must have the attribute ``needs``.
 
     Raises:
@@ -249,7 +259,7 @@ def environment(value: Any, *, needs: str = "step") -> None:
         raise TypeError(message("env", value, "an environment, as create() makes it"))
 
 
-def precision(dtype: Any) -> np.dtype:
+def precision(dtype: DTypeLike) -> np.dtype:
     """Returns the dtype of a simulation.
 
     Raises:
@@ -287,7 +297,7 @@ def array(
     name: str,
     value: object,
     shape: tuple[int, ...],
-    dtype: Any,
+    dtype: DTypeLike,
     *,
     scalars: bool = False,
 ) -> jax.Array:

@@ -5,10 +5,9 @@ from __future__ import annotations
 import importlib
 import warnings
 from collections.abc import Mapping
-from typing import Any
 
 
-def moved_name(module: str, name: str, moved: Mapping[str, str]) -> Any:
+def moved_name(module: str, name: str, moved: Mapping[str, str]) -> object:
     """Returns the object with an old name, for the ``__getattr__`` of a module.
 
     Args:

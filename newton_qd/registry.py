@@ -58,7 +58,7 @@ def register(
     descriptor_extractor: DescriptorExtractor | None = None,
     reward_offset: float | None = None,
     robot: RobotSpec | None = None,
-    **options: Any,
+    **options: object,
 ) -> None:
     """Adds an environment to the names that ``create`` knows.
 
@@ -176,10 +176,10 @@ def create(
     batch_size: int | None = None,
     eval_metrics: bool = False,
     fixed_init_state: bool = False,
-    qdax_wrappers_kwargs: Sequence[Mapping[str, Any]] | None = None,
+    qdax_wrappers_kwargs: Sequence[Mapping[str, object]] | None = None,
     material: Material | None = None,
     brax_views: bool = False,
-    **kwargs: Any,
+    **kwargs: object,
 ) -> Env:
     """Builds an environment by its name.
 

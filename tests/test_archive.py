@@ -43,6 +43,7 @@ def test_an_archive_that_was_written_once_can_be_read() -> None:
     assert np.array_equal(
         distance.argmin(1)[archive.filled], np.flatnonzero(archive.filled)
     )
+    facts: Any
     config, facts = read_config(STORED / "config.json")
     assert (config.env_name, config.hidden, config.grid) == ("point", (4,), (4, 4))
     assert facts["packages"]["newton_qd"] == "0.1.0"

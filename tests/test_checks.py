@@ -204,6 +204,7 @@ def test_arrays_are_strongly_typed() -> None:
 def test_precision(x64: None) -> None:
     assert checks.precision("float64") == np.float64
     assert checks.precision(np.float32) == np.float32
+    wrong: Any
     for wrong in ("float16", "foo", 3, int):
         with pytest.raises(ValueError, match=r"^dtype: got .*;.*float32, float64"):
             checks.precision(wrong)

@@ -415,7 +415,7 @@ def test_smooth_descriptor_leaves_the_environment_as_it_was() -> None:
     assert readings[1].all()
     for name in ("ant_omni", "pointmaze"):
         other = newton_qd.create(name)
-        same = with_smooth_descriptor(other)
+        same: Any = with_smooth_descriptor(other)
         assert same.state_descriptor_name == "xy_position"
     with pytest.raises(ValueError, match=r"width: got 0.*above 0"):
         with_smooth_descriptor(env, 0.0)

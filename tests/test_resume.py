@@ -328,6 +328,7 @@ def test_another_machine_is_noticed(
 
 
 def test_a_config_file_returns_the_settings(reference: Path) -> None:
+    facts: Any
     config, facts = read_config(reference / "config.json")
     assert config == SMALL
     assert facts["packages"]["jax"] == jax.__version__

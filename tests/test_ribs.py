@@ -198,13 +198,13 @@ def test_what_cannot_be_converted(monkeypatch: pytest.MonkeyPatch) -> None:
         SlidingBoundariesArchive,
     )
 
-    archive = ProximityArchive(
+    archive: Any = ProximityArchive(
         solution_dim=2, measure_dim=2, k_neighbors=1, novelty_threshold=0.1
     )
     with pytest.raises(TypeError, match="archive: got ProximityArchive; allowed: Gr"):
         from_ribs(archive)
     ranges: Any = [(0, 1), (0, 1)]
-    sliding = SlidingBoundariesArchive(solution_dim=2, dims=(4, 4), ranges=ranges)
+    sliding: Any = SlidingBoundariesArchive(solution_dim=2, dims=(4, 4), ranges=ranges)
     with pytest.raises(TypeError, match="archive: got SlidingBoundariesArchive; al"):
         from_ribs(sliding)
     matrices = GridArchive(solution_dim=(2, 3), dims=(4, 4), ranges=ranges)

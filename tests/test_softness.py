@@ -30,6 +30,8 @@ def test_create_takes_a_material() -> None:
 
 def test_soft_to_stiff() -> None:
     env: Any = newton_qd.create("hopper_uni", fixed_init_state=True)
+    soft: Any
+    stiff: Any
     soft, stiff = soft_to_stiff(env, (3.0, 1.0))
     assert stiff.unwrapped.robot.material == env.unwrapped.robot.material
     material, reference = soft.unwrapped.robot.material, HOPPER.material

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 
 from newton_qd import registry, tables
 from newton_qd.compat.scoring import (
+    PolicyNetwork,
     default_task,
     evaluate,
     get_mask_from_transitions,
@@ -20,6 +21,9 @@ from newton_qd.compat.scoring import (
 from newton_qd.envs.base import Env
 from newton_qd.envs.state import State
 from newton_qd.types import DescriptorExtractor, ExtraScores, Genotype, PyTree, RNGKey
+
+if TYPE_CHECKING:
+    from qdax.core.neuroevolution.networks.networks import MLP
 
 __all__ = [
     "create",
@@ -197,7 +201,7 @@ def _reset(
 
 def create_brax_scoring_fn(
     env: Env,
-    policy_network: Any,
+    policy_network: PolicyNetwork,
     bd_extraction_fn: DescriptorExtractor,
     random_key: jax.Array,
     play_step_fn: Callable[..., tuple] | None = None,
@@ -242,7 +246,7 @@ def create_default_brax_task_components(
     episode_length: int = 100,
     mlp_policy_hidden_layer_sizes: tuple[int, ...] = (64, 64),
     deterministic: bool = True,
-) -> tuple[Env, Any, ScoringFunction, jax.Array]:
+) -> tuple[Env, MLP, ScoringFunction, jax.Array]:
     """Makes environment, policy and scoring function of a task.
 
     Args:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -14,11 +14,22 @@ from newton_qd.envs.state import State
 from newton_qd.extractors import folded_sum
 from newton_qd.types import DescriptorExtractor, ExtraScores, Genotype, PyTree, RNGKey
 
+if TYPE_CHECKING:
+    from qdax.core.neuroevolution.networks.networks import MLP
+
 Scores = tuple[jax.Array, jax.Array, ExtraScores]
 
 
+class PolicyNetwork(Protocol):
+    """A policy that gets its parameters as an argument, such as a module of Flax."""
+
+    def apply(self, variables: PyTree, obs: jax.Array, /) -> PyTree:
+        """Returns the actions for observations."""
+        ...
+
+
 def make_policy_network_play_step_fn_brax(
-    env: Env, policy_network: Any
+    env: Env, policy_network: PolicyNetwork
 ) -> Callable[[State, Genotype, RNGKey], tuple[State, Genotype, RNGKey, PyTree]]:
     """Makes the function of one step with a policy.
 
@@ -123,7 +134,7 @@ def reset_function(
 
 def default_task(
     env_name: str, episode_length: int, hidden: tuple[int, ...]
-) -> tuple[Env, Any]:
+) -> tuple[Env, MLP]:
     """Makes an environment, and QDax's default perceptron for it."""
     from qdax.core.neuroevolution.networks.networks import MLP
 

@@ -13,7 +13,7 @@ from jax.core import Tracer
 
 from newton_qd.checks import Fact, message
 from newton_qd.errors import FaultError
-from newton_qd.types import Info, Metrics, Observation
+from newton_qd.types import Info, Metrics, Observation, PyTree
 
 Tree = TypeVar("Tree")
 
@@ -50,7 +50,7 @@ class State:
             """
             raise AttributeError(no_brax_view(self, name, ("qp", "system")))
 
-    def replace(self, **changes: Any) -> State:
+    def replace(self, **changes: object) -> State:
         """Returns a copy with some fields replaced."""
         return dataclasses.replace(self, **changes)
 
@@ -86,7 +86,7 @@ def select(condition: jax.Array, chosen: Tree, other: Tree) -> Tree:
     return jax.tree.map(leaf, chosen, other)
 
 
-def per_world(read: Callable[[Any], Tree], state: State) -> Tree:
+def per_world(read: Callable[[PyTree], Tree], state: State) -> Tree:
     """Applies a function to the simulation state of every world.
 
     Args:

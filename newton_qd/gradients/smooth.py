@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from typing import Any
 
 from newton_qd import checks
 from newton_qd.envs.base import Env
@@ -13,7 +12,7 @@ from newton_qd.wrappers.base import Wrapper
 
 def with_smooth_descriptor(
     env: Env, width: float = 0.02, straight_through: bool = False
-) -> Any:
+) -> Env:
     """Returns the environment with a state descriptor that has a gradient.
 
     Feet contact becomes smooth, and so does the feet-contact proportion of an episode.

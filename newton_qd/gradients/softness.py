@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
 
 from newton_qd import checks
 from newton_qd.checks import Fact, message
@@ -37,7 +36,7 @@ def softened(material: Material, factor: float) -> Material:
     return dataclasses.replace(material, **changes)
 
 
-def soft_to_stiff(env: Env, factors: Sequence[float] = (4, 2, 1)) -> tuple[Any, ...]:
+def soft_to_stiff(env: Env, factors: Sequence[float] = (4, 2, 1)) -> tuple[Env, ...]:
     """Returns the environment with several degrees of softness, for a continuation.
 
     Optimize in the first environment. Start the next one from the result, and so on.

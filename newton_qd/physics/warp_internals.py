@@ -12,9 +12,11 @@ import importlib
 from collections.abc import Callable
 from importlib import metadata
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeVar
 
 import warp as wp
+
+FunctionT = TypeVar("FunctionT")
 
 # Module that calls Python from XLA: since Warp 1.14, since 1.10, and before.
 _FFI = (
@@ -80,7 +82,7 @@ def ffi_module() -> ModuleType:
     return _module_with("FfiCallable.ffi_callback", _FFI)
 
 
-def ffi_callback() -> Callable[..., Any]:
+def ffi_callback() -> Callable[..., object]:
     """The method that XLA enters Python by, when it runs a ``wp.jax_callable``.
 
     Raises:
@@ -108,7 +110,7 @@ def tape_is_recording() -> bool:
     return module.runtime.tape is not None
 
 
-def field_dtype(struct: Any, name: str) -> Any:
+def field_dtype(struct: Any, name: str) -> type:
     """Type of the elements of an array in a struct.
 
     Args:
@@ -126,7 +128,7 @@ def field_dtype(struct: Any, name: str) -> Any:
     return struct.vars[name].type.dtype
 
 
-def never_replay(function: Any) -> Any:
+def never_replay(function: FunctionT) -> FunctionT:
     """Keep the adjoint of a caller from calling a function again for its results.
 
     Args:
@@ -141,5 +143,6 @@ def never_replay(function: Any) -> Any:
     """
     if not _has(function, "skip_replay"):
         raise _unsupported("skip_replay", (type(function).__qualname__,))
-    function.skip_replay = True
+    marked: Any = function
+    marked.skip_replay = True
     return function

@@ -10,7 +10,7 @@ import platform
 import tomllib
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from newton_qd import checks
 from newton_qd.checks import Fact, listed, message
@@ -143,7 +143,7 @@ class EvolveConfig:
             raise ConfigError(message("grid", given, allowed))
         return self
 
-    def replace(self, **changes: Any) -> EvolveConfig:
+    def replace(self, **changes: object) -> EvolveConfig:
         """Returns a copy with some settings changed.
 
         Raises:
@@ -155,7 +155,7 @@ class EvolveConfig:
             raise ConfigError(message("setting", unknown[0], listed(sorted(known))))
         return dataclasses.replace(self, **changes)
 
-    def differences(self, other: EvolveConfig) -> list[tuple[str, Any, Any]]:
+    def differences(self, other: EvolveConfig) -> list[tuple[str, object, object]]:
         """Lists ``(name, own value, other's value)`` of settings that differ."""
         pairs = (
             (field.name, getattr(self, field.name), getattr(other, field.name))
@@ -181,7 +181,9 @@ def _pairs(options: Any) -> tuple[tuple[str, Any], ...]:
     return tuple(sorted(pairs.items()))
 
 
-def check_integer(name: str, value: Any, least: int, most: int | None = None) -> None:
+def check_integer(
+    name: str, value: object, least: int, most: int | None = None
+) -> None:
     """Checks that a value is a Python integer within bounds.
 
     Raises:
@@ -192,18 +194,18 @@ def check_integer(name: str, value: Any, least: int, most: int | None = None) ->
     checks.instance(name, value, int, "integers of Python", error=ConfigError)
 
 
-def check_integers(name: str, values: Any) -> None:
+def check_integers(name: str, values: object) -> None:
     """Checks that values are a tuple of integers of at least 1.
 
     Raises:
         ConfigError: The values are not such a tuple.
     """
     checks.instance(name, values, tuple, "a tuple of integers", error=ConfigError)
-    for index, value in enumerate(values):
+    for index, value in enumerate(cast("tuple[object, ...]", values)):
         check_integer(f"{name}[{index}]", value, 1)
 
 
-def environment_facts() -> dict[str, Any]:
+def environment_facts() -> dict[str, object]:
     """Returns versions and machine data that a bit-exact repetition of a run needs."""
     import jax
 
@@ -223,7 +225,7 @@ def _version(package: str) -> str | None:
         return None
 
 
-def config_to_json(config: EvolveConfig, facts: dict[str, Any]) -> str:
+def config_to_json(config: EvolveConfig, facts: dict[str, object]) -> str:
     """Returns settings and the facts of the machine as readable JSON."""
     document = {
         "format": FORMAT,
@@ -245,7 +247,7 @@ def equal_settings(one: str, other: str) -> bool:
 
 def read_config(
     path: Path, env_name: str | None = None
-) -> tuple[EvolveConfig, dict[str, Any]]:
+) -> tuple[EvolveConfig, dict[str, object]]:
     """Reads a ``config.json``, or settings in a TOML file.
 
     Args:
@@ -295,11 +297,15 @@ def read_config(
 
 
 def changed_facts(
-    old: dict[str, Any], new: dict[str, Any]
-) -> Iterable[tuple[str, Any, Any]]:
+    old: dict[str, object], new: dict[str, object]
+) -> Iterable[tuple[str, object, object]]:
     """Yields ``(name, old, new)`` of machine facts that differ between two runs."""
-    old_flat = {**old, **old.get("packages", {})}
-    new_flat = {**new, **new.get("packages", {})}
+    old_flat = {**old, **_packages(old)}
+    new_flat = {**new, **_packages(new)}
     for name in new_flat:
         if name != "packages" and old_flat.get(name) != new_flat[name]:
             yield name, old_flat.get(name), new_flat[name]
+
+
+def _packages(facts: dict[str, object]) -> dict[str, object]:
+    return cast("dict[str, object]", facts.get("packages", {}))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Callable
-from typing import Any
 
 from newton_qd import checks
 from newton_qd.checks import Fact, listed, message
@@ -53,7 +52,7 @@ _TUPLES: dict[str, tuple[Callable[[object], bool], str]] = {
 
 
 def refusal(
-    robot: RobotSpec, field: str, value: Any, allowed: str, *, why: str = ""
+    robot: RobotSpec, field: str, value: object, allowed: str, *, why: str = ""
 ) -> RobotDescriptionError:
     """Returns the error about a field of a robot."""
     name = f"robot {robot.name!r}, {field}"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree
 from xml.parsers import expat
 
@@ -74,7 +73,7 @@ class XmlReader:
         )
 
     def refused(
-        self, element: ElementTree.Element, name: str, value: Any, allowed: str
+        self, element: ElementTree.Element, name: str, value: object, allowed: str
     ) -> RobotDescriptionError:
         """Returns an error about a value, with file, line and element in front."""
         return self.error(element, message(name, value, allowed))

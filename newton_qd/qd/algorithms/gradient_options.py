@@ -108,7 +108,7 @@ class MixedOptions(FlowOptions):
 CHAOTIC: Mapping[str, Any] = {"window": 10, "clip": 0.0}
 
 
-def on_robots_that_fall(**defaults: Any) -> dict[str, Mapping[str, Any]]:
+def on_robots_that_fall(**defaults: object) -> dict[str, Mapping[str, object]]:
     """Returns defaults for the robots that can fall.
 
     A fall ends the episode, and the gradient does not contain this. So these robots

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING
 
 import jax
 
 from newton_qd.qd.scoring.rollout import Policy
 from newton_qd.types import ExtraScores, Genotype, PyTree, Repertoire
+
+if TYPE_CHECKING:
+    from qdax.core.emitters.emitter import Emitter
 
 
 class OfParameters:
@@ -22,7 +25,7 @@ class OfParameters:
 
     def __init__(
         self,
-        emitter: Any,
+        emitter: Emitter,
         policy: Policy,
         convert: Callable[[dict[str, jax.Array]], PyTree],
     ) -> None:

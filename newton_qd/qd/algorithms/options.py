@@ -60,7 +60,7 @@ def refused_options() -> Iterator[None]:
 
 
 def read_options(
-    kind: type[OptionsT], config: EvolveConfig, *, least: int = 0, **defaults: Any
+    kind: type[OptionsT], config: EvolveConfig, *, least: int = 0, **defaults: object
 ) -> OptionsT:
     """Makes the options of an algorithm from those of a run.
 

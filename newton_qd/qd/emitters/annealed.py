@@ -90,8 +90,8 @@ class OnAnnealedRepertoire(Emitter):
         emitter_state: PyTree,
         repertoire: Repertoire = None,
         genotypes: Genotype | None = None,
-        fitnesses: Any = None,
-        descriptors: Any = None,
+        fitnesses: jax.Array | None = None,
+        descriptors: jax.Array | None = None,
         extra_scores: ExtraScores | None = None,
     ) -> AnnealedState:
         """Adds a generation to the annealed archive, and updates the emitter."""

@@ -13,7 +13,6 @@ import json
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -137,13 +136,13 @@ class RunFolder:
         finally:
             os.close(descriptor)
 
-    def start(self, config: EvolveConfig, facts: dict[str, Any]) -> None:
+    def start(self, config: EvolveConfig, facts: dict[str, object]) -> None:
         """Writes the settings of a new run."""
         content = config_to_json(config, facts)
         write_atomically(self.path / CONFIG, content.encode())
 
     def restore(
-        self, config: EvolveConfig, facts: dict[str, Any]
+        self, config: EvolveConfig, facts: dict[str, object]
     ) -> tuple[Checkpoint | None, list[str]]:
         """Reads the state of a run that was stopped.
 
@@ -194,7 +193,7 @@ class RunFolder:
         write_atomically(self.path / ARCHIVE, archive_bytes(archive))
         write_atomically(self.path / PICTURE, picture)
 
-    def save_reevaluated(self, metrics: dict[str, Any]) -> None:
+    def save_reevaluated(self, metrics: dict[str, float]) -> None:
         """Writes the metrics of re-evaluated elites."""
         text = json.dumps(metrics, indent=2) + "\n"
         write_atomically(self.path / REEVALUATED, text.encode())

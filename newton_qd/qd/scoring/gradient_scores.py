@@ -14,14 +14,13 @@ evaluation has fitness ``-inf``. ``Episode.scoring`` makes such functions.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 
 from newton_qd.checks import Fact, listed, message
-from newton_qd.types import Genotype
+from newton_qd.types import Genotype, PyTree
 
 GRADIENTS = "gradients"
 """Key of the gradients in ``extra_scores``."""
@@ -58,7 +57,7 @@ def read_scores(
     genotypes: Genotype,
     fitnesses: jax.Array,
     descriptors: jax.Array,
-    extra_scores: Mapping[str, Any] | None,
+    extra_scores: Mapping[str, PyTree] | None,
 ) -> Scores:
     """Checks the result of a scoring function and marks what is not finite.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,10 @@ from newton_qd import checks
 from newton_qd.checks import Fact, message
 from newton_qd.qd.extras import require_extra
 from newton_qd.types import Repertoire, ScoringFunction
+
+if TYPE_CHECKING:
+    from qdax.core.containers.mapelites_repertoire import MapElitesRepertoire
+    from ribs.archives import CVTArchive, GridArchive
 
 Limits = tuple[np.ndarray, np.ndarray]
 
@@ -78,7 +82,7 @@ def make_ribs_evaluation(
 
 def to_ribs(
     repertoire: Repertoire, limits: Limits, grid: tuple[int, ...] | None = None
-) -> Any:
+) -> CVTArchive | GridArchive:
     """Makes a ``ribs`` archive with the elites of a repertoire.
 
     pyribs computes the cell of each elite from its measures. At the border of cells,
@@ -124,7 +128,7 @@ def to_ribs(
     return archive
 
 
-def from_ribs(archive: Any) -> Any:
+def from_ribs(archive: CVTArchive | GridArchive) -> MapElitesRepertoire:
     """Makes QDax's repertoire from a ``ribs`` archive, cell by cell.
 
     Args:
@@ -146,7 +150,7 @@ def from_ribs(archive: Any) -> Any:
     data = archive.data(["solution", "objective", "measures", "index"])
     index = np.asarray(data["index"], np.int64)
     cells = len(centroids)
-    genotypes = np.zeros((cells, archive.solution_dim), np.float32)
+    genotypes = np.zeros((cells, cast("int", archive.solution_dim)), np.float32)
     fitnesses = np.full((cells, 1), -np.inf, np.float32)
     descriptors = np.zeros(centroids.shape, np.float32)
     genotypes[index] = data["solution"]

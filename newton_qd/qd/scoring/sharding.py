@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar, TypeVarTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,9 @@ from newton_qd import checks
 from newton_qd.types import ScoringFunction
 
 AXIS = "individuals"
+
+Inputs = TypeVarTuple("Inputs")
+Result = TypeVar("Result")
 
 
 def device_mesh(count: int | None = None) -> Mesh:
@@ -72,7 +75,9 @@ def shard_scoring(score: ScoringFunction, mesh: Mesh) -> ScoringFunction:
     return scored
 
 
-def on_mesh(function: Callable[..., Any], mesh: Mesh) -> Callable[..., Any]:
+def on_mesh(
+    function: Callable[[*Inputs], Result], mesh: Mesh
+) -> Callable[[*Inputs], Result]:
     """Compiles a function for a mesh, with arguments and results on one device.
 
     The program after an evaluation is then the same for any number of devices, and its
@@ -90,7 +95,7 @@ def on_mesh(function: Callable[..., Any], mesh: Mesh) -> Callable[..., Any]:
     everywhere = NamedSharding(mesh, PartitionSpec())
     run = jax.jit(function, out_shardings=everywhere)
 
-    def called(*arguments: Any) -> Any:
+    def called(*arguments: *Inputs) -> Result:
         given = jax.tree.map(lambda leaf: _copied(leaf, everywhere), arguments)
         results = run(*given)
         return jax.tree.map(lambda leaf: leaf.addressable_data(0), results)
