@@ -7,10 +7,13 @@ import inspect
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import jax
+
 from newton_qd import brax_views as brax
 from newton_qd import checks, tasks
 from newton_qd.checks import Fact, listed, message
 from newton_qd.envs.base import Env
+from newton_qd.envs.methods import check_methods, random_key
 from newton_qd.errors import UnknownEnvironment
 from newton_qd.moved import moved_name
 from newton_qd.robots import Material, RobotSpec
@@ -19,6 +22,7 @@ from newton_qd.types import DescriptorExtractor
 from newton_qd.wrappers import (
     AutoResetWrapper,
     CompletedEvalWrapper,
+    DescriptorWrapper,
     EpisodeWrapper,
     EvalWrapper,
     FixedInitialStateWrapper,
@@ -78,7 +82,8 @@ def register(
         **options: Keyword arguments of ``base``. ``create`` may replace them.
 
     Raises:
-        TypeError: An argument has the wrong type, or ``base`` does not take an option.
+        TypeError: An argument has the wrong type, ``base`` does not take an option, or
+            ``robot`` is missing and ``base`` needs it.
         ValueError: The name is in use, a name is not text or is empty, or
             ``reward_offset`` is not finite.
     """
@@ -97,7 +102,11 @@ def register(
         descriptor_extractor = getattr(
             described[0].wrapper, "descriptor_extractor", None
         )
-    if robot is not None and _takes_robot(base):
+    if _takes_robot(base):
+        why = f"and {getattr(base, '__name__', 'base')} needs a robot"
+        if robot is None:
+            allowed = "a newton_qd.robots.RobotSpec"
+            raise TypeError(message("robot", None, allowed, why=why))
         options = {"robot": robot, **options}
     if options:
         _require_keywords(env_name, base, options)
@@ -226,6 +235,8 @@ def create(
         env = fixed(env, spec.base_name)
     for wrapper_spec, chosen in zip(spec.wrappers, options, strict=True):
         env = wrapper_spec.wrapper(env, spec.base_name, **chosen)
+        if isinstance(env, DescriptorWrapper):
+            jax.eval_shape(env.reset, random_key())  # checks what ``describe`` returns
     if episode_length is not None:
         env = EpisodeWrapper(env, episode_length, action_repeat)
     if batch_size:
@@ -265,12 +276,15 @@ def _base(
     """Returns the environment inside all wrappers.
 
     Raises:
-        TypeError: ``material`` is not a ``Material``, or an option is unknown.
+        TypeError: ``material`` is not a ``Material``, an option is unknown, or a method
+            does not return an array.
+        ValueError: A method returns a wrong shape.
     """
     allowed = "newton_qd.robots.Material"
     checks.instance("material", material, Material, allowed, optional=True)
     _require_keywords(env_name, spec.base, options)
     env = spec.base(**options)
+    check_methods(env)
     return env if material is None else env.with_material(material)
 
 

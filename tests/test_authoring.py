@@ -17,6 +17,8 @@ import newton_qd
 import newton_qd.authoring as nq
 from newton_qd import tasks
 from newton_qd.physics.system import PhysicsState
+from newton_qd.qd.config import ConfigError, EvolveConfig
+from newton_qd.qd.scoring.task import make_task
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "own_environment.md"
 
@@ -211,6 +213,48 @@ def test_what_methods_may_return(
     bad = type("Bad", (Still,), {method: lambda self, *given: returned})
     with pytest.raises(error, match=message):
         bad(page["ROBOT"])
+
+
+@pytest.mark.parametrize(
+    ("method", "returned", "error", "message"),
+    [
+        ("control", [0.0, 0.0], TypeError, r"^Bad\.control: got a list; allowed: the"),
+        ("control", jnp.zeros(3), ValueError, r"^Bad\.control: got shape \(3,\); al"),
+        ("reset_pose", None, TypeError, r"^Bad\.reset_pose: got a NoneType; allowed"),
+        ("reset_pose", jnp.zeros(2), ValueError, r"^Bad\.reset_pose: .*shape \(9,\)"),
+        ("describe", jnp.zeros(3), ValueError, r"^Bad\.describe: .*allowed: shape \(2"),
+        ("observe", {"x": [1.0]}, TypeError, r"^Bad\.observe: 'x': got a list; all"),
+    ],
+)
+def test_create_checks_the_methods(
+    method: str,
+    returned: Any,
+    error: type[Exception],
+    message: str,
+    page: dict[str, Any],
+) -> None:
+    own = {"base": Still, "descriptor": page["ArmAngles"]}
+    part = "descriptor" if method == "describe" else "base"
+    own[part] = type("Bad", (own[part],), {method: lambda self, *given: returned})
+    nq.register("mine", robot=page["ROBOT"], **own)
+    with pytest.raises(error, match=message):
+        nq.create("mine")
+
+
+def test_what_register_and_evolve_need(page: dict[str, Any]) -> None:
+    with pytest.raises(TypeError, match="robot: got None, and Still needs a robot; a"):
+        nq.register("mine", Still)
+    robot = page["ROBOT"]
+    nq.register("mine", Still, robot=robot, descriptor=nq.XYPositionWrapper)
+    with pytest.raises(ConfigError, match="so pass reward_offset to newton_qd"):
+        make_task(EvolveConfig(env_name="mine"))
+    wide = {"descriptor": nq.XYPositionWrapper, "reward_offset": 1.0}
+    nq.register("wide", Still, robot=robot, **wide)
+    with pytest.raises(ConfigError, match=r"limits of 'wide': .*minval and maxval"):
+        make_task(EvolveConfig(env_name="wide"))
+    nq.register("footless", Still, robot=robot, descriptor=nq.FeetContactWrapper)
+    with pytest.raises(NotImplementedError, match=r"feet, so set RobotSpec\.feet$"):
+        nq.create("footless")
 
 
 def test_descriptors_have_the_length_of_their_limits(page: dict[str, Any]) -> None:

@@ -81,16 +81,21 @@ def checked_layout(env: str, blocks: object) -> tuple[tuple[str, int], ...]:
         blocks: Result of ``observe``.
 
     Raises:
-        TypeError: It is not a dictionary with at least one block.
+        TypeError: It is not a dictionary with at least one block, or a block is not
+            an array.
         ValueError: A block does not have exactly one axis.
     """
     if not isinstance(blocks, dict) or not blocks:
         allowed = "a dictionary of arrays (n,)"
         raise TypeError(message(f"{env}.observe", blocks, allowed))
     for name, block in blocks.items():
+        allowed = "shape (n,), such as state.q[2:3] for one number"
+        if not checks.is_array(block):
+            given = Fact(f"a {type(block).__name__}")
+            allowed = f"an array of {allowed}"
+            raise TypeError(message(f"{env}.observe: {name!r}", given, allowed))
         if jnp.ndim(block) != 1:
             given = Fact(f"shape {jnp.shape(block)}")
-            allowed = "shape (n,), such as state.q[2:3] for one number"
             raise ValueError(message(f"{env}.observe: {name!r}", given, allowed))
     return tuple((name, block.shape[0]) for name, block in blocks.items())
 
@@ -119,3 +124,24 @@ def checked_outcome(env: str, found: object) -> tuple[str, ...]:
             given = Fact(f"shape {jnp.shape(value)}")
             raise ValueError(message(f"{env}.outcome: {name!r}", given, "shape ()"))
     return tuple(metrics)
+
+
+def checked_vector(name: str, found: object, size: int, *, meaning: str) -> None:
+    """Checks the result of ``control`` or ``reset_pose``.
+
+    Args:
+        name: Class and method.
+        found: Shape of the result.
+        size: Allowed length.
+        meaning: What the result is, for the error.
+
+    Raises:
+        TypeError: It is not an array.
+        ValueError: It has another shape.
+    """
+    allowed = f"{meaning}, shape {(size,)}"
+    if not checks.is_array(found):
+        given = Fact(f"a {type(found).__name__}")
+        raise TypeError(message(name, given, allowed))
+    if jnp.shape(found) != (size,):
+        raise ValueError(message(name, Fact(f"shape {jnp.shape(found)}"), allowed))

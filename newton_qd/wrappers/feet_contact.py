@@ -51,9 +51,10 @@ class FeetContactWrapper(DescriptorWrapper):
         """
         robot = env.unwrapped
         if not isinstance(robot, PhysicsEnv) or not len(robot.system.feet):
-            raise NotImplementedError(
-                unsupported(env, env_name, "simulated robots with feet")
-            )
+            allowed = "simulated robots with feet"
+            if isinstance(robot, PhysicsEnv):
+                allowed += ", so set RobotSpec.feet"
+            raise NotImplementedError(unsupported(env, env_name, allowed))
         checks.number("smooth_width", smooth_width, above=0, optional=True)
         if straight_through and smooth_width is None:
             allowed = (

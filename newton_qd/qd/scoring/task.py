@@ -49,7 +49,8 @@ def make_task(config: EvolveConfig) -> Task:
 
     Raises:
         UnknownEnvironment: No environment of this name is registered.
-        ConfigError: The environment has no descriptor.
+        ConfigError: The environment has no descriptor, no reward offset, or no finite
+            limits of its descriptor.
     """
     # imported here, because the registry imports every environment
     import newton_qd
@@ -61,10 +62,18 @@ def make_task(config: EvolveConfig) -> Task:
     if name not in tasks:
         why = "which has no descriptor"
         raise ConfigError(message("env_name", name, listed(tasks), why=why))
+    if name not in newton_qd.tables.reward_offset:
+        allowed = "names with one, so pass reward_offset to newton_qd.register"
+        why = "which has no reward_offset"
+        raise ConfigError(message("env_name", name, allowed, why=why))
     env: Any = newton_qd.create(
         name, episode_length=config.episode_length, auto_reset=False
     )
     low, high = (np.asarray(x, np.float32) for x in env.descriptor_limits)
+    if not np.all(np.isfinite([low, high])):
+        allowed = "finite numbers, such as minval and maxval of XYPositionWrapper"
+        given = (low.tolist(), high.tolist())
+        raise ConfigError(message(f"descriptor limits of {name!r}", given, allowed))
     return Task(
         env=env,
         descriptor_extractor=newton_qd.tables.descriptor_extractor[name],
