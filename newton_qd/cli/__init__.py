@@ -27,13 +27,14 @@ def main(
     """Runs the command line.
 
     Args:
-        argv: Arguments without the name of the program; those of the process by
-            default.
-        task_factory: Makes the task of ``evolve``; by default from the registered
-            environments.
+        argv: Arguments without the name of the program. ``None``: the arguments of the
+            process.
+        task_factory: Function that creates the task of ``evolve``. ``None``: the task
+            of a registered environment.
 
     Returns:
-        Exit code: 0 success, 1 failure, 2 bad arguments, 130 interrupted and saved.
+        Exit code: 0 success, 1 failure, 2 wrong arguments, 130 interrupted with all
+        results saved.
     """
     parser = argparse.ArgumentParser(
         prog="newton-qd", description="Quality-Diversity with differentiable physics."

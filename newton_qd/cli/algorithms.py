@@ -1,4 +1,4 @@
-"""``newton-qd algorithms``: the algorithms of ``evolve``, and the options of one."""
+"""``newton-qd algorithms``: lists the algorithms of ``evolve``, or their options."""
 
 from __future__ import annotations
 
@@ -30,7 +30,9 @@ def add_parser(commands: Commands) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Prints the list, or the options of one, and returns the exit code.
+    """Prints the algorithms, or the options of one algorithm.
+
+    Returns the exit code.
 
     Raises:
         ConfigError: No algorithm has this name.
@@ -43,12 +45,12 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _plain(spec: AlgorithmSpec[Any]) -> str:
-    """The summary without the marks of code."""
+    """Returns the summary without backticks."""
     return spec.summary.replace("`", "")
 
 
 def _details(spec: AlgorithmSpec[Any]) -> Iterator[str]:
-    """Lines that describe an algorithm and its options."""
+    """Yields the lines that describe an algorithm and its options."""
     yield from textwrap.wrap(f"{spec.name}: {_plain(spec)}", _WIDTH)
     rows = [
         (f"{name}={default}" if default else name, meaning.replace("``", ""))
@@ -68,7 +70,7 @@ def _details(spec: AlgorithmSpec[Any]) -> Iterator[str]:
 
 
 def _columns(rows: Iterable[tuple[str, str]]) -> Iterator[str]:
-    """Lines of two columns, the second of which is wrapped."""
+    """Yields the lines of a table with two columns. The second column is wrapped."""
     rows = list(rows)
     width = max(len(head) for head, _ in rows)
     for head, text in rows:

@@ -1,4 +1,4 @@
-"""Shared by the commands: exit codes, error messages, lists of integers."""
+"""Helpers of all commands: exit codes, error messages, lists of integers."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def complain(arguments: argparse.Namespace, what: object, code: int) -> int:
 
 
 def widths(text: str) -> tuple[int, ...]:
-    """Parses integers with commas between them; the word ``none`` is an empty list."""
+    """Parses integers with commas between them. The word ``none`` means no integers."""
     return () if text == "none" else integers(text, ",")
 
 

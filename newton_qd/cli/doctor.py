@@ -1,4 +1,4 @@
-"""``newton-qd doctor``: where gradients of an environment are useful."""
+"""``newton-qd doctor``: measures where gradients of an environment are useful."""
 
 from __future__ import annotations
 
@@ -58,13 +58,13 @@ def add_parser(commands: Commands) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Prints a report, writes it with ``--out``, and returns the exit code."""
+    """Prints a report, and writes it to files with ``--out``. Returns the exit code."""
     import newton_qd
     from newton_qd.physics.precision import quiet
 
     quiet()
     out = arguments.out
-    if out is not None and out.exists() and not out.is_dir():  # before minutes of work
+    if out is not None and out.exists() and not out.is_dir():  # not after minutes
         refused = f"--out: got {out}, a file; allowed: a folder, or a new name"
         return complain(arguments, refused, BAD_ARGUMENTS)
     try:

@@ -1,4 +1,4 @@
-"""``newton-qd envs``: a table of the registered environments."""
+"""``newton-qd envs``: prints a table of the registered environments."""
 
 from __future__ import annotations
 

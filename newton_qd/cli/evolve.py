@@ -1,4 +1,4 @@
-"""``newton-qd evolve``: a Quality-Diversity algorithm on an environment."""
+"""``newton-qd evolve``: runs a Quality-Diversity algorithm on an environment."""
 
 from __future__ import annotations
 
@@ -166,19 +166,20 @@ def run(
     arguments: argparse.Namespace,
     task_factory: Callable[[EvolveConfig], Task] | None,
 ) -> int:
-    """Starts or resumes a run and returns the exit code.
+    """Starts or resumes a run, and returns the exit code.
 
     Raises:
-        ConfigError: A setting is missing or wrong.
-        KeyboardInterrupt: A signal came while the packages were imported.
+        ConfigError: A setting is missing or not allowed.
+        KeyboardInterrupt: A signal arrived during the imports.
     """
     config, out = _settle(arguments)
     seconds = arguments.checkpoint_seconds
     checks.number(
         "checkpoint_seconds", seconds, least=0, endless=True, error=ConfigError
     )
-    # Imports JAX and the physics: an argument error above does not wait for it. An
-    # exception in the middle of an extension module's import could end in a crash.
+    # These imports load JAX and the physics. They come after the argument checks, so
+    # that argument errors are fast. The signal is delayed until the imports end,
+    # because an exception during the import of an extension module can crash Python.
     with graceful_stop(b"\nstopping\n") as stop:
         from newton_qd.physics.precision import quiet
         from newton_qd.qd.run.evolution import evolve
@@ -205,10 +206,10 @@ def run(
 
 
 def _settle(arguments: argparse.Namespace) -> tuple[EvolveConfig, Path]:
-    """Combines arguments, config file and the run to resume.
+    """Combines the settings of the arguments, the config file and the run to resume.
 
     Raises:
-        ConfigError: They do not name an environment, or a setting is wrong.
+        ConfigError: No environment is named, or a setting is not allowed.
     """
     from newton_qd.qd.run.folder import CONFIG, RunFolder
 
@@ -235,7 +236,7 @@ def _settle(arguments: argparse.Namespace) -> tuple[EvolveConfig, Path]:
     if base is None and "env_name" not in given:
         raise ConfigError(_UNNAMED)
     base = base or _DEFAULTS
-    # A new choice of cells replaces the other kind of cells.
+    # A grid replaces centroids of the config, and centroids replace its grid.
     if "grid" in given:
         base = base.replace(centroids=None)
     if "centroids" in given:
@@ -255,7 +256,7 @@ def _warn_of_changes(facts: dict[str, Any]) -> None:
 
 
 def _report(result: EvolveResult, out: Path) -> None:
-    """Prints the results of the run and how to resume it."""
+    """Prints the results of the run. After an interrupt, prints how to resume it."""
     config = result.config
     if result.iteration >= 0:
         first, last = (

@@ -1,4 +1,4 @@
-"""The differentiable physics: systems, the control step, and views of it."""
+"""Differentiable physics: systems, the control step, and functions that inspect it."""
 
 from newton_qd.physics.bridge import (
     episode_final,

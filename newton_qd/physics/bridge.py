@@ -1,7 +1,8 @@
-"""The one door between JAX and Warp.
+"""The interface between JAX and Warp.
 
-Traced code calls the kernels as :mod:`newton_qd.physics.row_calls` wraps them. Eager
-code shares memory through DLPack. No third module knows both libraries.
+Traced code calls the kernels through the wrappers of
+:mod:`newton_qd.physics.row_calls`. Eager code shares memory through DLPack. Only this
+module and ``row_calls`` use both libraries.
 """
 
 import functools
@@ -33,14 +34,14 @@ def _launcher(system: System, alias: str, parametric: bool) -> Launcher:
 
 
 def _default_device() -> wp.Device:
-    """The Warp device of JAX's first."""
+    """Returns the Warp device of the first JAX device."""
     device = wp.device_from_jax(jax.devices()[0])
-    assert device is not None  # Warp reads it from the kind and number of JAX's
+    assert device is not None  # Warp finds it by the platform and index in JAX
     return device
 
 
 def launcher(system: System, device: wp.Device, parametric: bool = False) -> Launcher:
-    """The launcher of ``system`` on a Warp device; made once."""
+    """Returns the launcher of ``system`` on a Warp device. It is created once."""
     return _launcher(system, device.alias, parametric)
 
 
@@ -48,11 +49,11 @@ def launcher(system: System, device: wp.Device, parametric: bool = False) -> Lau
 def _kernel_call(
     system: System, name: str, size: int, parametric: bool = False
 ) -> RowCall:
-    """A kernel of a system as a function of rows, as ``row_call`` makes them.
+    """Wraps a kernel of a system as a function of rows, with ``row_call``.
 
     Args:
         system: The system.
-        name: Kernel; one that ends in ``_backward`` runs its adjoint.
+        name: Name of the kernel. If it ends in ``_backward``, the adjoint runs.
         size: Length of a row of inputs.
         parametric: Whether that row ends with the world's parameters.
     """
@@ -70,7 +71,9 @@ def _kernel_call(
 def _row(
     system: System, shapes: dict[str, tuple[int, ...]], **arrays: jax.Array
 ) -> jax.Array:
-    """Concatenates the inputs of one world; a wrong size would shift all others.
+    """Concatenates the inputs of one world into a row.
+
+    It checks every shape, because an input of the wrong size would shift the next ones.
 
     Args:
         system: The system.
@@ -78,8 +81,8 @@ def _row(
         **arrays: The inputs, in the order of the row.
 
     Raises:
-        TypeError: An array has another type than the system.
-        ValueError: An array has another shape.
+        TypeError: The type of an array is not that of the system.
+        ValueError: An array has the wrong shape.
     """
     for name, array in arrays.items():
         allowed = f"an array of shape {shapes[name]}, {system.dtype}"
@@ -91,7 +94,7 @@ def _row(
 
 
 def _split(row: jax.Array, fields: Layout) -> dict[str, jax.Array]:
-    """The fields of one world's row (size,), each in its shape."""
+    """Splits one world's row (size,) into its fields, each in its shape."""
     parts = jnp.split(row, [field.offset for field in fields][1:])
     pairs = zip(fields, parts, strict=True)
     return {field.name: part.reshape(field.shape) for field, part in pairs}
@@ -107,28 +110,29 @@ class Step(Protocol):
         control: jax.Array,
         params: jax.Array | None = None,
     ) -> tuple[PhysicsState, jax.Array]:
-        """Next state, and the fault ().
+        """Returns the next state and the fault ().
 
         Raises:
-            TypeError: An array has another type than the system.
-            ValueError: An array has another shape, or ``NEWTON_QD_THREADS`` is not
-                allowed.
+            TypeError: The type of an array is not that of the system.
+            ValueError: An array has the wrong shape, or the value of
+                ``NEWTON_QD_THREADS`` is not allowed.
         """
         ...
 
 
 @functools.cache
 def control_step(system: System) -> Step:
-    """The differentiable control step of one world.
+    """Returns the differentiable control step of one world.
 
     Args:
         system: The system.
 
     Returns:
-        A function of ``q`` (nq,), ``v`` (nv,), ``control`` (nu,) and, where the
-        world has its own, ``params``
-        (:func:`~newton_qd.physics.parameters.parameter_count`,) that returns the next
-        state and the fault (); reverse mode once, no forward mode. Under ``vmap`` the
+        A function of ``q`` (nq,), ``v`` (nv,), ``control`` (nu,) and ``params``
+        (:func:`~newton_qd.physics.parameters.parameter_count`,). It returns the next
+        state and the fault (). ``params`` is optional: without it the world has the
+        parameters of the system. The function supports first derivatives in reverse
+        mode, but neither second derivatives nor forward mode. Under ``vmap`` all
         worlds share one launch.
     """
     interrupts.install()
@@ -145,7 +149,7 @@ def control_step(system: System) -> Step:
     def run(
         q: jax.Array, v: jax.Array, control: jax.Array, params: jax.Array | None = None
     ) -> tuple[PhysicsState, jax.Array]:
-        thread_count()  # a bad setting is an error here, not inside a compiled call
+        thread_count()  # raises for a wrong setting now, not inside a compiled call
         if params is None:
             y = step(_row(system, shapes, q=q, v=v, control=control))
         else:
@@ -163,10 +167,10 @@ def control_step(system: System) -> Step:
 
 @functools.cache
 def kinematics(system: System) -> Callable[[jax.Array, jax.Array], Kinematics]:
-    """Differentiable bodies of one world, as a function of ``q`` and ``v``.
+    """Returns the differentiable kinematics of one world as a function.
 
-    The function raises TypeError for another type than the system's, and ValueError for
-    another shape.
+    Its arguments are ``q`` (nq,) and ``v`` (nv,). It raises TypeError if the type of an
+    array is not that of the system, and ValueError if an array has the wrong shape.
     """
     read, written = layout.coordinates(system), layout.bodies(system)
     call = functools.partial(_kernel_call, system, size=read.size)
@@ -180,11 +184,11 @@ def kinematics(system: System) -> Callable[[jax.Array, jax.Array], Kinematics]:
 
 
 def dynamics(system: System, q: jax.Array, v: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Mass matrix (nv, nv) and bias forces (nv,) of one world.
+    """Returns the mass matrix (nv, nv) and the bias forces (nv,) of one world.
 
     Raises:
-        TypeError: ``q`` or ``v`` has another type than the system.
-        ValueError: ``q`` or ``v`` has another shape.
+        TypeError: The type of ``q`` or ``v`` is not that of the system.
+        ValueError: ``q`` or ``v`` has the wrong shape.
     """
     read, written = layout.coordinates(system), layout.dynamics(system)
     call = _kernel_call(system, "dynamics_forward", read.size)
@@ -194,11 +198,11 @@ def dynamics(system: System, q: jax.Array, v: jax.Array) -> tuple[jax.Array, jax
 
 
 def contact_gaps(system: System, q: jax.Array) -> jax.Array:
-    """Gaps (nc,) of one world.
+    """Returns the contact gaps (nc,) of one world [m].
 
     Raises:
-        TypeError: ``q`` has another type than the system.
-        ValueError: ``q`` has another shape.
+        TypeError: The type of ``q`` is not that of the system.
+        ValueError: ``q`` has the wrong shape.
     """
     read, written = layout.coordinates(system), layout.gaps(system)
     call = _kernel_call(system, "contact_gaps", read.size)
@@ -208,7 +212,7 @@ def contact_gaps(system: System, q: jax.Array) -> jax.Array:
 
 @functools.cache
 def _episode_call(name: str, dtype: str, steps: int, nd: int) -> RowCall:
-    """A kernel of ``kernels.episodes`` as a function of one episode's row."""
+    """Wraps a kernel of ``kernels.episodes`` as a function of one episode's row."""
     kernel = getattr(build_kernels(Variant(dtype, 1)).episodes, name)
 
     def launch(x: wp.array, *arrays: wp.array) -> None:
@@ -224,7 +228,10 @@ def _episode_call(name: str, dtype: str, steps: int, nd: int) -> RowCall:
 def _episode_reduction(
     name: str, dtype: str, steps: int, nd: int, size: int
 ) -> Differentiable:
-    """Reverse-mode function of one episode's row; the mask has no gradient."""
+    """Returns a reverse-mode function of one episode's row.
+
+    The mask has no gradient.
+    """
     call = functools.partial(_episode_call, dtype=dtype, steps=steps, nd=nd)
     return differentiable(call, name, steps * (nd + 1), size)
 
@@ -240,20 +247,23 @@ def _episode_row(state_desc: jax.Array, mask: jax.Array) -> jax.Array:
 
 
 def episode_proportion(state_desc: jax.Array, mask: jax.Array) -> jax.Array:
-    """Proportion of the valid steps of one episode; under ``vmap`` one launch.
+    """Averages the state descriptors over the valid steps of one episode.
 
-    On a CPU bitwise :func:`newton_qd.extractors.get_feet_contact_proportion`.
+    On a CPU the result is bitwise equal to
+    :func:`newton_qd.extractors.get_feet_contact_proportion`. Under ``vmap`` all
+    episodes share one launch.
 
     Args:
         state_desc: (t, nd) state descriptors before each step.
-        mask: (t,) 1 where a step comes after the end of the episode, else 0.
+        mask: (t,) 1 for a step after the end of the episode, else 0.
 
     Returns:
-        (nd,) proportions [-]; differentiable in reverse mode in ``state_desc``.
+        (nd,) proportions [-]. Differentiable in reverse mode with respect to
+        ``state_desc``.
 
     Raises:
-        TypeError: ``state_desc`` has a type that the kernels do not have.
-        ValueError: ``state_desc`` or ``mask`` has another shape, or no step.
+        TypeError: The kernels do not support the type of ``state_desc``.
+        ValueError: ``state_desc`` or ``mask`` has the wrong shape, or has no steps.
     """
     row = _episode_row(state_desc, mask)
     steps, nd = state_desc.shape
@@ -263,20 +273,23 @@ def episode_proportion(state_desc: jax.Array, mask: jax.Array) -> jax.Array:
 
 
 def episode_final(state_desc: jax.Array, mask: jax.Array) -> jax.Array:
-    """State descriptor before the last valid step; under ``vmap`` one launch.
+    """Returns the state descriptor before the last valid step of one episode.
 
-    On a CPU bitwise :func:`newton_qd.extractors.get_final_xy_position`.
+    On a CPU the result is bitwise equal to
+    :func:`newton_qd.extractors.get_final_xy_position`. Under ``vmap`` all episodes
+    share one launch.
 
     Args:
         state_desc: (t, nd) state descriptors before each step.
-        mask: (t,) 1 where a step comes after the end of the episode, else 0.
+        mask: (t,) 1 for a step after the end of the episode, else 0.
 
     Returns:
-        (nd,) descriptor; differentiable in reverse mode in ``state_desc``.
+        (nd,) descriptor. Differentiable in reverse mode with respect to
+        ``state_desc``.
 
     Raises:
-        TypeError: ``state_desc`` has a type that the kernels do not have.
-        ValueError: ``state_desc`` or ``mask`` has another shape, or no step.
+        TypeError: The kernels do not support the type of ``state_desc``.
+        ValueError: ``state_desc`` or ``mask`` has the wrong shape, or has no steps.
     """
     row = _episode_row(state_desc, mask)
     steps, nd = state_desc.shape
@@ -286,10 +299,11 @@ def episode_final(state_desc: jax.Array, mask: jax.Array) -> jax.Array:
 def to_jax(array: wp.array) -> jax.Array:
     """View a Warp array as a JAX array without a copy.
 
-    The view is read-only by contract: later Warp writes to the memory show through.
+    The view must not be written to. It shows what Warp writes to the memory later.
 
     Args:
-        array: Warp array; on a GPU the current Warp stream is finished first.
+        array: Warp array. On a GPU the function first waits for the current Warp
+            stream.
 
     Returns:
         The JAX array on the same device.
@@ -305,8 +319,8 @@ def from_jax(array: jax.Array, dtype: type | None = None) -> wp.array:
     JAX arrays are immutable: never write to the view.
 
     Args:
-        array: Concrete JAX array; waited for before it is shared.
-        dtype: Warp dtype to reinterpret the last axes with, as ``wp.vec3``.
+        array: Concrete JAX array. The function waits until it is computed.
+        dtype: Warp dtype for the last axes, for example ``wp.vec3``.
 
     Returns:
         The Warp array on the same device.

@@ -1,4 +1,4 @@
-"""The kernels' structs in device memory: the model and the scratch."""
+"""Kernel structs in device memory: the model and the scratch memory."""
 
 from __future__ import annotations
 
@@ -18,11 +18,12 @@ from newton_qd.physics.system import CONTACT_FRACTION, STANDARD_GRAVITY, System
 from newton_qd.physics.tree import Tree, build_tree, origin_axes
 from newton_qd.physics.warp_internals import field_dtype
 
-# Iterations of a substep and solves of an iteration. With contacts: a predictor and two
-# correctors of the contacts. Without: two more iterations, each at the mean velocity of
-# the one before.
+# Iterations in a substep, and solves in an iteration. A system with contacts has one
+# iteration with three solves: a predictor and two correctors of the contacts. A system
+# without contacts has three iterations. The second and the third use the mean
+# velocity of the previous iteration.
 _TOUCHING, _FREE = (1, 3), (3, 1)
-# Scratch arrays by what they hold an entry for.
+# Names of the scratch arrays, grouped by what one entry belongs to.
 _PER_BODY = ("pose", "twist_w", "twist_v", "bias_w", "bias_v", "inertia", "moment")
 _PER_BODY += ("wrench_w", "wrench_v")
 _PER_CONTACT = ("point", "arm", "normal", "velocity", "load")
@@ -35,7 +36,7 @@ _PER_READING += ("position", "com", "com_velocity")
 _REPORTED = ("impulse", "angular_impulse", "normal_impulse")
 
 
-# Copies a table to an array of the model by that name.
+# Copies a table to the model's array of this name.
 Put = Callable[[str, ArrayLike], None]
 
 
@@ -47,7 +48,7 @@ Row = TypeVar("Row", bound=_RowStruct)
 
 
 def _with_world(table: np.ndarray) -> np.ndarray:
-    """Prepend the world's row to a body table; it is never read."""
+    """Prepend a row for the world to a table of bodies. Kernels never read this row."""
     return np.concatenate([table[:1], table])
 
 
@@ -56,12 +57,12 @@ def _iterations_and_solves(system: System) -> tuple[int, int]:
 
 
 def kernels_of(system: System, device: wp.Device, parametric: bool = False) -> Kernels:
-    """The kernels for a system on a device, with what it needs and no more.
+    """Returns the smallest variant of the kernels that fits a system and a device.
 
     Args:
         system: The system.
         device: Warp device.
-        parametric: Whether every world brings physical parameters of its own.
+        parametric: Whether each world has its own physical parameters.
     """
     width = pack_width(system.dtype, device)
     return build_kernels(Variant(system.dtype, width, parametric, system.has_boxes))
@@ -71,9 +72,9 @@ def build_model(system: System, device: wp.Device, parametric: bool = False) -> 
     """Copy a system to a device as a ``Model`` struct.
 
     Args:
-        system: The system; its ``dtype`` chooses the kernels.
+        system: The system. Its ``dtype`` selects the kernels.
         device: Warp device.
-        parametric: Whether it is for the kernels with parameters of each world.
+        parametric: Whether each world has its own physical parameters.
 
     Returns:
         The struct of :mod:`newton_qd.physics.kernels.structs`.
@@ -121,12 +122,13 @@ def build_model(system: System, device: wp.Device, parametric: bool = False) -> 
 
 
 def fill_row(struct: Row, fields: Layout, names: Iterable[str] | None = None) -> Row:
-    """Tell the kernels where the fields of a row begin.
+    """Write the offsets of a row's fields into a kernel struct.
 
     Args:
-        struct: A struct of :mod:`newton_qd.physics.kernels.rows`.
-        fields: The row.
-        names: Its fields that the struct has; ``None``: all.
+        struct: A struct of :mod:`newton_qd.physics.kernels.rows`. It is changed in
+            place.
+        fields: Layout of the row.
+        names: Fields of the row that the struct has. ``None``: all.
 
     Returns:
         ``struct``.
@@ -185,7 +187,8 @@ def _put_dofs(put: Put, system: System) -> None:
     control[system.control_dof] = np.arange(system.nu)
     gear = np.zeros(system.nv)
     gear[system.control_dof] = system.gear
-    # The zone in which a limit switches on begins at the limit.
+    # The smoothing zone of a limit is centred at the stored value. The value is moved
+    # outwards by the width, so that the zone begins at the limit.
     width = system.robot.material.limit_smoothing
     put("dof_control", control)
     for name, values in {
@@ -194,7 +197,8 @@ def _put_dofs(put: Put, system: System) -> None:
         "damping": system.damping,
         "stiffness": system.stiffness,
         "spring_rest": system.spring_rest,
-        # far beyond any angle, and finite: infinity times zero stiffness is NaN
+        # The bound is far beyond any angle. It is finite, because infinity times zero
+        # stiffness is NaN.
         "limit_lower": np.clip(system.limit_lower - width, -1e9, 1e9),
         "limit_upper": np.clip(system.limit_upper + width, -1e9, 1e9),
         "limit_stiffness": system.limit_stiffness,
@@ -225,12 +229,12 @@ def _put_contacts(put: Put, system: System, tree: Tree) -> None:
 
 
 def _entries(system: System, adjoint: bool) -> dict[str, int]:
-    """Entries of each scratch array for one pack of worlds."""
+    """Returns the length of each scratch array for one pack of worlds."""
     n, nc = system.robot.substeps, max(len(system.contact_body), 1)
     nf = len(system.feet)
     iterations, solves = _iterations_and_solves(system)
     turns = n * iterations
-    # the state after the last substep has kinematics too
+    # one more: the kinematics after the last substep
     steps = turns + 1 if adjoint else 1
     solves = turns * solves if adjoint else 1
     return {
@@ -255,11 +259,12 @@ def _entries(system: System, adjoint: bool) -> dict[str, int]:
 
 @dataclasses.dataclass(frozen=True)
 class Memory:
-    """Intermediates in device memory.
+    """Intermediate values of a step in device memory.
 
     Attributes:
-        values: A ``Scratch`` struct.
-        adjoints: Another one for their adjoints; ``values`` itself without.
+        values: ``Scratch`` struct of the values.
+        adjoints: ``Scratch`` struct of their adjoints. Without adjoints it is
+            ``values`` itself.
     """
 
     values: Any
@@ -274,18 +279,18 @@ def build_scratch(
     adjoint: bool,
     parametric: bool = False,
 ) -> Memory:
-    """Allocate the intermediates of ``slots`` packs of worlds in flight.
+    """Allocate the intermediate values of ``slots`` packs of worlds.
 
     Args:
         system: The system.
-        slots: Number of packs that the scratch holds at once.
+        slots: Number of packs that the scratch memory holds at once.
         device: Warp device.
-        adjoint: Whether every substep is kept, with adjoints; otherwise the substeps
-            share their memory.
+        adjoint: Whether to allocate adjoints, and memory for each substep. If false,
+            the substeps share their memory.
         parametric: As in :func:`build_model`.
 
     Returns:
-        The structs that kernels take.
+        The structs that the kernels take as arguments.
     """
     space = kernels_of(system, device, parametric)
     values, adjoints = space.structs.Scratch(), space.structs.Scratch()

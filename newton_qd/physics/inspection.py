@@ -1,4 +1,4 @@
-"""Functions for checking and control: kinematics, gaps, mass matrix, bias forces."""
+"""Functions that inspect a state: kinematics, gaps, mass matrix, bias forces."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from newton_qd.physics.system import Kinematics, PhysicsState, System
 
 
 def _rotate(quaternion: jax.Array, vector: jax.Array) -> jax.Array:
-    """Rotate (..., 3) vectors by (..., 4) quaternions xyzw."""
+    """Rotate vectors (..., 3) by quaternions xyzw (..., 4)."""
     axis, w = quaternion[..., :3], quaternion[..., 3:]
     turned = 2.0 * jnp.cross(axis, vector)
     return vector + w * turned + jnp.cross(axis, turned)
@@ -25,7 +25,7 @@ def _checked(system: System, name: str, value: jax.Array, size: int) -> jax.Arra
 
 
 def forward_kinematics(system: System, q: jax.Array, v: jax.Array) -> Kinematics:
-    """Poses and velocities of every body.
+    """Computes the pose and the velocity of every body.
 
     Args:
         system: The system.
@@ -33,10 +33,10 @@ def forward_kinematics(system: System, q: jax.Array, v: jax.Array) -> Kinematics
         v: (nv,) velocities [m/s or rad/s].
 
     Returns:
-        The kinematics; differentiable in reverse mode.
+        The kinematics. Differentiable in reverse mode.
 
     Raises:
-        ValueError: ``q`` or ``v`` has another shape.
+        ValueError: ``q`` or ``v`` has the wrong shape.
     """
     q = _checked(system, "q", q, system.nq)
     v = _checked(system, "v", v, system.nv)
@@ -44,17 +44,19 @@ def forward_kinematics(system: System, q: jax.Array, v: jax.Array) -> Kinematics
 
 
 def seen_bodies(system: System, state: PhysicsState) -> Kinematics:
-    """Poses and velocities of every body: as the step reported, or computed now.
+    """Returns the pose and the velocity of every body.
+
+    If the step reported them, they come from the state. Otherwise they are computed.
 
     Args:
         system: The system.
         state: State of one world.
 
     Returns:
-        The kinematics; differentiable in reverse mode.
+        The kinematics. Differentiable in reverse mode.
 
     Raises:
-        ValueError: ``q`` or ``v`` of the state has another shape.
+        ValueError: ``q`` or ``v`` of the state has the wrong shape.
     """
     if state.bodies is not None:
         return state.bodies
@@ -62,24 +64,26 @@ def seen_bodies(system: System, state: PhysicsState) -> Kinematics:
 
 
 def mass_matrix(system: System, q: jax.Array) -> jax.Array:
-    """Joint-space inertia, armature included.
+    """Computes the joint-space inertia, including the armature.
 
     Args:
         system: The system.
         q: (nq,) coordinates [m or rad].
 
     Returns:
-        (nv, nv) symmetric matrix M of M dv/dt + bias = force.
+        (nv, nv) symmetric matrix M in the equation M dv/dt + bias = force.
 
     Raises:
-        ValueError: ``q`` has another shape.
+        ValueError: ``q`` has the wrong shape.
     """
     q = _checked(system, "q", q, system.nq)
     return bridge.dynamics(system, q, jnp.zeros((system.nv,), q.dtype))[0]
 
 
 def bias_forces(system: System, q: jax.Array, v: jax.Array) -> jax.Array:
-    """Velocity-product and gravity forces, without damping, springs and contacts.
+    """Computes the bias forces: velocity-product forces and gravity.
+
+    Damping, springs and contacts are not included.
 
     Args:
         system: The system.
@@ -87,10 +91,10 @@ def bias_forces(system: System, q: jax.Array, v: jax.Array) -> jax.Array:
         v: (nv,) velocities [m/s or rad/s].
 
     Returns:
-        (nv,) generalized force [N or N m] that keeps dv/dt zero.
+        (nv,) generalized force [N or N m] that makes dv/dt zero.
 
     Raises:
-        ValueError: ``q`` or ``v`` has another shape.
+        ValueError: ``q`` or ``v`` has the wrong shape.
     """
     q = _checked(system, "q", q, system.nq)
     v = _checked(system, "v", v, system.nv)
@@ -98,18 +102,20 @@ def bias_forces(system: System, q: jax.Array, v: jax.Array) -> jax.Array:
 
 
 def contact_gaps(system: System, q: jax.Array) -> jax.Array:
-    """Distances of all that can touch, as the step sees them; not differentiable.
+    """Computes the gaps of all contacts, with the distances that the step uses.
+
+    The result is not differentiable.
 
     Args:
         system: The system.
         q: (nq,) coordinates [m or rad].
 
     Returns:
-        (nc,) gap of each row of the system's contact tables [m], negative where the two
-        are pressed into each other; both rows of a pair have the same.
+        (nc,) gap for each row of the system's contact tables [m]. A negative gap is a
+        penetration. Both rows of a pair have the same gap.
 
     Raises:
-        ValueError: ``q`` has another shape.
+        ValueError: ``q`` has the wrong shape.
     """
     q = _checked(system, "q", q, system.nq)
     if not len(system.contact_body):
@@ -118,7 +124,7 @@ def contact_gaps(system: System, q: jax.Array) -> jax.Array:
 
 
 def lowest_contact(system: System, q: jax.Array) -> jax.Array:
-    """Height of the lowest point of all spheres that touch the ground [m].
+    """Computes the height of the lowest point of all ground-contact spheres [m].
 
     Args:
         system: The system.
@@ -128,7 +134,7 @@ def lowest_contact(system: System, q: jax.Array) -> jax.Array:
         () height above z = 0 [m].
 
     Raises:
-        ValueError: ``q`` has another shape, or nothing of the robot touches the ground.
+        ValueError: ``q`` has the wrong shape, or the robot has no ground contacts.
     """
     still = jnp.zeros((system.nv,), q.dtype)
     kinematics = forward_kinematics(system, q, still)

@@ -1,9 +1,9 @@
-"""Keeping Ctrl-C out of the callbacks that XLA makes into Python.
+"""Keeps Ctrl-C out of the callbacks from XLA into Python.
 
-A ``KeyboardInterrupt`` that is raised while XLA waits for a callback is lost at
-best, because no exception passes through XLA's frames, and leaves outputs unwritten
-at worst. So while a callback is on the stack the interrupt is put off, and sent again
-until it arrives between two computations.
+No exception passes through XLA's frames. A ``KeyboardInterrupt`` inside a callback is
+therefore lost, and the outputs of the callback may stay unwritten. While a callback is
+on the stack, this module delays the interrupt. It sends the signal again until the
+signal arrives between two computations.
 """
 
 from __future__ import annotations
@@ -18,22 +18,23 @@ from types import CodeType, FrameType
 _RETRY_SECONDS = 0.02
 _protected: set[CodeType] = set()
 _files: set[str] = set()
-# Written by the signal handler, which may interrupt anything, itself included: the
-# put of a SimpleQueue is made for that, starting a thread or setting an Event is not.
+# The signal handler writes to this queue. The handler may interrupt any code, including
+# itself. SimpleQueue.put is safe in this case. Starting a thread or setting an Event is
+# not.
 _put_off: queue.SimpleQueue[None] = queue.SimpleQueue()
 _pending = False
 _sender: threading.Thread | None = None
 
 
 def protect(function: Callable) -> None:
-    """Put interrupts off while ``function`` is running.
+    """Delay interrupts while ``function`` is running.
 
-    Whatever is defined inside a function of the same file counts as well: ctypes may
-    enter Python through a closure that calls ``function``, and an interrupt on the
-    first line of that closure is as bad.
+    Functions that are defined inside a function of the same file are protected too.
+    The reason: ctypes may enter Python through a closure that calls ``function``. An
+    interrupt on the first line of that closure would do the same harm.
 
     Args:
-        function: A Python function whose frame marks a callback.
+        function: Python function. Its frame on the stack marks a callback.
     """
     _protected.add(function.__code__)
     _files.add(function.__code__.co_filename)
@@ -66,16 +67,17 @@ def _on_interrupt(signum: int, frame: FrameType | None) -> None:
         _pending = False
         signal.default_int_handler(signum, frame)
     elif not _pending:
-        # however often the user asks meanwhile, one interrupt arrives
+        # Several Ctrl-C during one callback become one interrupt.
         _pending = True
         _put_off.put(None)
 
 
 def install() -> None:
-    """Handle SIGINT as above, unless the program has a handler of its own.
+    """Install the SIGINT handler of this module.
 
-    Only Python's default handler is replaced, and only from the main thread; the
-    replacement raises ``KeyboardInterrupt`` as the default one does.
+    It replaces Python's default handler only. A handler that the program installed
+    stays. Outside the main thread the function does nothing. The new handler raises
+    ``KeyboardInterrupt``, as the default handler does.
     """
     global _sender
     if threading.current_thread() is not threading.main_thread():

@@ -1,10 +1,10 @@
-"""Kinds of joints and obstacles: the one table that models and kernels read."""
+"""Kinds of joints and obstacles. Models and kernels both read them from here."""
 
 import enum
 
 
 class JointKind(enum.IntEnum):
-    """Joint types that the kernels know."""
+    """Joint types that the kernels support."""
 
     FREE = 0
     REVOLUTE = 1
@@ -12,7 +12,7 @@ class JointKind(enum.IntEnum):
 
 
 class ObstacleKind(enum.IntEnum):
-    """Shapes that a robot may touch."""
+    """Shapes of obstacles that the kernels support."""
 
     PLANE = 0
     CAPSULE = 1

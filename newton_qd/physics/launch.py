@@ -1,4 +1,4 @@
-"""Launches of the step's kernels on Warp arrays: threads on a CPU, lanes on a GPU."""
+"""Launches the kernels on Warp arrays: with threads on a CPU, with lanes on a GPU."""
 
 from __future__ import annotations
 
@@ -17,23 +17,25 @@ from newton_qd.physics.workers import Worker
 Arrays = tuple[wp.array, ...]
 
 LANES = (1, 2, 4, 8, 16, 32)
-# Kernel modules other than ``inspect``; each is compiled as a whole.
+# Modules of the kernels that are not in ``inspect``. Warp compiles whole modules.
 _MODULES = {
     "step_forward": "forward",
     "step_backward": "backward",
     "contact_gaps": "gaps",
 }
-# The fastest at 4,096 and at 16,384 worlds of the ant on an H200.
+# The fastest numbers of lanes for 4,096 and 16,384 worlds of the ant on an H200.
 _LANES = {"step_forward": 16, "step_backward": 8}
-# Packs below which another thread costs more than it takes over, without and with
-# adjoint: it is woken by Python.
+# Minimum number of packs per thread, without and with adjoint. For fewer packs, waking
+# another thread from Python takes longer than the work that it saves.
 _PACKS_PER_THREAD = {False: 16, True: 4}
 _GPU_BLOCK = 256
 _RESIDENT_WORLDS = 16384
 
 
 def thread_count() -> int:
-    """Threads of a CPU launch: ``NEWTON_QD_THREADS``, or one per usable core.
+    """Returns the number of threads of a CPU launch.
+
+    It is ``NEWTON_QD_THREADS``, or by default the number of usable cores.
 
     Raises:
         ValueError: The environment variable is not a positive integer.
@@ -49,10 +51,13 @@ def thread_count() -> int:
 
 
 def lane_count(kernel: str) -> int:
-    """Lanes per world of a GPU launch: ``NEWTON_QD_LANES``, or the fastest.
+    """Returns the number of lanes per world of a GPU launch.
+
+    It is ``NEWTON_QD_LANES``, or by default the number that was measured as fastest.
 
     Args:
-        kernel: Name of the kernel; all but those of the step are written for one lane.
+        kernel: Name of the kernel. Only the kernels of the step support several lanes;
+            the result for all others is 1.
 
     Raises:
         ValueError: The environment variable is not one of ``LANES``.
@@ -68,13 +73,13 @@ def lane_count(kernel: str) -> int:
 
 
 def output_size(system: System) -> int:
-    """Length of a row that a step writes."""
+    """Returns the length of the row that a step writes for one world."""
     return layout.outputs(system).size
 
 
 @dataclasses.dataclass(frozen=True)
 class _Command:
-    """A recorded launch, and the position of its first array among its arguments."""
+    """A recorded launch, and the index of the first array in its arguments."""
 
     launch: wp.Launch
     first_array: int
@@ -88,7 +93,7 @@ class _Command:
         slot_stride: int,
         lanes: int,
     ) -> None:
-        """Launch it on ``worlds`` worlds from ``first`` on."""
+        """Launch the kernel on ``worlds`` worlds, starting with world ``first``."""
         self.launch.set_dim(threads)
         for index, value in enumerate((first, slot_stride, worlds, lanes), 1):
             self.launch.set_param_at_index(index, value)
@@ -98,10 +103,11 @@ class _Command:
 
 
 class Launcher:
-    """The kernels of one system on one device.
+    """Launches the kernels of one system on one device.
 
-    Scratch memory and launch commands are made once per thread (CPU) or stream (GPU)
-    and reused; launches of one stream follow each other, so they can share it.
+    Each thread (CPU) or stream (GPU) has its own scratch memory and launch commands.
+    They are created once and reused. Launches in one stream run one after the other,
+    so they can share the memory.
     """
 
     def __init__(
@@ -112,7 +118,7 @@ class Launcher:
         Args:
             system: The system.
             device: Warp device.
-            parametric: Whether every row of inputs ends with the world's parameters.
+            parametric: Whether each row of inputs ends with the world's parameters.
         """
         self.system = system
         self.device = device
@@ -127,13 +133,13 @@ class Launcher:
         self._lock = threading.Lock()
 
     def prepare(self, name: str) -> wp.Module:
-        """Compile a kernel now, rather than inside a callback; returns its module."""
+        """Compile a kernel now, before a callback needs it. Returns its module."""
         module = self._kernel(name).module
         module.load(self.device, self._block)
         return module
 
     def forward(self, worlds: int, x: wp.array, y: wp.array) -> None:
-        """One control step; rows as :mod:`~newton_qd.physics.layout` says.
+        """Run one control step. :mod:`~newton_qd.physics.layout` defines the rows.
 
         Args:
             worlds: Number of worlds.
@@ -141,7 +147,8 @@ class Launcher:
             y: (worlds * outputs,) Warp array to write.
 
         Raises:
-            ValueError: ``NEWTON_QD_THREADS`` or ``NEWTON_QD_LANES`` is not allowed.
+            ValueError: The value of ``NEWTON_QD_THREADS`` or ``NEWTON_QD_LANES`` is
+                not allowed.
         """
         self.launch("step_forward", worlds, x, y)
 
@@ -155,14 +162,16 @@ class Launcher:
         """Run a kernel, or its adjoint, on all worlds.
 
         Args:
-            name: Kernel whose arguments are the model, first world, slot stride,
-                worlds, lanes, scratch (and its adjoint), then ``arrays``.
+            name: Name of the kernel. Its arguments are: model, first world, slot
+                stride, number of worlds, lanes, scratch (and its adjoint), then
+                ``arrays``.
             worlds: Number of worlds.
-            *arrays: Warp arrays with a contiguous row per world.
-            adjoint: Whether the kernel's adjoint is run.
+            *arrays: Warp arrays with one contiguous row for each world.
+            adjoint: Whether to run the adjoint of the kernel.
 
         Raises:
-            ValueError: ``NEWTON_QD_THREADS`` or ``NEWTON_QD_LANES`` is not allowed.
+            ValueError: The value of ``NEWTON_QD_THREADS`` or ``NEWTON_QD_LANES`` is
+                not allowed.
         """
         if worlds == 0:
             return
@@ -189,13 +198,13 @@ class Launcher:
         arrays: Arrays,
         adjoint: bool,
     ) -> None:
-        """Split the packs over threads; each walks through its share in one slot."""
+        """Split the packs over threads. Each thread computes its packs in one slot."""
         packs = -(-worlds // self.width)
         threads = min(thread_count(), -(-packs // _PACKS_PER_THREAD[adjoint]))
         bounds = [packs * n // threads * self.width for n in range(threads)] + [worlds]
         while len(self._workers) < threads - 1:
             self._workers.append(Worker(f"newton_qd-{len(self._workers) + 1}"))
-        # memory of its own for each thread: shared cache lines would slow all down
+        # Each thread has its own memory, because shared cache lines are slow.
         commands = [
             self._command(kernel, thread, 1, arrays, adjoint)
             for thread in range(threads)
@@ -223,7 +232,10 @@ class Launcher:
         arrays: Arrays,
         adjoint: bool,
     ) -> _Command:
-        """The recorded launch of ``kernel`` in an owner's scratch."""
+        """Returns the recorded launch of ``kernel`` in the owner's scratch memory.
+
+        The owner is a thread (CPU) or a stream (GPU).
+        """
         held = self._scratch.get((adjoint, owner))
         if held is None or held[0] < slots:
             scratch = buffers.build_scratch(
@@ -250,7 +262,8 @@ class Launcher:
     ) -> _Command:
         structs = self.kernels.structs
         held = [scratch.values, *([scratch.adjoints] if adjoint else [])]
-        # adjoints travel through the scratch and ``arrays``, not through Warp's
+        # Adjoints are stored in the scratch memory and in ``arrays``. Warp's own
+        # adjoint arguments are not used.
         unused = [structs.Model(), 0, 0, 0, 0, *(structs.Scratch() for _ in held)]
         unused += [None for _ in arrays]
         before = [self.model, 0, 0, 0, 1, *held]
@@ -264,5 +277,5 @@ class Launcher:
             block_dim=self._block,
             record_cmd=True,
         )
-        assert isinstance(launch, wp.Launch)  # as record_cmd asks for
+        assert isinstance(launch, wp.Launch)  # because of record_cmd
         return _Command(launch, len(before))

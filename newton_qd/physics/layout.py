@@ -1,9 +1,9 @@
-"""The one table of what a row of numbers holds, for JAX, the launches and the kernels.
+"""Layout of the rows of numbers that JAX, the launches and the kernels share.
 
-Every world has one contiguous row of inputs and one of outputs. A row is a list of
-named fields; this module says which, in what order and of what shape. The bridge joins
-and splits rows by it, and the kernels get its offsets in their ``Model``: nobody else
-adds up sizes.
+Each world has one contiguous row of inputs and one row of outputs. A row is a list of
+named fields. This module defines the fields, their order and their shapes. The bridge
+uses it to join and split rows. The kernels get the offsets in their ``Model``. No other
+module computes offsets.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ class Field:
     """A part of a row.
 
     Attributes:
-        name: What it is.
-        shape: Shape of the array that its numbers are, row by row.
-        offset: Where it begins.
+        name: Name of the field.
+        shape: Shape of the field's array. The numbers are in row-major order.
+        offset: Index of its first number in the row.
     """
 
     name: str
@@ -31,15 +31,15 @@ class Field:
 
     @property
     def size(self) -> int:
-        """How many numbers it has."""
+        """Number of numbers in the field."""
         return math.prod(self.shape)
 
 
 class Layout:
-    """The fields of a row, one after the other without gaps."""
+    """The fields of a row, in order and without gaps."""
 
     def __init__(self, shapes: dict[str, tuple[int, ...]]) -> None:
-        """Places the fields.
+        """Computes the offsets of the fields.
 
         Args:
             shapes: Shape of each field, in the order of the row.
@@ -63,12 +63,12 @@ class Layout:
 
     @property
     def offsets(self) -> dict[str, int]:
-        """Where each field begins."""
+        """Offset of each field."""
         return {field.name: field.offset for field in self}
 
 
 def parameters(system: System) -> Layout:
-    """Physical parameters of a world: the fields of ``PhysicsParams``."""
+    """Returns the row of a world's physical parameters: the ``PhysicsParams``."""
     nb, nv, nu = system.nb, system.nv, system.nu
     return Layout(
         {
@@ -84,23 +84,23 @@ def parameters(system: System) -> Layout:
 
 
 def coordinates(system: System) -> Layout:
-    """What the kernels read that show a state from inside."""
+    """Returns the row that the inspection kernels read: ``q`` and ``v``."""
     return Layout({"q": (system.nq,), "v": (system.nv,)})
 
 
 def inputs(system: System, parametric: bool = False) -> Layout:
-    """What a step reads.
+    """Returns the row that a step reads.
 
     Args:
         system: The system.
-        parametric: Whether every world brings physical parameters of its own.
+        parametric: Whether each world has its own physical parameters.
     """
     own = parameters(system).shapes if parametric else {}
     return Layout({**coordinates(system).shapes, "control": (system.nu,), **own})
 
 
 def bodies(system: System) -> Layout:
-    """Where the bodies are and how they move: the fields of ``Kinematics``."""
+    """Returns the row of poses and velocities of the bodies: the ``Kinematics``."""
     nb = system.nb
     return Layout(
         {
@@ -114,7 +114,7 @@ def bodies(system: System) -> Layout:
 
 
 def outputs(system: System) -> Layout:
-    """What a step writes: ``PhysicsState`` and the fault."""
+    """Returns the row that a step writes: the ``PhysicsState`` fields and the fault."""
     nb, feet = system.nb, system.feet.shape
     seen = bodies(system).shapes if system.reports_bodies else {}
     return Layout(
@@ -132,17 +132,20 @@ def outputs(system: System) -> Layout:
 
 
 def dynamics(system: System) -> Layout:
-    """The mass matrix and the bias forces."""
+    """Returns the row of the mass matrix and the bias forces."""
     return Layout({"mass_matrix": (system.nv, system.nv), "bias": (system.nv,)})
 
 
 def gaps(system: System) -> Layout:
-    """How far apart everything is that can touch."""
+    """Returns the row of contact gaps."""
     return Layout({"gap": system.contact_body.shape})
 
 
 def scratch_parameters(system: System) -> Layout:
-    """What a kernel with parameters of each world makes of them, once for all."""
+    """Returns the row of values that a parametric kernel computes from its parameters.
+
+    It computes them once at the start and keeps them in the scratch memory.
+    """
     nb, nv = system.nb, system.nv
     return Layout(
         {

@@ -1,4 +1,4 @@
-"""Physical parameters of a world: what differs between the copies of one robot."""
+"""Physical parameters of a world. They may differ between copies of one robot."""
 
 from __future__ import annotations
 
@@ -19,27 +19,30 @@ from newton_qd.physics.system import System
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, eq=False)
 class PhysicsParams:
-    """Physical parameters of one world; in a batch every field has its axis in front.
+    """Physical parameters of one world. In a batch each field has a leading batch axis.
 
-    A robot has many masses, dampings and gears of very different size, some of them
-    zero: these are scales of what its files say, 1 being as it is there. Gravity and
-    friction are one number each, and values.
+    Gravity and friction are absolute values. All other fields are scale factors for the
+    values in the robot's files; 1 keeps the value. Scale factors are used because the
+    masses, dampings and gears of a robot differ by orders of magnitude, and some are
+    zero.
 
     A step is differentiable with respect to every field.
 
     Attributes:
         gravity: () downward acceleration [m/s^2], 0 or more.
-        friction: () Coulomb coefficient of every contact [-], 0 or more.
-        contact_stiffness_scale: () of the stiffness of every contact [-], 0 or more.
-            The stiffness itself is chosen for the weight that the files give; it does
-            not follow masses or gravity.
-        mass_scale: (nb,) of the mass of each body and of its inertia, as if it were
-            denser [-], above 0.
-        inertia_scale: (nb,) of the inertia of each body about its centre of mass, on
-            top of ``mass_scale`` [-], above 0.
-        damping_scale: (nv,) of the damping of each degree of freedom [-], 0 or more.
-        gear_scale: (nu,) of the gear of each action [-], 0 or more. Joint limits keep
-            the stiffness that is chosen for the gear of the files.
+        friction: () Coulomb coefficient of all contacts [-], 0 or more.
+        contact_stiffness_scale: () scale of the stiffness of all contacts [-], 0 or
+            more. The unscaled stiffness is computed from the weight in the files. It
+            does not change with ``mass_scale`` or ``gravity``.
+        mass_scale: (nb,) scale of the mass of each body [-], above 0. The inertia is
+            scaled too, as for a change of density.
+        inertia_scale: (nb,) additional scale of the inertia of each body about its
+            centre of mass [-], above 0. It multiplies ``mass_scale``.
+        damping_scale: (nv,) scale of the damping of each degree of freedom [-], 0 or
+            more.
+        gear_scale: (nu,) scale of the gear of each action [-], 0 or more. It does not
+            change the stiffness of joint limits, which is computed from the unscaled
+            gear.
     """
 
     gravity: jax.Array
@@ -66,12 +69,12 @@ def parameter_shapes(system: System) -> dict[str, tuple[int, ...]]:
 
 
 def parameter_count(system: System) -> int:
-    """Returns how many numbers the parameters of one world are."""
+    """Returns the number of parameters of one world, counting every array element."""
     return layout.parameters(system).size
 
 
 def default_params(system: System) -> PhysicsParams:
-    """Returns the parameters of one world as in the robot's files."""
+    """Returns the parameters of one world with the values of the robot's files."""
     robot = system.robot
     values = dict.fromkeys(FIELDS, 1.0)
     values |= {"gravity": robot.gravity, "friction": robot.material.friction}
@@ -81,14 +84,15 @@ def default_params(system: System) -> PhysicsParams:
 
 
 def check_bounds(name: str, values: np.ndarray) -> None:
-    """Checks that all numbers are allowed values of a parameter.
+    """Checks that all values of a parameter are within its bounds.
 
     Args:
         name: Name of the parameter.
-        values: Numbers, of any shape.
+        values: Values, of any shape.
 
     Raises:
-        ValueError: A number is not finite, is negative, or is 0 if that is not allowed.
+        ValueError: A value is not finite, is negative, or is 0 where the parameter
+            must be positive.
     """
     positive = name in _POSITIVE
     valid = np.isfinite(values) & ((values > 0) if positive else (values >= 0))
@@ -101,7 +105,10 @@ def check_bounds(name: str, values: np.ndarray) -> None:
 def _checked(
     name: str, value: jax.Array, shape: tuple[int, ...], dtype: np.dtype
 ) -> jax.Array:
-    """Returns one parameter, strongly typed; weakly typed numbers are converted."""
+    """Returns one parameter as an array with a strong type.
+
+    Numbers with a weak type are converted.
+    """
     array = checks.array(f"params.{name}", value, shape, dtype, scalars=True)
     if not isinstance(array, Tracer):
         check_bounds(name, np.asarray(array))
@@ -109,17 +116,17 @@ def _checked(
 
 
 def parameter_row(system: System, params: PhysicsParams) -> jax.Array:
-    """Returns the parameters of one world in a row, as the kernels read them.
+    """Returns the parameters of one world as the row that the kernels read.
 
     Args:
         system: The system.
-        params: Its parameters. Values are checked where they are concrete: not inside
-            ``jit`` and ``vmap``.
+        params: The parameters. Bounds are checked for concrete values only, not for
+            traced values inside ``jit`` and ``vmap``.
 
     Raises:
-        TypeError: ``params`` is something else, or a field has another type than the
-            system.
-        ValueError: A field has another shape, or a number that is out of bounds.
+        TypeError: ``params`` is not a ``PhysicsParams``, or the type of a field is not
+            that of the system.
+        ValueError: A field has the wrong shape, or a value out of bounds.
     """
     allowed = "None, or PhysicsParams, as env.default_params.replace(friction=0.5)"
     checks.instance("params", params, PhysicsParams, allowed)

@@ -1,9 +1,9 @@
-"""The variants of the kernels, and how each is built.
+"""The variants of the kernels, and the function that builds them.
 
-The kernel package is a template: :func:`build_kernels` runs its files once for each
-:class:`Variant`, as a package of its own name. A file of the template asks
-:func:`variant_of` which variant it is a part of. docs/physics.md says why the files are
-run again, and not wrapped in functions.
+The kernel package is a template. :func:`build_kernels` runs its files once for each
+:class:`Variant`, as a package with another name. A file of the template calls
+:func:`variant_of` to find its variant. docs/physics.md explains why the files are run
+again instead of being wrapped in functions.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ import warp as wp
 _TEMPLATE = Path(__file__).parent / "kernels"
 _TEMPLATE_PACKAGE = "newton_qd.physics.kernels"
 _VECTOR_BYTES = 32
-# Warp's default for CPUs. For CUDA it has 3, which compiles twice as long for kernels
-# that are 3 % faster (docs/verification.md).
+# Warp's default for CPUs. Its default for CUDA is 3. Level 3 doubles the compile time
+# and makes the kernels 3 % faster (docs/verification.md).
 _OPTIMIZATION = 2
 SCALARS = {"float32": wp.float32, "float64": wp.float64}
 
 
 @dataclasses.dataclass(frozen=True)
 class Variant:
-    """What a copy of the kernels is compiled for, and what is left out of it.
+    """Precision, width and optional features of one copy of the kernels.
 
     Attributes:
         dtype: ``"float32"`` or ``"float64"``.
-        width: Worlds of a pack, see :mod:`newton_qd.physics.kernels`.
-        parametric: Whether every world brings physical parameters of its own.
+        width: Number of worlds in a pack, see :mod:`newton_qd.physics.kernels`.
+        parametric: Whether each world has its own physical parameters.
         boxes: Whether obstacles may be boxes.
     """
 
@@ -45,29 +45,29 @@ class Variant:
 
     @property
     def scalar(self) -> type:
-        """Warp's type of a number."""
+        """Warp's scalar type."""
         return SCALARS[self.dtype]
 
     @property
     def package(self) -> str:
-        """Name of the variant's package, and of its modules for Warp's cache."""
+        """Name of the variant's package. Warp's cache uses it as a prefix too."""
         own = "_parametric" * self.parametric + "_boxes" * self.boxes
         return f"{_TEMPLATE_PACKAGE}_{self.dtype}_{self.width}{own}"
 
 
 @dataclasses.dataclass(frozen=True)
 class Kernels:
-    """The modules of one variant that others launch or read.
+    """The modules of one variant that other packages use.
 
     Attributes:
-        package: Types of a number and of vectors.
-        structs: The structs that kernels take.
-        world: What moves inputs and outputs.
-        forward: ``step_forward``.
-        backward: ``step_backward``.
-        inspect: Kinematics and dynamics.
-        gaps: ``contact_gaps``.
-        episodes: Descriptors of episodes.
+        package: The scalar and vector types.
+        structs: The structs that kernels take as arguments.
+        world: Functions that read inputs and write outputs.
+        forward: Kernel ``step_forward``.
+        backward: Kernel ``step_backward``.
+        inspect: Kernels for kinematics and dynamics.
+        gaps: Kernel ``contact_gaps``.
+        episodes: Kernels for descriptors of episodes.
     """
 
     package: ModuleType
@@ -80,33 +80,36 @@ class Kernels:
     episodes: ModuleType
 
 
-# The template under its own name is a variant too: of one world, with boxes. Tools
-# import it so, and `conventions`, which does not depend on the variant.
+# The template under its own name is a variant too, with one world in a pack and with
+# boxes. Tools import it under this name. So do users of `conventions`, which does not
+# depend on the variant.
 _VARIANTS = {_TEMPLATE_PACKAGE: Variant("float32", 1, boxes=True)}
 
 
 def variant_of(package: str) -> Variant:
-    """Returns the variant that a package of kernels is built for.
+    """Returns the variant of a kernel package.
 
     Args:
-        package: Its ``__name__``.
+        package: The package's ``__name__``.
 
     Raises:
-        KeyError: :func:`build_kernels` did not build it.
+        KeyError: :func:`build_kernels` did not build the package.
     """
     return _VARIANTS[package]
 
 
 @functools.cache
 def build_kernels(variant: Variant) -> Kernels:
-    """Runs the kernel package for a variant; once, and compiles nothing.
+    """Runs the kernel package for a variant. It does not compile anything.
+
+    The result is cached: each variant is built once.
 
     Args:
-        variant: Precision, width, and what is left out.
+        variant: Precision, width and optional features.
 
     Returns:
         The modules of the variant. Their names begin with ``variant.package``, so that
-        Warp compiles and caches each variant by itself.
+        Warp compiles and caches each variant separately.
     """
     _VARIANTS[variant.package] = variant
     package = _run_template(variant.package)
@@ -138,14 +141,14 @@ def _run_template(name: str) -> ModuleType:
 
 
 def pack_width(dtype: str, device: wp.Device) -> int:
-    """Worlds that one thread of a device computes side by side.
+    """Returns the number of worlds in a pack, which one thread computes side by side.
 
     Args:
         dtype: ``"float32"`` or ``"float64"``.
         device: Warp device.
 
     Returns:
-        1 on a GPU; on a CPU what fills a vector register of 256 bits.
+        1 on a GPU. On a CPU the number of scalars in a vector register of 256 bits.
     """
     if not device.is_cpu:
         return 1
@@ -153,5 +156,5 @@ def pack_width(dtype: str, device: wp.Device) -> int:
 
 
 def quiet() -> None:
-    """Keep Warp's notices off the terminal, for programs with output of their own."""
+    """Turn off Warp's messages, for programs that print their own output."""
     wp.config.log_level = wp.LOG_WARNING

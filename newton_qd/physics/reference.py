@@ -1,6 +1,6 @@
-"""Plain NumPy kinematics in float64: slow, obvious, and independent of Warp.
+"""Reference kinematics in NumPy with float64: slow, simple and independent of Warp.
 
-The default pose of a robot is found with it, and tests compare the kernels to it.
+The default pose of a robot is computed with it. Tests compare the kernels with it.
 Quaternions are (x, y, z, w).
 """
 
@@ -35,18 +35,22 @@ def axis_quaternion(axis: np.ndarray, angle: float) -> np.ndarray:
 
 
 def rpy_quaternion(roll: float, pitch: float, yaw: float) -> np.ndarray:
-    """Returns URDF's rotation (4,): about the fixed x, then y, then z axis [rad]."""
+    """Returns the quaternion (4,) of URDF's roll, pitch and yaw [rad].
+
+    URDF rotates about the fixed x axis, then about y, then about z.
+    """
     x, y, z = np.eye(3)
     about_zy = quaternion_product(axis_quaternion(z, yaw), axis_quaternion(y, pitch))
     return quaternion_product(about_zy, axis_quaternion(x, roll))
 
 
 def compose(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Returns frame ``b``, given in frame ``a``, in the frame that holds ``a``.
+    """Returns the composition (7,) of two frames.
 
     Args:
-        a: (7,) position [m] and quaternion.
-        b: (7,) position [m] and quaternion.
+        a: (7,) frame in an outer frame, position [m] and quaternion.
+        b: (7,) frame in ``a``, position [m] and quaternion. The result is this frame
+            in the outer frame.
     """
     position = a[:3] + rotation_matrix(a[3:]) @ b[:3]
     return np.concatenate([position, quaternion_product(a[3:], b[3:])])
@@ -59,7 +63,7 @@ def inverse(a: np.ndarray) -> np.ndarray:
 
 
 def _joint_motion(system: System, joint: int, q: np.ndarray) -> np.ndarray:
-    """Returns the frame (7,) of a joint's child side in its parent side."""
+    """Returns the frame (7,) of the child side of a joint in its parent side."""
     kind = JointKind(system.joint_kind[joint])
     start = system.q_start[joint]
     axis = system.joint_axis[joint]
@@ -86,15 +90,16 @@ def body_frames(system: System, q: np.ndarray) -> np.ndarray:
 
 
 def jacobians(system: System, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns how the bodies move with the degrees of freedom, in world axes.
+    """Returns the Jacobians of all bodies, in world axes.
 
     Args:
         system: The robot.
         q: (nq,) coordinates.
 
     Returns:
-        Velocity of the centre of mass (nb, 3, nv) and angular velocity
-        (nb, 3, nv) of every body for each unit velocity.
+        Linear Jacobian (nb, 3, nv) of the centre of mass, and angular Jacobian
+        (nb, 3, nv). Column i is the velocity of a body for a unit velocity of degree
+        of freedom i.
     """
     q = np.asarray(q, dtype=np.float64)
     frames = body_frames(system, q)
@@ -123,7 +128,7 @@ def jacobians(system: System, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def mass_matrix(system: System, q: np.ndarray) -> np.ndarray:
-    """Returns the mass matrix (nv, nv) as the sum of every body's kinetic energy."""
+    """Returns the mass matrix (nv, nv), summed from the kinetic energy of each body."""
     linear, angular = jacobians(system, q)
     frames = body_frames(system, q)
     total = np.diag(system.armature).astype(np.float64)
@@ -136,14 +141,14 @@ def mass_matrix(system: System, q: np.ndarray) -> np.ndarray:
 
 
 def penetration(gap: float, width: float) -> float:
-    """Returns the smooth ``max(-gap, 0)`` of the kernels: exact beyond ``width``."""
+    """Returns the kernels' smooth ``max(-gap, 0)``. It is exact for |gap| >= width."""
     if abs(gap) >= width:
         return max(-gap, 0.0)
     return (width - gap) ** 3 * (3 * width + gap) / (16 * width**3)
 
 
 def lowest_contact(system: System, q: np.ndarray) -> float:
-    """Returns the height over z = 0 of the lowest sphere against the ground [m]."""
+    """Returns the height above z = 0 of the lowest ground-contact sphere [m]."""
     frames = body_frames(system, q)
     ground = system.ground_contacts
     heights = [

@@ -1,7 +1,8 @@
-"""Kernels as JAX functions: a launch behind XLA's foreign function interface.
+"""Wraps kernels as JAX functions, through XLA's foreign function interface.
 
-A kernel takes contiguous rows, one for each world. As a function of one world's row it
-goes through ``jit``, ``vmap`` and ``grad``; a batch of any nesting is one launch.
+A kernel takes contiguous rows, one for each world. The wrapped function takes the row
+of one world and supports ``jit``, ``vmap`` and ``grad``. A batch is one launch, also
+with nested ``vmap``.
 """
 
 import contextlib
@@ -20,13 +21,16 @@ interrupts.protect(ffi_callback())
 
 @contextlib.contextmanager
 def _errors_contained() -> Iterator[None]:
-    """Turn what Warp would let through XLA's frames into an error that it reports.
+    """Convert exceptions that Warp does not catch into an error that Warp reports.
+
+    Warp catches ``Exception`` in a callback. Any other exception would enter XLA's
+    frames.
 
     Raises:
-        RuntimeError: Something else than an ``Exception`` was raised, such as an
-            interrupt.
+        RuntimeError: An exception that is not an ``Exception`` was raised, for example
+            an interrupt.
     """
-    # notebooks put Python's own SIGINT handler back before every cell
+    # Notebooks restore Python's SIGINT handler before each cell.
     interrupts.install()
     try:
         yield
@@ -37,32 +41,33 @@ def _errors_contained() -> Iterator[None]:
 
 
 class RowCall(Protocol):
-    """A kernel as a function of contiguous rows, one world's each."""
+    """A kernel as a function of contiguous rows, one row for each world."""
 
     def __call__(self, *rows: jax.Array, output_dims: int) -> tuple[jax.Array, ...]:
-        """A tuple of one row of length ``output_dims``."""
+        """Returns a tuple with one row of length ``output_dims``."""
         ...
 
 
 Differentiable = Callable[[jax.Array], jax.Array]
-"""Reverse-mode function of one world's row of inputs; returns its row of outputs."""
+"""Reverse-mode function from one world's row of inputs to its row of outputs."""
 
 
 def row_call(
     name: str, dtype: str, module: wp.Module, launch: Callable[..., None]
 ) -> RowCall:
-    """A launch as a function of contiguous rows.
+    """Wraps a launch as a function of contiguous rows.
 
     Args:
-        name: Kernel; one that ends in ``_backward`` takes the adjoints of the outputs
-            as a second argument.
+        name: Name of the kernel. If it ends in ``_backward``, the function takes the
+            adjoints of the outputs as a second argument.
         dtype: Type of the rows.
-        module: Warp module of the kernel; Warp loads it when a call is traced.
+        module: Warp module of the kernel. Warp loads it when a call is traced.
         launch: Runs the kernel on Warp arrays of rows: the inputs, then the outputs.
 
     Returns:
-        Function of one world's rows that returns a tuple of one row; its
-        ``output_dims`` says how long. Under ``vmap`` the worlds share one launch.
+        Function of one world's rows. It returns a tuple with one row. The keyword
+        argument ``output_dims`` is the length of that row. Under ``vmap`` the worlds
+        share one launch.
     """
     real = SCALARS[dtype]
 
@@ -87,19 +92,21 @@ def row_call(
         vmap_method="broadcast_all",
         graph_mode=wp.JaxCallableGraphMode.NONE,
     )
-    # Warp numbers and keeps every call that it traces, and XLA compiles each number:
-    # without jit that would be every eager call
+    # Warp gives each traced call a number and keeps it, and XLA compiles each number.
+    # jit traces once. Without jit, every eager call would be traced and compiled.
     return jax.jit(call, static_argnames="output_dims", inline=True)
 
 
 def differentiable(
     call: Callable[[str], RowCall], name: str, size: int, output_size: int
 ) -> Differentiable:
-    """Reverse-mode function of one row; the adjoint is compiled when first traced.
+    """Returns a reverse-mode function of one row.
+
+    The adjoint kernel is compiled when a gradient is traced for the first time.
 
     Args:
-        call: Makes the function of a kernel, as :func:`row_call`, from its name.
-        name: Kernels, without ``_forward`` and ``_backward``.
+        call: Returns the function of a kernel for its name, as :func:`row_call` does.
+        name: Name of the kernels without ``_forward`` and ``_backward``.
         size: Length of a row of inputs.
         output_size: Length of a row of outputs.
     """

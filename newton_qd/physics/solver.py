@@ -1,4 +1,4 @@
-"""The physics as a solver for a plain Newton loop."""
+"""The physics as a Newton solver, for programs that use Newton's own loop."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ from newton_qd.physics.system import JointKind, System
 from newton_qd.physics.warp_internals import tape_is_recording
 from newton_qd.robots import RobotSpec
 
-# Arrays that every world must share with the robot, by what they have a row for.
+# Arrays of the model in which every world must equal the robot. They are grouped by
+# what one row of the array belongs to.
 _COMPARED = {
     "body": ("body_mass", "body_com", "body_inertia", "body_flags"),
     "joint": (
@@ -52,21 +53,21 @@ _COMPARED = {
     ),
     "joint_coord": ("joint_rest_q",),
 }
-# Entries that count on from world to world, and what they count.
+# Arrays of indices that count over all worlds, and the count that each refers to.
 _NUMBERED = {
     "joint_parent": "body_count",
     "joint_child": "body_count",
     "joint_mimic_joint": "joint_count",
 }
 _ABSENT = ("particle_count", "muscle_count", "tendon_count", "constraint_mimic_count")
-# Step lengths whose model stays in memory.
+# Maximum number of different step lengths whose models stay in memory.
 _HELD_STEPS = 8
 
 
 class NewtonQDSolver(SolverBase):
     """Steps a Newton model of identical worlds with the kernels of this package.
 
-    The model is made of copies of one robot, one a world::
+    Each world of the model contains one copy of the same robot::
 
         scene = newton.ModelBuilder()
         scene.replicate(newton_builder(path, floating=True, gravity=robot.gravity), 64)
@@ -74,39 +75,40 @@ class NewtonQDSolver(SolverBase):
         solver = NewtonQDSolver(model, robot)
         solver.step(state_in, state_out, control, None, dt)
 
-    The physics is that of :func:`newton_qd.physics.step`: the robot touches the ground
-    z = 0 with the spheres and the material of its row. Hence ``contacts`` is ignored,
-    as are the materials, limit gains and effort limits of the model, shapes that belong
-    to no body, ``State.body_f``, and every part of ``Control`` except ``joint_f``,
-    which is added to the passive joint forces.
+    The physics is the same as in :func:`newton_qd.physics.step`. The robot touches the
+    ground z = 0 with the spheres and the material of its ``RobotSpec``. The solver
+    therefore ignores: ``contacts``; the materials, limit gains and effort limits of the
+    model; shapes without a body; ``State.body_f``; and every part of ``Control`` except
+    ``joint_f``. ``joint_f`` is added to the passive joint forces.
 
-    Joint velocities and forces follow Newton's convention: those of a free joint belong
-    to the child's centre of mass. Nothing is differentiable by ``wp.Tape``; gradients
-    come from :func:`newton_qd.physics.step`. Step once with each ``dt``, eight at most,
-    before a CUDA graph is captured, so that every buffer exists and stays.
+    Joint velocities and forces follow Newton's convention: for a free joint they refer
+    to the child's centre of mass. ``wp.Tape`` cannot differentiate the solver. For
+    gradients use :func:`newton_qd.physics.step`. Before you capture a CUDA graph, step
+    once with each ``dt`` that it uses, at most eight. Then every buffer exists and
+    stays in memory.
 
     Attributes:
-        fault: (worlds,) 1 where the last step met a number that is not finite or a
-            speed beyond 1,000 [m/s or rad/s]; such a world keeps the coordinates and
-            velocities of ``state_in``. Else 0.
+        fault: (worlds,) 1 if the last step met a non-finite value or a speed above
+            1,000 [m/s or rad/s], else 0. A world with a fault keeps the coordinates and
+            velocities of ``state_in``.
         impulse: (worlds, nb, 6) contact impulses of the last step, as in
             :class:`~newton_qd.physics.system.PhysicsState`.
-        normal_impulse: (worlds, nb) likewise [N s].
+        normal_impulse: (worlds, nb) normal contact impulses of the last step [N s].
     """
 
     def __init__(self, model: newton.Model, robot: RobotSpec) -> None:
         """Checks the model and allocates the buffers of a step.
 
         Args:
-            model: Worlds that are copies of the robot.
-            robot: Row of the robot.
+            model: Newton model. Each world is a copy of the robot.
+            robot: The robot.
 
         Raises:
-            ValueError: ``model`` is something else; names the array that differs.
-            TypeError: ``robot`` is something else.
+            ValueError: A world of ``model`` is not a copy of the robot. The message
+                names the array that differs.
+            TypeError: ``robot`` is not a ``RobotSpec``.
             AssetNotFoundError: The robot's URDF file does not exist.
-            RobotDescriptionError: The file or the robot is not one that physics can
-                run.
+            RobotDescriptionError: The physics does not support the file or the robot.
         """
         super().__init__(model)
         self.robot = robot
@@ -142,19 +144,20 @@ class NewtonQDSolver(SolverBase):
         """Advances every world by one substep of length ``dt``.
 
         Args:
-            state_in: Joint coordinates and velocities are read.
-            state_out: Joint coordinates and velocities, and the poses and velocities
-                of the bodies, are written; may be ``state_in``.
-            control: ``joint_f`` is read: generalized forces [N or N m]; ``None``
-                takes the model's.
-            contacts: Ignored, ``None`` is fine.
-            dt: Duration [s]; the robot's row was made for ``dt / substeps`` of it.
-            observables: This solver has none.
+            state_in: State to start from. Joint coordinates and velocities are read.
+            state_out: State to write: joint coordinates and velocities, and poses and
+                velocities of the bodies. It may be ``state_in``.
+            control: ``joint_f`` is read: generalized forces [N or N m]. ``None``: the
+                ``joint_f`` of the model.
+            contacts: Ignored. ``None`` is allowed.
+            dt: Duration of the substep [s]. The robot's ``RobotSpec`` was made for
+                substeps of ``RobotSpec.dt / RobotSpec.substeps``.
+            observables: Not supported. It must be ``None`` or empty.
 
         Raises:
-            ValueError: ``dt`` is not positive, an array has another size, or an
-                environment variable is wrong.
-            NotImplementedError: ``observables`` has any.
+            ValueError: ``dt`` is not positive, an array has the wrong size, or the
+                value of an environment variable is not allowed.
+            NotImplementedError: ``observables`` is not empty.
             RuntimeError: A ``wp.Tape`` is recording.
         """
         self.validate_observables(observables)
@@ -182,13 +185,13 @@ class NewtonQDSolver(SolverBase):
         newton.eval_fk(self.model, q_new.flatten(), qd_new.flatten(), state_out)
 
     def notify_model_changed(self, flags: newton.ModelFlags | int) -> None:
-        """Checks again that every world is the robot.
+        """Checks again that every world is a copy of the robot.
 
         Args:
-            flags: Ignored; everything is checked.
+            flags: Ignored. All arrays are checked.
 
         Raises:
-            ValueError: The model is no longer copies of the robot.
+            ValueError: A world is no longer a copy of the robot.
         """
         _check_model(self.model, self._reference, self.robot)
 
@@ -196,7 +199,7 @@ class NewtonQDSolver(SolverBase):
         """Returns the array as (worlds, columns), without a copy.
 
         Raises:
-            ValueError: It is missing, or has the wrong size.
+            ValueError: The array is missing, or has the wrong size.
         """
         size = self._worlds * columns
         if array is None or array.shape != (size,):
@@ -209,7 +212,7 @@ class NewtonQDSolver(SolverBase):
 
 
 def _driven_by_forces(system: System) -> System:
-    """Returns the system with a force on every degree of freedom as its actions."""
+    """Returns the system with one action for each degree of freedom: a force."""
     return dataclasses.replace(
         system,
         control_dof=np.arange(system.nv, dtype=np.int32),
@@ -218,18 +221,18 @@ def _driven_by_forces(system: System) -> System:
 
 
 def _launcher(system: System, device: wp.Device, dt: float) -> Launcher:
-    """Returns the launcher of one substep of ``dt`` [s]."""
+    """Returns the launcher of one substep with length ``dt`` [s]."""
     robot = dataclasses.replace(system.robot, dt=dt, substeps=1)
     return Launcher(dataclasses.replace(system, robot=robot), device)
 
 
 def _one_world(robot: RobotSpec, device: wp.Device) -> newton.Model:
-    """Returns what Newton makes of the robot alone, as its users would build it."""
+    """Returns Newton's model of the robot alone, built as users build it."""
     path = find_urdf(robot.urdf)
     floating = read_description(path).floating
     builder = newton_builder(str(path), floating, robot.gravity)
     with warnings.catch_warnings():
-        # that it corrects inertias it has said of the caller's model already
+        # Newton has already warned about corrected inertias in the caller's model.
         warnings.simplefilter("ignore", newton.NewtonWarning)
         return builder.finalize(device=device)
 
@@ -280,7 +283,10 @@ def _per_world(model: newton.Model, name: str, worlds: int) -> np.ndarray:
 
 
 def _colliders(model: newton.Model, name: str, nb: int) -> list[np.ndarray]:
-    """Returns a shape array of each world's colliders, sorted by body."""
+    """Returns the rows of a shape array for the colliders of each world.
+
+    The rows are sorted by body.
+    """
     body, flags = model.shape_body.numpy(), model.shape_flags.numpy()
     values = getattr(model, name).numpy()
     values = values.reshape(len(body), math.prod(values.shape[1:]))
@@ -295,7 +301,7 @@ def _colliders(model: newton.Model, name: str, nb: int) -> list[np.ndarray]:
 def _compare(
     name: str, worlds: np.ndarray, robot: np.ndarray, first_world: int = 0
 ) -> None:
-    """Checks that the row of each world is equal to that of the robot.
+    """Checks that the row of each world equals the row of the robot.
 
     Raises:
         ValueError: A row differs.

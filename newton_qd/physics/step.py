@@ -13,7 +13,7 @@ from newton_qd.physics.system import CONTACT_FRACTION, PhysicsState, System
 
 
 def initial_state(system: System, q: jax.Array, v: jax.Array) -> PhysicsState:
-    """A state before its first step: nothing has touched the ground yet.
+    """Returns the state before the first step, with zero contact impulses.
 
     Args:
         system: The system.
@@ -24,7 +24,8 @@ def initial_state(system: System, q: jax.Array, v: jax.Array) -> PhysicsState:
         The state.
 
     Raises:
-        ValueError: ``q`` or ``v`` has another shape, where the bodies are computed.
+        ValueError: ``q`` or ``v`` has the wrong shape. This is checked only if the
+            kinematics of the bodies are computed.
     """
     dtype = jnp.dtype(system.dtype)
     q, v = jnp.asarray(q, dtype), jnp.asarray(v, dtype)
@@ -35,7 +36,7 @@ def initial_state(system: System, q: jax.Array, v: jax.Array) -> PhysicsState:
         seen = bodies or forward_kinematics(system, q, v)
         torso_xy = seen.position[system.torso, :2]
     feet = system.feet.shape
-    # of no load: 1 / (1 + exp(.)), which does not overflow
+    # The value without load, 1 / (1 + exp(.)), in a form that does not overflow.
     unloaded = np.exp(-np.logaddexp(0.0, CONTACT_FRACTION / system.feet_width))
     return PhysicsState(
         q=q,
@@ -60,22 +61,23 @@ def step(
     Args:
         system: The system.
         state: State of the world.
-        control: (nu,) actions [-]; scaled by the gear, never clipped.
-        params: Physical parameters of the world; ``None``: those of the system,
-            with kernels that have no place for others.
+        control: (nu,) actions [-]. They are scaled by the gear and not clipped.
+        params: Physical parameters of the world. ``None``: the parameters of the
+            system, with kernels that do not read parameters.
 
     Returns:
-        The next state, and the fault () int32: 0, or 1 where anything was not
-        finite or a velocity exceeded 1,000 [m/s or rad/s]; then ``q`` and ``v`` are
-        the given ones (the default pose at rest if those are not finite), the
-        impulses are zero and every gradient through the step is exactly zero.
+        The next state, and the fault () int32. The fault is 1 if a value was not
+        finite or a velocity exceeded 1,000 [m/s or rad/s], else 0. After a fault
+        ``q`` and ``v`` are those of ``state``, or the default pose at rest if those
+        are not finite. The impulses are zero, and every gradient through the step is
+        exactly zero.
 
     Raises:
-        TypeError: The state, the control or a parameter has another type than the
-            system.
-        ValueError: The state, the control or a parameter has another shape, a
-            parameter that is not traced is out of bounds, or an environment variable
-            is wrong.
+        TypeError: The type of the state, the control or a parameter is not that of
+            the system.
+        ValueError: The state, the control or a parameter has the wrong shape; a
+            concrete parameter is out of bounds; or the value of an environment
+            variable is not allowed.
     """
     own = None if params is None else parameter_row(system, params)
     run = bridge.control_step(system)

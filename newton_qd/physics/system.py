@@ -14,76 +14,80 @@ from newton_qd.robots import RobotSpec
 from newton_qd.scenes import Scene
 
 CONTACT_FRACTION = 0.01
-"""Share of the robot's weight above which a foot touches the ground [-]."""
+"""Minimum load of a foot that counts as contact, as a share of the weight [-]."""
 STANDARD_GRAVITY = 9.81
-"""Gives a robot without gravity the weight that its feet are measured by [m/s^2]."""
+"""Gravity that defines the weight of a robot whose own gravity is 0 [m/s^2].
+
+The contacts of its feet are measured relative to this weight.
+"""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class System:
-    """One world: the kinematic tree, its material and its scene.
+    """Description of one world: the kinematic tree, its material and its scene.
 
-    All arrays are float64 or int32 NumPy arrays, read-only; the kernels read a
-    copy in the precision ``dtype``. Systems compare and hash by identity.
-    Bodies are ordered parents first; joint ``i`` connects body ``i`` to its
-    parent. Quaternions are (x, y, z, w) here and in the kernels, and in ``q``.
+    All arrays are read-only NumPy arrays, float64 or int32. The kernels read a copy in
+    the precision ``dtype``. Systems compare and hash by identity. A parent body comes
+    before its children. Joint ``i`` connects body ``i`` to its parent. Quaternions are
+    (x, y, z, w) here, in the kernels and in ``q``.
 
     Attributes:
-        robot: The row that the system was built from.
-        scene: The row of what stands on the ground; ``None``: nothing.
-        dtype: ``"float32"`` or ``"float64"``: precision of the kernels.
+        robot: The robot that the system was built from.
+        scene: The scene with the obstacles. ``None``: only the ground.
+        dtype: Precision of the kernels: ``"float32"`` or ``"float64"``.
         body_names: (nb,) URDF link names.
-        joint_names: (nb,) URDF joint names; the root's is the empty string when
-            Newton made the joint.
+        joint_names: (nb,) URDF joint names. The name is empty for a root joint that
+            Newton added.
         parent: (nb,) parent body, -1 for the world.
         joint_kind: (nb,) see :class:`JointKind`.
-        q_start: (nb,) first coordinate of a joint in ``q``.
-        v_start: (nb,) first degree of freedom of a joint in ``v``.
+        q_start: (nb,) index of a joint's first coordinate in ``q``.
+        v_start: (nb,) index of a joint's first degree of freedom in ``v``.
         joint_axis: (nb, 3) axis in the joint frame [-].
         parent_frame: (nb, 7) joint frame in the parent body, position [m] and
             quaternion.
         child_frame: (nb, 7) joint frame in the child body, position [m] and
             quaternion.
-        mass: (nb,) [kg].
+        mass: (nb,) mass [kg].
         com: (nb, 3) centre of mass in the body frame [m].
-        inertia: (nb, 3, 3) about the centre of mass, body axes [kg m^2].
+        inertia: (nb, 3, 3) inertia about the centre of mass, body axes [kg m^2].
         armature: (nv,) rotor inertia [kg m^2 or kg].
         damping: (nv,) viscous joint damping [N m s/rad or N s/m].
         stiffness: (nv,) joint spring [N m/rad or N/m].
         spring_rest: (nv,) rest angle of the joint spring [rad or m].
-        limit_lower: (nv,) [rad or m]; -inf where there is none.
-        limit_upper: (nv,) [rad or m]; +inf where there is none.
-        limit_stiffness: (nv,) [N m/rad or N/m]; 0 where there is no limit.
+        limit_lower: (nv,) lower limit [rad or m], -inf without a limit.
+        limit_upper: (nv,) upper limit [rad or m], +inf without a limit.
+        limit_stiffness: (nv,) stiffness of the limits [N m/rad or N/m], 0 without a
+            limit.
         control_dof: (nu,) degree of freedom that each action drives.
         gear: (nu,) generalized force of a unit action [N m or N].
         contact_body: (nc,) body of each contact sphere or capsule, ascending.
         contact_position: (nc, 3) centre in the body frame [m].
-        contact_segment: (nc, 3) from the centre to an end of a capsule's axis in
-            the body frame [m]; zero for a sphere, and not read for the ground.
-        contact_radius: (nc,) [m].
-        contact_obstacle: (nc,) row of the obstacle tables; -1 for a side of a pair.
-        contact_pairs: (np, 2) rows of the two sides of each pair of colliders, on
-            two bodies, that may touch each other.
-        contact_pair_share: (np,) how much of a pair's relative motion an impulse
+        contact_segment: (nc, 3) vector from the centre to an end of a capsule's axis
+            in the body frame [m]. Zero for a sphere. Not read for the ground.
+        contact_radius: (nc,) radius [m].
+        contact_obstacle: (nc,) row of the obstacle tables, -1 for a side of a pair.
+        contact_pairs: (np, 2) rows of the contact tables for the two sides of each
+            pair. A pair is two colliders on two bodies that may touch each other.
+        contact_pair_share: (np,) share of a pair's relative motion that an impulse
             gives to its first side, between 0 and 1 [-].
         obstacle_kind: (no,) see :class:`ObstacleKind`.
-        obstacle_frame: (no, 7) world pose; a plane's normal and a capsule's
-            axis are the local z axis.
-        obstacle_size: (no, 3) capsule: radius, half length, 0; box: half
-            extents [m]; plane: zeros.
-        scene_links: (ns,) names of the links that never move: those of the robot
-            that are fixed to the world, then the scene's.
-        scene_frames: (ns, 7) their frames in the world.
-        contact_stiffness: [N/m].
+        obstacle_frame: (no, 7) pose in the world. The normal of a plane and the axis
+            of a capsule are the local z axis.
+        obstacle_size: (no, 3) size [m]. Capsule: radius, half length, 0. Box: half
+            extents. Plane: zeros.
+        scene_links: (ns,) names of the links that do not move: first the links of the
+            robot that are fixed to the world, then the links of the scene.
+        scene_frames: (ns, 7) frames of these links in the world.
+        contact_stiffness: Stiffness of every contact [N/m].
         feet: (nf,) body index of each foot.
-        feet_width: Share of the robot's weight over which the smooth contact of a
-            foot rises [-].
-        reports_bodies: Whether a step reports where the bodies are.
+        feet_width: Width of the smooth contact step of a foot, as a share of the
+            robot's weight [-].
+        reports_bodies: Whether a step reports the kinematics of the bodies.
         torso: Body index of the torso.
-        rest_q: (nq,) coordinates of the default pose, ``v`` being 0.
+        rest_q: (nq,) coordinates of the default pose. Its velocities are 0.
 
     Raises:
-        ValueError: A contact table has another length than ``contact_body``.
+        ValueError: The length of a contact table is not that of ``contact_body``.
     """
 
     robot: RobotSpec
@@ -135,7 +139,7 @@ class System:
             if isinstance(value, np.ndarray):
                 value.setflags(write=False)
         for field in ("position", "segment", "radius", "obstacle"):
-            # the kernels read these tables without looking at their length
+            # The kernels read these tables without checking their length.
             rows = len(getattr(self, f"contact_{field}"))
             if rows != len(self.contact_body):
                 allowed = f"{len(self.contact_body)}, as many as contact_body has"
@@ -164,17 +168,17 @@ class System:
 
     @property
     def torso_floats(self) -> bool:
-        """Whether the torso moves freely, so that its position is in ``q``."""
+        """Whether the torso has a free joint. Then its position is in ``q``."""
         return self.joint_kind[self.torso] == JointKind.FREE
 
     @property
     def has_boxes(self) -> bool:
-        """Whether an obstacle is a box, for which the kernels have more to do."""
+        """Whether an obstacle is a box. Boxes need another variant of the kernels."""
         return bool(np.any(self.obstacle_kind == ObstacleKind.BOX))
 
     @property
     def ground_contacts(self) -> np.ndarray:
-        """Rows of the contact tables that touch the ground, obstacle 0."""
+        """Rows of the contact tables for the ground, which is obstacle 0."""
         return np.flatnonzero(self.contact_obstacle == 0)
 
     @property
@@ -186,14 +190,14 @@ class System:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Kinematics:
-    """Where the bodies are and how they move, world axes.
+    """Poses and velocities of the bodies, in world axes.
 
     Attributes:
         position: (nb, 3) origin of the link frame [m].
         rotation: (nb, 4) quaternion xyzw of the link frame.
         com: (nb, 3) centre of mass [m].
-        linear_velocity: (nb, 3) of the centre of mass [m/s].
-        angular_velocity: (nb, 3) [rad/s].
+        linear_velocity: (nb, 3) velocity of the centre of mass [m/s].
+        angular_velocity: (nb, 3) angular velocity [rad/s].
     """
 
     position: jax.Array
@@ -206,30 +210,30 @@ class Kinematics:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class PhysicsState:
-    """State of a world, and what is read from it.
+    """State of a world, and values that the last step computed.
 
-    A step starts from ``q`` and ``v`` alone and writes all the rest: for a state of
-    other coordinates call :func:`~newton_qd.physics.initial_state`.
+    A step reads only ``q`` and ``v`` and writes all fields. To create a state with
+    other coordinates, call :func:`~newton_qd.physics.initial_state`.
 
-    A free root has coordinates (position of the root origin, quaternion xyzw)
-    and velocities (linear velocity of the root origin, angular velocity), all
-    in world axes.
+    The coordinates of a free root are the position of the root origin and the
+    quaternion xyzw. Its velocities are the linear velocity of the root origin and the
+    angular velocity. All are in world axes.
 
     Attributes:
         q: (nq,) coordinates [m or rad].
         v: (nv,) velocities [m/s or rad/s].
-        impulse: (nb, 6) contact impulse on each body over the control step,
-            friction included: linear [N s], then angular about the body's
-            centre of mass [N m s], world axes.
+        impulse: (nb, 6) contact impulse on each body over the control step, with
+            friction, in world axes: linear [N s], then angular about the body's
+            centre of mass [N m s].
         normal_impulse: (nb,) sum of the normal contact impulses on each body
-            over the control step [N s]; never negative.
-        feet_contact: (nf,) 1 where a foot carried more than 1 % of the robot's
-            weight over the control step, else 0; its gradient is 0.
-        smooth_feet_contact: (nf,) the same as a smooth step of the system's
-            ``feet_width``, 0.5 where the other switches.
+            over the control step [N s]. Never negative.
+        feet_contact: (nf,) 1 if a foot carried more than 1 % of the robot's weight
+            over the control step, else 0. Its gradient is 0.
+        smooth_feet_contact: (nf,) smooth version of ``feet_contact``: a smooth step
+            with the system's ``feet_width``. It is 0.5 at the load where
+            ``feet_contact`` switches.
         torso_xy: (2,) x and y of the torso's link frame [m].
-        bodies: Where the bodies are and how they move; ``None`` where the system does
-            not report it.
+        bodies: Kinematics of the bodies. ``None`` if the system does not report them.
     """
 
     q: jax.Array

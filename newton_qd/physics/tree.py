@@ -1,4 +1,4 @@
-"""Tables of a kinematic tree that the kernels walk, and the origin they work about."""
+"""Index tables of a kinematic tree, and the origin of spatial vectors."""
 
 from __future__ import annotations
 
@@ -12,14 +12,17 @@ from newton_qd.physics.system import JointKind, System
 
 
 def _ragged(rows: Sequence[Sequence[int]]) -> tuple[np.ndarray, np.ndarray]:
-    """Starts and concatenated items of a list of lists (one item at least)."""
+    """Returns the row starts and the concatenated items of a list of lists.
+
+    If there are no items, the result has one item 0.
+    """
     starts = np.cumsum([0, *map(len, rows)], dtype=np.int32)
     items = [item for row in rows for item in row] or [0]
     return starts, np.asarray(items, np.int32)
 
 
 def _by_level(level: Sequence[int]) -> list[list[int]]:
-    """Items grouped by level, roots first."""
+    """Returns the items grouped by level, roots first."""
     return [
         [item for item, its in enumerate(level) if its == n]
         for n in range(max(level) + 1)
@@ -28,13 +31,13 @@ def _by_level(level: Sequence[int]) -> list[list[int]]:
 
 @dataclasses.dataclass(frozen=True)
 class Tree:
-    """Index tables of a system; bodies are counted from 1, row 0 is the world.
+    """Index tables of a system. Bodies are counted from 1; row 0 is the world.
 
     Attributes:
-        body_parent: (nb + 1,).
-        body_level: Level starts and bodies, roots first.
-        child: Child starts (nb + 2) and children of each body.
-        contact: Starts (nb + 2) of each body's contacts.
+        body_parent: (nb + 1,) parent of each body.
+        body_level: Start of each level, and the bodies by level, roots first.
+        child: (nb + 2,) start of each body's children, and the children.
+        contact: (nb + 2,) start of each body's contacts.
     """
 
     body_parent: np.ndarray
@@ -44,7 +47,7 @@ class Tree:
 
 
 def build_tree(system: System) -> Tree:
-    """Index tables of ``system``."""
+    """Returns the index tables of ``system``."""
     nb = system.nb
     parent = [-1, *(int(p) + 1 for p in system.parent)]
     level = [-1]
@@ -63,13 +66,14 @@ def build_tree(system: System) -> Tree:
 
 
 def origin_axes(system: System) -> np.ndarray:
-    """Returns how the origin O of spatial vectors moves with the first coordinates.
+    """Returns the derivative of the origin O with respect to the first coordinates.
 
-    O is the position of a free root, or the point that the slides at the root have
-    carried away from the origin of the world.
+    O is the origin of spatial vectors. With a free root, O is the position of the root.
+    Otherwise O starts at the origin of the world and moves with the prismatic joints at
+    the root.
 
     Returns:
-        (3, 3) row i is the step of O for each metre of coordinate i, world axes [-].
+        (3, 3) row i is the motion of O per metre of coordinate i, world axes [-].
     """
     if system.joint_kind[0] == JointKind.FREE:
         return np.eye(3)

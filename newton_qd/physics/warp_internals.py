@@ -1,8 +1,8 @@
-"""The parts of Warp that its documentation does not name, all in this one file.
+"""All uses of undocumented parts of Warp.
 
-Warp offers no public way to do what is done here, and moves these parts between its
-versions. So each is looked for in every place that it had, newest first, and where it
-is in none of them one error says which Warp was found and which versions work.
+Warp has no public interface for what this file does, and its versions have these parts
+in different modules. The functions search all known modules, newest first. If a part is
+missing, one error names the installed Warp and the versions that work.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class UnsupportedWarpError(ImportError):
 
 
 def _versions() -> str:
-    """Versions of Warp that newton_qd asks for, as its metadata states them."""
+    """Returns the versions of Warp that the metadata of newton_qd requires."""
     try:
         required = metadata.requires("newton_qd") or []
     except metadata.PackageNotFoundError:
@@ -50,12 +50,12 @@ def _unsupported(part: str, places: tuple[str, ...]) -> UnsupportedWarpError:
 
 
 def _module_with(part: str, places: tuple[str, ...]) -> ModuleType:
-    """First of several modules that exists and has ``part``, such as ``"A.b"``."""
+    """Returns the first module that exists and has ``part``, for example ``"A.b"``."""
     for place in places:
         try:
             module = importlib.import_module(place)
         except ModuleNotFoundError as error:
-            # an import that fails inside of a module that is there is another error
+            # The module exists, but an import inside it failed: a different error.
             if not f"{place}.".startswith(f"{error.name}."):
                 raise
             continue
@@ -74,19 +74,19 @@ def _has(owner: Any, part: str) -> bool:
 
 @functools.cache
 def ffi_module() -> ModuleType:
-    """The module of Warp whose functions XLA calls.
+    """Returns the module of Warp whose functions XLA calls.
 
     Raises:
-        UnsupportedWarpError: This Warp has none that is known.
+        UnsupportedWarpError: The installed Warp has no such module.
     """
     return _module_with("FfiCallable.ffi_callback", _FFI)
 
 
 def ffi_callback() -> Callable[..., object]:
-    """The method that XLA enters Python by, when it runs a ``wp.jax_callable``.
+    """Returns the method that XLA calls to run a ``wp.jax_callable``.
 
     Raises:
-        UnsupportedWarpError: This Warp has none that is known.
+        UnsupportedWarpError: The installed Warp has no such method.
     """
     return ffi_module().FfiCallable.ffi_callback
 
@@ -97,10 +97,10 @@ def _context() -> ModuleType:
 
 
 def tape_is_recording() -> bool:
-    """Whether the program is inside of a ``wp.Tape``.
+    """Returns whether a ``wp.Tape`` is recording.
 
     Raises:
-        UnsupportedWarpError: This Warp does not say so.
+        UnsupportedWarpError: The installed Warp does not expose its tape.
     """
     module = _context()
     if module.runtime is None:  # nothing has run yet
@@ -111,17 +111,17 @@ def tape_is_recording() -> bool:
 
 
 def field_dtype(struct: Any, name: str) -> type:
-    """Type of the elements of an array in a struct.
+    """Returns the type of the elements of an array in a struct.
 
     Args:
-        struct: Class that ``wp.struct`` made.
-        name: Field; an array.
+        struct: Class from ``wp.struct``.
+        name: Name of a field. The field is an array.
 
     Returns:
-        The Warp type, as ``wp.vec3``.
+        The Warp type, for example ``wp.vec3``.
 
     Raises:
-        UnsupportedWarpError: Structs of this Warp do not say so.
+        UnsupportedWarpError: Structs of the installed Warp do not expose their types.
     """
     if not _has(struct, "vars"):
         raise _unsupported("vars", (type(struct).__qualname__,))
@@ -129,17 +129,17 @@ def field_dtype(struct: Any, name: str) -> type:
 
 
 def never_replay(function: FunctionT) -> FunctionT:
-    """Keep the adjoint of a caller from calling a function again for its results.
+    """Mark a function so that the adjoint of its caller does not call it a second time.
 
     Args:
-        function: What ``wp.func`` made; changed in place.
+        function: Function from ``wp.func``. It is changed in place.
 
     Returns:
         ``function``.
 
     Raises:
-        UnsupportedWarpError: Functions of this Warp cannot be marked so; unmarked they
-            would be called twice, and the gradient would be wrong.
+        UnsupportedWarpError: The installed Warp has no such mark. Without it the
+            function would run twice, and the gradient would be wrong.
     """
     if not _has(function, "skip_replay"):
         raise _unsupported("skip_replay", (type(function).__qualname__,))

@@ -1,8 +1,8 @@
-"""Threads that take a share of a CPU launch.
+"""Worker threads for CPU launches.
 
-A launch lasts some hundred microseconds, about as long as an idle core needs to wake
-up. So a worker looks for its next job for a moment before it sleeps, as OpenMP's
-threads do; a scan over control steps then finds it awake.
+A launch takes a few hundred microseconds. An idle core needs about as long to wake up.
+A worker therefore polls for its next job for a short time before it sleeps, as the
+threads of OpenMP do. In a scan over control steps it then stays awake.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Arguments = TypeVarTuple("Arguments")
 
 
 def _take(source: queue.SimpleQueue[Item]) -> Item:
-    """Next item: looked for at once, then waited for."""
+    """Returns the next item. It polls for a short time, then blocks."""
     deadline = time.perf_counter() + _AWAKE_SECONDS
     while time.perf_counter() < deadline:
         try:
@@ -45,23 +45,23 @@ class Worker:
             error: BaseException | None = None
             try:
                 function(*arguments)
-            except BaseException as raised:  # handed to the thread that waits
+            except BaseException as raised:  # the waiting thread raises it
                 error = raised
-            # nothing of the job may outlive it while this thread waits
+            # Free the job's objects before this thread waits for the next job.
             del function, arguments
             self._ends.put(error)
 
     def start(
         self, function: Callable[[*Arguments], None], *arguments: *Arguments
     ) -> None:
-        """Begin a job."""
+        """Start a job."""
         self._jobs.put((function, arguments))
 
     def wait(self) -> None:
-        """Wait for the job's end.
+        """Wait for the end of the job.
 
         Raises:
-            BaseException: What the job raised.
+            BaseException: The exception that the job raised.
         """
         error = _take(self._ends)
         if error is not None:

@@ -1,9 +1,9 @@
-"""From a robot's URDF file to a System: everything that runs before the first step.
+"""Builds a System from a robot's URDF file, before the first step.
 
-``xml_reader``, ``elements`` and ``description`` read the file, ``robot_checks`` checks
-the robot, ``build`` lets Newton build its model and ``verify`` compares the two.
-``contacts``, ``scene`` and ``rest`` add what can touch what, the walls and the default
-pose.
+``xml_reader``, ``elements`` and ``description`` read the file. ``robot_checks`` checks
+the ``RobotSpec``. ``build`` builds Newton's model, and ``verify`` compares this model
+with the file. ``contacts`` adds the contacts, ``scene`` the obstacles and ``rest`` the
+default pose.
 """
 
 from newton_qd.physics.model.build import build_system, load_system, newton_builder

@@ -1,8 +1,8 @@
-"""Builds a System: the URDF file through Newton's model, and the robot's row.
+"""Builds a System from a robot's URDF file and its ``RobotSpec``.
 
-Newton decides the order of bodies and coordinates. It stores single precision, so
-once :mod:`newton_qd.physics.model.verify` has shown that its numbers are the file's,
-the System takes them in the file's double precision.
+Newton imports the file and defines the order of bodies and coordinates. Newton stores
+single precision. :mod:`newton_qd.physics.model.verify` checks that its numbers equal
+those of the file. The System then takes the numbers from the file, in double precision.
 """
 
 from __future__ import annotations
@@ -37,17 +37,18 @@ _DEFAULT_GEAR = 100.0  # [N m]
 
 
 def newton_builder(path: str, floating: bool, gravity: float) -> newton.ModelBuilder:
-    """Imports a URDF file into a Newton builder, as the suite needs it.
+    """Imports a URDF file into a Newton builder, with the settings of this package.
 
     Args:
         path: The file.
-        floating: Whether the root link floats; else it is fixed to the world.
+        floating: Whether the root link floats. If false, it is fixed to the world.
         gravity: Downward acceleration [m/s^2].
     """
     import newton
 
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, -gravity))
-    # Links without <inertial> are massless, not as heavy as their colliders.
+    # Links without <inertial> have no mass. By default Newton computes a mass from the
+    # colliders.
     builder.default_shape_cfg.density = 0.0
     builder.add_urdf(path, floating=floating, collapse_fixed_joints=True)
     return builder
@@ -85,10 +86,10 @@ def _numpy(array: object) -> np.ndarray:
 
 
 def _joint_kinds(model: newton.Model, description: Description) -> np.ndarray:
-    """Returns the kind of every Newton joint (number of joints,).
+    """Returns the kinds (number of joints,) of Newton's joints.
 
     Raises:
-        RobotDescriptionError: Newton made a joint of an unsupported kind.
+        RobotDescriptionError: The kind of a joint is not supported.
     """
     from newton import JointType
 
@@ -112,7 +113,7 @@ def _read_newton(model: newton.Model, description: Description) -> BuiltModel:
     """Copies the model into NumPy arrays ordered by body.
 
     Raises:
-        ModelMismatchError: Newton's joints do not move each body once.
+        ModelMismatchError: A body of Newton's model has no joint, or several.
     """
     prefix = f"{description.name}/" if description.name else ""
     kinds = _joint_kinds(model, description)
@@ -175,7 +176,7 @@ def _control(
 
 
 def _body_arrays(bodies: list[Body]) -> dict[str, np.ndarray]:
-    """Returns the joint frames and the inertias, each (nb, ...)."""
+    """Returns the joint frames and the inertias, arrays of shape (nb, ...)."""
     joints = [body.joint for body in bodies]
     return {
         "joint_axis": np.array([j.axis if j else np.zeros(3) for j in joints]),
@@ -190,7 +191,7 @@ def _body_arrays(bodies: list[Body]) -> dict[str, np.ndarray]:
 def _dof_arrays(
     robot: RobotSpec, built: BuiltModel, bodies: list[Body], control: dict
 ) -> dict[str, np.ndarray]:
-    """Returns the joint springs, dampers and limits, each (nv,)."""
+    """Returns the joint springs, dampers and limits, arrays of shape (nv,)."""
     nv = int(sum(6 if kind == JointKind.FREE else 1 for kind in built.joint_kind))
     lower, upper = np.full(nv, -np.inf), np.full(nv, np.inf)
     damping = np.zeros(nv)
@@ -200,7 +201,8 @@ def _dof_arrays(
             damping[start] = body.joint.damping
     gear = np.full(nv, control["gear"].max(initial=0.0) or _DEFAULT_GEAR)
     gear[control["control_dof"]] = control["gear"]
-    # A servo is a spring to the angle 0 and the torque of its target: both implicit.
+    # A servo is a spring towards the angle 0, plus a torque from its target angle. Both
+    # are integrated implicitly.
     servo = [joint in robot.servos for joint, _ in robot.actuators]
     stiffness = np.zeros(nv)
     stiffness[control["control_dof"][servo]] = control["gear"][servo]
@@ -222,14 +224,14 @@ def build_system(robot: RobotSpec, dtype: str, scene: Scene | None = None) -> Sy
     """Builds the immutable description of a robot in a scene.
 
     Args:
-        robot: The robot's row.
-        dtype: ``"float32"`` or ``"float64"``: precision of the kernels.
-        scene: What stands on the flat ground; ``None``: nothing.
+        robot: The robot.
+        dtype: Precision of the kernels: ``"float32"`` or ``"float64"``.
+        scene: The obstacles on the flat ground. ``None``: no obstacles.
 
     Raises:
-        TypeError: ``robot`` or ``scene`` is something else.
+        TypeError: ``robot`` is not a ``RobotSpec``, or ``scene`` is not a ``Scene``.
         AssetNotFoundError: A URDF file does not exist.
-        RobotDescriptionError: A file or a robot is not one that physics can run.
+        RobotDescriptionError: The physics does not support a file or the robot.
         ModelMismatchError: Newton's model differs from the file.
         ValueError: ``dtype`` is not allowed, or needs JAX's 64-bit mode.
     """
@@ -237,7 +239,7 @@ def build_system(robot: RobotSpec, dtype: str, scene: Scene | None = None) -> Sy
     check_robot(robot)
     description = read_description(find_urdf(robot.urdf))
     builder = newton_builder(str(description.path), description.floating, robot.gravity)
-    # The file's inertias are checked already; Newton would correct some silently.
+    # The inertias of the file are already checked. Newton would change some silently.
     model = builder.finalize(skip_validation_inertia=True)
     built = _read_newton(model, description)
     verify(built, description)
@@ -305,28 +307,29 @@ def load_system(
     feet_width: float | None = None,
     reports_bodies: bool = False,
 ) -> System:
-    """Returns the system of a robot, built once per process and arguments.
+    """Returns the system of a robot. A process builds it once for the same arguments.
 
     Args:
-        robot: The robot's row.
-        dtype: ``"float32"`` or ``"float64"``, which needs JAX's 64-bit mode.
-        scene: What stands on the flat ground; ``None``: nothing.
-        feet_width: Share of the robot's weight over which the smooth contact of a
-            foot rises [-], above 0; ``None``: 0.02.
-        reports_bodies: Whether a step reports where the bodies are.
+        robot: The robot.
+        dtype: Precision of the kernels: ``"float32"`` or ``"float64"``. ``"float64"``
+            needs JAX's 64-bit mode.
+        scene: The obstacles on the flat ground. ``None``: no obstacles.
+        feet_width: Width of the smooth contact step of a foot, as a share of the
+            robot's weight [-], above 0. ``None``: 0.02.
+        reports_bodies: Whether a step reports the kinematics of the bodies.
 
     Raises:
-        TypeError: ``robot`` or ``scene`` is something else.
+        TypeError: ``robot`` is not a ``RobotSpec``, or ``scene`` is not a ``Scene``.
         AssetNotFoundError: A URDF file does not exist.
-        RobotDescriptionError: A file or a robot is not one that physics can run.
+        RobotDescriptionError: The physics does not support a file or the robot.
         ModelMismatchError: Newton's model differs from the file.
-        ValueError: ``dtype`` is not allowed, or needs JAX's 64-bit mode; or
+        ValueError: ``dtype`` is not allowed, or needs JAX's 64-bit mode. Or
             ``feet_width`` is not above 0.
     """
     dtype = checks.precision(dtype).name
     checks.number(
         "feet_width", feet_width, above=0, endless=True, optional=True, error=ValueError
     )
-    check_robot(robot)  # before the cache hashes it
+    check_robot(robot)  # before the cache computes its hash
     system = _cached_system(robot, dtype, scene)
     return _cached_variant(system, feet_width, reports_bodies)

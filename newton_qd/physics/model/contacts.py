@@ -1,4 +1,4 @@
-"""Finds what of a robot touches what: the ground, the walls, its own links."""
+"""Builds the contact tables: contacts with the ground, with walls and of link pairs."""
 
 from __future__ import annotations
 
@@ -23,10 +23,16 @@ from newton_qd.scenes import Scene
 
 
 def body_of(robot: RobotSpec, field: str, link: str, bodies: list[Body]) -> int:
-    """Returns the body that holds a link which the robot's field names.
+    """Returns the index of the body that contains a link.
+
+    Args:
+        robot: The robot.
+        field: Field of the robot that names the link, for the error message.
+        link: Name of the link.
+        bodies: Bodies of the robot.
 
     Raises:
-        RobotDescriptionError: No body does.
+        RobotDescriptionError: No body contains the link.
     """
     links = {name: i for i, body in enumerate(bodies) for name in body.links}
     index_of(robot, field, link, tuple(links))
@@ -34,14 +40,18 @@ def body_of(robot: RobotSpec, field: str, link: str, bodies: list[Body]) -> int:
 
 
 def _contact_sphere(shape: Shape, end: int) -> tuple[np.ndarray, float]:
-    """Returns centre (3,) in the body and radius of one end of a collider [m]."""
+    """Returns the sphere at one end of a collider.
+
+    Returns:
+        Centre (3,) in the body frame [m], and radius [m].
+    """
     axis = reference.rotation_matrix(shape.frame[3:])[:, 2]
     half_length = shape.size[1] if end else 0.0
     return shape.frame[:3] + end * half_length * axis, float(shape.size[0])
 
 
 def _colliders(contact: Contact, body: Body, kinds: tuple[str, ...]) -> list[Shape]:
-    """Returns the colliders of a link, of given kinds, that a row's contact names."""
+    """Returns the colliders of the given kinds that a contact of the robot names."""
     return [
         shape
         for shape in body.shapes
@@ -52,7 +62,7 @@ def _colliders(contact: Contact, body: Body, kinds: tuple[str, ...]) -> list[Sha
 
 
 def _collider(robot: RobotSpec, contact: Contact, body: Body) -> Shape:
-    """Returns the one collider of a body that a row's contact means."""
+    """Returns the only collider of a body that matches a contact of the robot."""
     kind = "capsule" if contact.end else "sphere"
     found = _colliders(contact, body, (kind,))
     if len(found) != 1:
@@ -69,8 +79,8 @@ def _collider(robot: RobotSpec, contact: Contact, body: Body) -> Shape:
 
 
 def _ground_contacts(robot: RobotSpec, bodies: list[Body]) -> Iterator[ContactRow]:
-    """Pairs the spheres of the robot's row with the ground."""
-    # a collider may be named or be the only one of its kind: both ways mean the same
+    """Yields the contacts of the robot's spheres with the ground."""
+    # A contact may name its collider or leave the name out. Both can mean the same one.
     seen: set[tuple[int, int]] = set()
     for contact in robot.contacts:
         body = body_of(robot, "contacts", contact.link, bodies)
@@ -87,7 +97,7 @@ def _ground_contacts(robot: RobotSpec, bodies: list[Body]) -> Iterator[ContactRo
 def _pair_sides(
     robot: RobotSpec, bodies: list[Body]
 ) -> Iterator[tuple[ContactRow, ContactRow]]:
-    """Returns both sides of the pairs of the robot's row, the shorter one first."""
+    """Yields both sides of each pair of the robot, the shorter side first."""
     for pair in robot.pairs:
         sides = []
         for contact in pair:
@@ -105,7 +115,8 @@ def _pair_sides(
             given = Fact(f"{pair[0].link!r} and {pair[1].link!r}")
             allowed = "links with a joint between them"
             raise refusal(robot, "pairs", given, allowed, why="which move as one body")
-        # from a sphere the nearest point of a segment is exact, not the other way round
+        # The nearest point of a segment to a sphere is exact. The shorter side is
+        # therefore first.
         swap = np.linalg.norm(first.segment) > np.linalg.norm(second.segment)
         yield (second, first) if swap else (first, second)
 
@@ -115,16 +126,18 @@ def contact_tables(
 ) -> dict[str, np.ndarray]:
     """Returns the contact tables of a system.
 
-    They are sorted by body; the ground comes before the walls, these before pairs.
+    The rows are sorted by body. Contacts with the ground are before contacts with
+    walls, and contacts of pairs are last.
 
     Args:
-        robot: The robot's row.
-        scene: The scene's row, if there is one.
+        robot: The robot.
+        scene: The scene. ``None``: no obstacles.
         bodies: Bodies of the robot.
-        obstacles: Rows of the obstacle tables; row 0 is the ground.
+        obstacles: Number of rows of the obstacle tables. Row 0 is the ground.
 
     Raises:
-        RobotDescriptionError: A row names links or colliders that are not there.
+        RobotDescriptionError: The robot or the scene names a link or collider that
+            does not exist.
     """
     rows = list(_ground_contacts(robot, bodies))
     # after the contacts: a foot may lack its contact because of a typo in the contact
@@ -154,11 +167,13 @@ def contact_tables(
 
 
 def pair_shares(system: System) -> np.ndarray:
-    """Returns how much of a pair's motion an impulse gives to its first side (np,).
+    """Returns the share (np,) of a pair's relative motion that its first side takes.
 
-    Both are moved at the centres of their colliders, in the default pose and in all
-    directions alike. Shares near 0 and 1, of bodies that hardly move, are cut off:
-    they would only add stiffness to such a body.
+    An impulse acts on both sides. The share is the mobility of the first side divided
+    by the sum of both. Mobility is computed at the centre of the collider, in the
+    default pose, summed over all directions. Shares are clipped to 0.01 and 0.99. A
+    share nearer to 0 or 1 belongs to a body that hardly moves, and would only add
+    stiffness to it.
     """
     if not len(system.contact_pairs):
         return np.zeros(0)

@@ -1,8 +1,8 @@
-"""Reads a robot's URDF file in double precision, and refuses what it cannot mean.
+"""Reads a robot's URDF file in double precision, and refuses unsupported content.
 
-This is the independent reading that :mod:`newton_qd.physics.model.verify` holds against
-the model that Newton built. It makes one tree of the elements that
-:mod:`newton_qd.physics.model.elements` reads.
+:mod:`newton_qd.physics.model.elements` reads the single elements. This module joins
+them to one kinematic tree. The reading does not depend on Newton.
+:mod:`newton_qd.physics.model.verify` compares it with the model that Newton built.
 """
 
 from __future__ import annotations
@@ -29,20 +29,20 @@ from newton_qd.physics.model.xml_reader import (
 from newton_qd.physics.reference import compose
 
 WORLD = "world"
-"""Name of a root link that is fixed to the world; any other root floats."""
+"""Name of a root link that is fixed to the world. A root with another name floats."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Body:
-    """A link that moves, with the massless links that are fixed to it.
+    """A moving link, together with the massless links that are fixed to it.
 
     Attributes:
-        link: The link; its frame is the body's.
-        joint: The joint that moves it, its frame in the parent body; ``None``
-            for a floating root.
-        parent: Name of the parent body; ``None`` for the world.
-        links: Names of the links of the body.
-        shapes: Colliders of all of them, in the body.
+        link: The moving link. Its frame is the frame of the body.
+        joint: The joint that moves it. The joint's frame is in the parent body.
+            ``None`` for a floating root.
+        parent: Name of the parent body. ``None`` for the world.
+        links: Names of all links of the body.
+        shapes: Colliders of all links of the body, in the body frame.
     """
 
     link: Link
@@ -54,14 +54,14 @@ class Body:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Description:
-    """A URDF file.
+    """The content of a URDF file.
 
     Attributes:
         path: The file.
         name: Name of the robot.
         floating: Whether the root link moves freely.
-        bodies: By name, parents first, in depth-first order.
-        still: Frames (7,) in the world of the links that are fixed to it.
+        bodies: Bodies by name, in depth-first order with parents first.
+        still: World frames (7,) of the links that are fixed to the world, by name.
         fixed: Names of the fixed joints.
     """
 
@@ -74,11 +74,11 @@ class Description:
 
 
 def read_joints(reader: XmlReader, links: dict[str, Link]) -> dict[str, list[Joint]]:
-    """Returns the joints by parent link, having checked that they name links.
+    """Reads and checks the joints, and returns them by parent link.
 
     Raises:
-        RobotDescriptionError: A joint is malformed, of another kind, names a link that
-            is not there or moves one that another moves.
+        RobotDescriptionError: A joint is malformed or its kind is not supported. Or it
+            names a link that does not exist, or a child link that already has a parent.
     """
     children: dict[str, list[Joint]] = {name: [] for name in links}
     moved: set[str] = set()
@@ -97,10 +97,10 @@ def read_joints(reader: XmlReader, links: dict[str, Link]) -> dict[str, list[Joi
 def find_root(
     reader: XmlReader, links: dict[str, Link], children: dict[str, list[Joint]]
 ) -> str:
-    """Returns the link without a parent, having checked that there is one tree.
+    """Returns the link without a parent, after a check that the links form one tree.
 
     Raises:
-        RobotDescriptionError: There are several, or links in a loop.
+        RobotDescriptionError: Several links have no parent, or links form a loop.
     """
     moved = {joint.child for joints in children.values() for joint in joints}
     roots = [name for name in links if name not in moved]
@@ -123,11 +123,11 @@ def _merge_fixed(
     links: dict[str, Link],
     children: dict[str, list[Joint]],
 ) -> tuple[dict[str, np.ndarray], tuple[Shape, ...], list[Joint]]:
-    """Gathers what is fixed to a link.
+    """Merges a link with all links that are fixed to it.
 
     Returns:
-        Frames (7,) of the links by name, their colliders, and the moving joints on
-        them, all in the frame of ``root``.
+        Frames (7,) of the links by name, their colliders, and the moving joints that
+        start at them. All are in the frame of ``root``.
 
     Raises:
         RobotDescriptionError: A fixed link has mass.
@@ -142,7 +142,7 @@ def _merge_fixed(
             continue
         link = links[joint.child]
         if link.mass > 0:
-            # Newton 1.8 forgets the offset of the centre of mass when it merges.
+            # When Newton 1.8 merges links, it ignores the offset of the centre of mass.
             name = f"{reader.path}: mass of link {link.name!r}"
             given = Fact(f"{link.mass:g}")
             why = f"and it is fixed to {joint.parent!r}"
@@ -172,8 +172,8 @@ def read_description(path: Path) -> Description:
     """Reads a URDF file.
 
     Raises:
-        RobotDescriptionError: The file is malformed, or describes something that
-            the physics does not have. Names file, line and element.
+        RobotDescriptionError: The file is malformed, or has content that the physics
+            does not support. The message names file, line and element.
     """
     reader = XmlReader(path)
     if reader.root.tag != "robot":

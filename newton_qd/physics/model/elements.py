@@ -1,7 +1,7 @@
-"""Reads the elements of a URDF file one by one: colliders, links and joints.
+"""Reads the elements of a URDF file: colliders, links and joints.
 
-Elements that physics does not need (materials, transmissions, simulator extensions)
-are ignored; what it cannot mean is refused.
+Elements that the physics does not need are ignored: materials, transmissions and
+simulator extensions. Unsupported content is an error.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from newton_qd.physics.model.xml_reader import XmlReader
 from newton_qd.physics.reference import rotation_matrix
 
 UNLIMITED = 1e9
-"""Limits beyond this are none; Newton writes 1e10 [rad or m]."""
+"""A limit of this size or larger means no limit. Newton writes 1e10 [rad or m]."""
 
 _JOINT_TYPES = ("revolute", "continuous", "prismatic", "fixed")
-# Sizes that a shape needs; Newton takes 1 for one that is missing.
+# Attributes that a shape must have. Newton uses 1 for a missing size.
 _SHAPES = {
     "sphere": ("radius",),
     "capsule": ("radius", "height"),
@@ -35,12 +35,12 @@ class Shape:
     """A collider.
 
     Attributes:
-        link: Link that names it in the file.
-        kind: Tag of its geometry, such as ``"capsule"``.
+        link: Name of the link that contains it in the file.
+        kind: Tag of its geometry, for example ``"capsule"``.
         frame: (7,) position [m] and quaternion xyzw in the body.
-        size: (3,) as Newton stores it: sphere: radius; capsule and cylinder:
-            radius, half of the straight part; box: half extents [m].
-        name: Name of the collider in the file; empty if it has none.
+        size: (3,) size as Newton stores it [m]. Sphere: radius. Capsule and cylinder:
+            radius, half length of the straight part. Box: half extents.
+        name: Name of the collider in the file. Empty if it has no name.
     """
 
     link: str
@@ -52,7 +52,7 @@ class Shape:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Joint:
-    """A joint; ``frame`` (7,) is in the parent link, ``axis`` (3,) in the joint."""
+    """A joint: ``frame`` (7,) in the parent link, ``axis`` (3,) in the joint frame."""
 
     name: str
     kind: str
@@ -67,7 +67,7 @@ class Joint:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Link:
-    """A link: ``com`` (3,) [m]; ``inertia`` (3, 3) about it, link axes [kg m^2]."""
+    """A link: ``com`` (3,) [m], ``inertia`` (3, 3) about it in link axes [kg m^2]."""
 
     name: str
     mass: float
@@ -92,7 +92,7 @@ def _read_shape(reader: XmlReader, element: ElementTree.Element, link: str) -> S
     else:
         for i, key in enumerate(_SHAPES[shape.tag]):
             size[i] = reader.positive(shape, key, 1)[0] / (1 if i == 0 else 2)
-    # Newton reads a capsule's height, MuJoCo its length.
+    # Newton reads the height of a capsule. MuJoCo reads its length.
     if shape.tag == "capsule" and shape.get("length") is not None:
         if 2 * size[1] != reader.number(shape, "length"):
             given = (shape.get("height"), shape.get("length"))
@@ -104,7 +104,7 @@ def _read_shape(reader: XmlReader, element: ElementTree.Element, link: str) -> S
 def _read_inertial(
     reader: XmlReader, link: ElementTree.Element
 ) -> tuple[float, np.ndarray, np.ndarray]:
-    """Returns mass, centre of mass (3,) and inertia (3, 3) about it, link axes."""
+    """Returns mass, centre of mass (3,) and inertia (3, 3) about it, in link axes."""
     inertial = link.find("inertial")
     if inertial is None:
         return 0.0, np.zeros(3), np.zeros((3, 3))
@@ -115,7 +115,7 @@ def _read_inertial(
         key = "i" + "xyz"[i] + "xyz"[j]
         inertia[i, j] = inertia[j, i] = reader.number(element, key)
     moments = np.linalg.eigvalsh(inertia)
-    # A principal moment is at most the sum of the others for any real body.
+    # For a real body, each principal moment is at most the sum of the other two.
     if moments[0] <= 0 or moments[2] > (moments[0] + moments[1]) * (1 + 1e-6):
         given = Fact(listed([f"{moment:g}" for moment in moments]))
         allowed = "positive, none larger than the sum of the other two"
@@ -129,7 +129,7 @@ def read_link(reader: XmlReader, element: ElementTree.Element) -> Link:
     """Reads a link: its inertia and its colliders.
 
     Raises:
-        RobotDescriptionError: Something in it is malformed, or no body has it.
+        RobotDescriptionError: The link is malformed, or no real body has its inertia.
     """
     name = reader.text(element, "name")
     mass, com, inertia = _read_inertial(reader, element)
@@ -143,7 +143,7 @@ def read_link(reader: XmlReader, element: ElementTree.Element) -> Link:
 
 
 def _refuse_limits(reader: XmlReader, limit: ElementTree.Element) -> None:
-    # URDF gives a continuous joint no limits, and Newton takes those that are written.
+    # In URDF a continuous joint has no limits. Newton would use limits in the file.
     for key in ("lower", "upper"):
         if limit.get(key) is None:
             continue
@@ -177,7 +177,7 @@ def read_joint(reader: XmlReader, element: ElementTree.Element) -> Joint:
     """Reads a joint.
 
     Raises:
-        RobotDescriptionError: It is malformed, or of another kind than those allowed.
+        RobotDescriptionError: The joint is malformed, or its kind is not supported.
     """
     name = reader.text(element, "name")
     kind = reader.text(element, "type")
@@ -218,10 +218,10 @@ def read_joint(reader: XmlReader, element: ElementTree.Element) -> Joint:
 
 
 def by_name(reader: XmlReader, tag: str) -> dict[str, ElementTree.Element]:
-    """Returns the elements of a tag by their names, each given once.
+    """Returns the elements with a tag, by name.
 
     Raises:
-        RobotDescriptionError: An element has no name, or that of another.
+        RobotDescriptionError: An element has no name, or two have the same name.
     """
     found: dict[str, ElementTree.Element] = {}
     for element in reader.root.findall(tag):

@@ -1,4 +1,4 @@
-"""The default pose of a robot: its row's joint angles, standing on the ground."""
+"""The default pose of a robot: the joint angles of its ``RobotSpec``, on the ground."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ from newton_qd.physics.system import JointKind, System
 
 
 def raising_coordinate(system: System) -> tuple[int, float] | None:
-    """Finds what lifts a robot without turning it.
+    """Finds the coordinate that moves the torso up without rotating it.
 
     Args:
         system: The robot, in the pose ``rest_q``.
 
     Returns:
-        The coordinate that raises the torso, and its sign; ``None`` if none does.
+        Index of the coordinate, and the sign that means up. ``None`` if the robot has
+        no such coordinate.
     """
     frames = reference.body_frames(system, system.rest_q)
     body = system.torso
@@ -37,14 +38,15 @@ def raising_coordinate(system: System) -> tuple[int, float] | None:
 
 
 def grounding_coordinate(system: System) -> tuple[int, float] | None:
-    """Finds what puts a robot on the ground in any pose, as its row asks for.
+    """Finds the coordinate that places the robot on the ground in any pose.
 
     Args:
         system: The robot.
 
     Returns:
-        The coordinate that raises the torso, and its sign; ``None`` if none does, if
-        the row gives the height, or if nothing of the robot touches the ground.
+        Index of the coordinate that moves the torso up, and the sign that means up.
+        ``None`` if the robot has no such coordinate, if its ``RobotSpec`` sets the
+        height, or if the robot has no ground contacts.
     """
     if system.robot.rest_height is not None or not len(system.ground_contacts):
         return None
@@ -55,8 +57,8 @@ def rest_coordinates(system: System) -> np.ndarray:
     """Returns the coordinates (nq,) of the robot's default pose.
 
     Raises:
-        RobotDescriptionError: The pose is not one that the joints can take, or names
-            joints that are not there.
+        RobotDescriptionError: The pose is outside the limits of the joints, or names a
+            joint that does not exist.
     """
     robot = system.robot
     q = np.array(system.rest_q)

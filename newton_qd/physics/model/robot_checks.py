@@ -1,4 +1,4 @@
-"""Checks of a robot's row; every error names the field, its value, what is allowed."""
+"""Checks a ``RobotSpec``. Each error names the field, its value and what is allowed."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def _is_pair(entry: object) -> bool:
     return isinstance(entry, tuple) and len(entry) == 2 and all(map(_is_contact, entry))
 
 
-# Fields that are tuples: what an entry is, and how the field is written.
+# Fields that are tuples: the check of an entry, and the text of what is allowed.
 _TUPLES: dict[str, tuple[Callable[[object], bool], str]] = {
     "feet": (_is_name, 'a tuple of links, such as ("foot",)'),
     "actuators": (
@@ -54,16 +54,16 @@ _TUPLES: dict[str, tuple[Callable[[object], bool], str]] = {
 def refusal(
     robot: RobotSpec, field: str, value: object, allowed: str, *, why: str = ""
 ) -> RobotDescriptionError:
-    """Returns the error about a field of a robot."""
+    """Returns an error for a field of a robot."""
     name = f"robot {robot.name!r}, {field}"
     return RobotDescriptionError(message(name, value, allowed, why=why))
 
 
 def index_of(robot: RobotSpec, field: str, name: str, allowed: tuple[str, ...]) -> int:
-    """Returns the position of a link's or joint's name in ``allowed``.
+    """Returns the index of the name of a link or joint in ``allowed``.
 
     Raises:
-        RobotDescriptionError: The row's field names something that is not there.
+        RobotDescriptionError: The name is not in ``allowed``.
     """
     if not name or name not in allowed:
         known = listed([known for known in allowed if known])
@@ -89,17 +89,17 @@ def _check_unique(robot: RobotSpec, field: str, names: list[str]) -> None:
 
 
 def _pair_name(pair: tuple[Contact, Contact]) -> str:
-    """Name of a pair, in whichever order it is written."""
+    """Returns a name of a pair that does not depend on the order of its sides."""
     ends = (":".join(filter(None, (end.link, end.collider))) for end in pair)
     return " and ".join(sorted(ends))
 
 
 def _check_types(robot: RobotSpec) -> None:
-    """Checks that a row can be read: what its fields hold, not yet their values.
+    """Checks the types of a robot's fields, but not their values.
 
     Raises:
-        TypeError: ``robot`` is not a row.
-        RobotDescriptionError: A field is not of the type that it is read as.
+        TypeError: ``robot`` is not a ``RobotSpec``.
+        RobotDescriptionError: A field has the wrong type.
     """
     allowed = "a RobotSpec, such as newton_qd.robots.ANT"
     checks.instance("robot", robot, RobotSpec, allowed)
@@ -108,7 +108,7 @@ def _check_types(robot: RobotSpec) -> None:
         raise refusal(robot, "urdf", robot.urdf, 'a path, such as "robot.urdf"')
     for field, (is_entry, allowed) in _TUPLES.items():
         value = getattr(robot, field)
-        # a text is a sequence, too: read letter by letter, not as one name
+        # A string is a sequence too. It would be read as one name per letter.
         if not isinstance(value, tuple):
             raise refusal(robot, field, value, allowed)
         for index, entry in enumerate(value):
@@ -123,7 +123,7 @@ def _check_types(robot: RobotSpec) -> None:
 
 
 def _check_contacts(robot: RobotSpec) -> None:
-    """Checks the ends of contacts and pairs."""
+    """Checks the ``end`` of each contact, also in pairs."""
     for contact in robot.contacts:
         if contact.end not in (-1, 0, 1):
             field = f"contacts: end of {contact.link!r}"
@@ -136,11 +136,11 @@ def _check_contacts(robot: RobotSpec) -> None:
 
 
 def check_robot(robot: RobotSpec) -> None:
-    """Checks the numbers of a row, and what can be checked without its file.
+    """Checks everything in a ``RobotSpec`` that does not need its file.
 
     Raises:
-        TypeError: ``robot`` is not a row.
-        RobotDescriptionError: A field is of another type, a number is not finite or
+        TypeError: ``robot`` is not a ``RobotSpec``.
+        RobotDescriptionError: A field has the wrong type, a number is not finite or
             has the wrong sign, or a name is given twice.
     """
     _check_types(robot)

@@ -1,4 +1,4 @@
-"""Reads the static obstacles of a scene, and finds what collides with them."""
+"""Reads the static obstacles of a scene, and finds the contacts with them."""
 
 from __future__ import annotations
 
@@ -22,19 +22,22 @@ from newton_qd.physics.system import ObstacleKind
 from newton_qd.robots import RobotSpec
 from newton_qd.scenes import Scene
 
-# A sphere is a capsule of no length.
+# A sphere is a capsule with length 0.
 _KINDS = {
     "sphere": ObstacleKind.CAPSULE,
     "capsule": ObstacleKind.CAPSULE,
     "box": ObstacleKind.BOX,
 }
-# Colliders of a robot that may touch an obstacle, or each other.
+# Kinds of colliders of a robot that may touch an obstacle or each other.
 TOUCHING = ("sphere", "capsule")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SceneLink:
-    """A link that never moves: its ``frame`` (7,) and its colliders in the world."""
+    """A static link: its name, its world ``frame`` (7,) and its colliders.
+
+    The frames of the colliders are in the world, too.
+    """
 
     name: str
     frame: np.ndarray
@@ -46,11 +49,12 @@ class ContactRow:
     """One contact: a sphere or capsule of a body, and an obstacle.
 
     Attributes:
-        body: Body of the robot.
-        obstacle: Row of the obstacle tables; -1 for a side of a pair.
+        body: Index of the robot's body.
+        obstacle: Row of the obstacle tables, -1 for a side of a pair.
         position: (3,) centre in the body frame [m].
-        segment: (3,) from the centre to an end of a capsule's axis, body frame [m].
-        radius: [m].
+        segment: (3,) vector from the centre to an end of a capsule's axis, in the body
+            frame [m].
+        radius: Radius [m].
     """
 
     body: int
@@ -63,13 +67,13 @@ class ContactRow:
 def read_scene(scene: Scene) -> tuple[SceneLink, ...]:
     """Reads the links of a scene, in the order of its file.
 
-    A root link called ``world`` stands for the world and is left out.
+    A root link with the name ``world`` is the world. It is not part of the result.
 
     Raises:
-        TypeError: ``scene`` is something else.
+        TypeError: ``scene`` is not a ``Scene``.
         AssetNotFoundError: The URDF file does not exist.
-        RobotDescriptionError: The file is malformed, something in it moves or has
-            mass, or a collider is of a kind that contacts do not have.
+        RobotDescriptionError: The file is malformed, a link moves or has mass, or the
+            kind of a collider is not supported.
     """
     allowed = "None, or a Scene such as newton_qd.scenes.TRAP"
     checks.instance("scene", scene, Scene, allowed)
@@ -127,7 +131,7 @@ def _placed(link: Link, frame: np.ndarray) -> tuple[Shape, ...]:
 
 
 def obstacle_tables(links: tuple[SceneLink, ...]) -> dict[str, np.ndarray]:
-    """Returns the tables of what a robot may touch: the ground, then the walls."""
+    """Returns the obstacle tables: the ground in row 0, then the walls."""
     shapes = [shape for link in links for shape in link.shapes]
     kinds = [ObstacleKind.PLANE, *(_KINDS[shape.kind] for shape in shapes)]
     return {
@@ -138,7 +142,7 @@ def obstacle_tables(links: tuple[SceneLink, ...]) -> dict[str, np.ndarray]:
 
 
 def whole_collider(body: int, obstacle: int, shape: Shape) -> ContactRow:
-    """Returns the contact of a sphere or of a whole capsule with an obstacle."""
+    """Returns the contact of a sphere or a whole capsule with an obstacle."""
     axis = reference.rotation_matrix(shape.frame[3:])[:, 2]
     half = shape.size[1] * axis
     return ContactRow(body, obstacle, shape.frame[:3], half, float(shape.size[0]))
@@ -150,17 +154,21 @@ def wall_contacts(
     obstacles: int,
     colliders: dict[str, tuple[int, tuple[Shape, ...]]],
 ) -> Iterator[ContactRow]:
-    """Pairs the colliders of the robot's touching links with every wall.
+    """Yields the contacts of the robot's links with every wall.
+
+    The links are those of the scene's field ``links``. If it is ``None``, they are the
+    links with a ground contact.
 
     Args:
-        robot: The robot's row.
-        scene: The scene's row.
-        obstacles: Rows of the obstacle tables; row 0 is the ground.
-        colliders: Body and colliders, in the body, of every link of the robot.
+        robot: The robot.
+        scene: The scene.
+        obstacles: Number of rows of the obstacle tables. Row 0 is the ground.
+        colliders: For each link of the robot: index of its body, and its colliders in
+            the body frame.
 
     Raises:
-        RobotDescriptionError: A link is not the robot's, or has no collider that
-            may touch.
+        RobotDescriptionError: A link is not a link of the robot, or it has no collider,
+            or one of a kind that may not touch.
     """
     names = scene.links
     if names is None:

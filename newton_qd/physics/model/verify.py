@@ -1,8 +1,9 @@
-"""Checks that the model Newton built is the robot that the URDF file describes.
+"""Checks that Newton's model equals the robot in the URDF file.
 
-Newton fills gaps silently (a missing size is 1, a link without inertia weighs what
-its collider would), so nothing it built is used before it agrees with the file.
-Newton stores single precision; beyond its rounding the two must be equal.
+Newton replaces missing values silently: a missing size becomes 1, and a link without
+inertia gets the mass of its colliders. This package therefore uses the model only after
+the check. Newton stores single precision. The model and the file must be equal up to
+its rounding.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from newton_qd.physics.model.elements import Shape
 from newton_qd.physics.model.xml_reader import IDENTITY, RobotDescriptionError
 from newton_qd.physics.system import JointKind
 
-# A few roundings of single precision, relative to the largest number compared.
+# A few rounding errors of single precision, relative to the largest compared number.
 _TOLERANCE = 2e-6
 _KINDS = {
     "revolute": JointKind.REVOLUTE,
@@ -32,7 +33,7 @@ class ModelMismatchError(RobotDescriptionError):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class BuiltModel:
-    """What Newton built, in NumPy; joint ``i`` moves body ``i``.
+    """Newton's model in NumPy arrays. Joint ``i`` moves body ``i``.
 
     Attributes:
         body_names: (nb,) link names, parents first.
@@ -43,13 +44,13 @@ class BuiltModel:
         v_start: (nb,) first degree of freedom of each joint.
         parent_frame: (nb, 7) joint frame in the parent body [m], xyzw.
         child_frame: (nb, 7) joint frame in the child body [m], xyzw.
-        axis: (nb, 3) axis in the joint frame; zeros for a free joint.
-        lower: (nb,) [rad or m]; -inf where there is none.
-        upper: (nb,) [rad or m]; +inf where there is none.
-        damping: (nb,) [N m s/rad or N s/m].
-        mass: (nb,) [kg].
-        com: (nb, 3) in the body frame [m].
-        inertia: (nb, 3, 3) about the centre of mass, body axes [kg m^2].
+        axis: (nb, 3) axis in the joint frame, zeros for a free joint.
+        lower: (nb,) lower limit [rad or m], -inf without a limit.
+        upper: (nb,) upper limit [rad or m], +inf without a limit.
+        damping: (nb,) damping [N m s/rad or N s/m].
+        mass: (nb,) mass [kg].
+        com: (nb, 3) centre of mass in the body frame [m].
+        inertia: (nb, 3, 3) inertia about the centre of mass, body axes [kg m^2].
         shapes: (nb,) colliders of each body.
     """
 
@@ -72,7 +73,11 @@ class BuiltModel:
 
 
 def _near(expected: ArrayLike, built: ArrayLike, scale: float = 0.0) -> bool:
-    """Whether two arrays agree, relative to their largest entry or ``scale``."""
+    """Returns whether two arrays agree, up to a tolerance.
+
+    The tolerance is relative to the largest expected entry or ``scale``, whichever is
+    larger.
+    """
     expected, built = np.atleast_1d(expected), np.atleast_1d(built)
     if expected.shape != built.shape:
         return False
@@ -85,8 +90,8 @@ def _near(expected: ArrayLike, built: ArrayLike, scale: float = 0.0) -> bool:
 
 
 def _same_frame(expected: np.ndarray, built: np.ndarray) -> bool:
-    # Both signs of a quaternion are one rotation; lengths below 1 m are compared
-    # absolutely because they may be differences of longer ones.
+    # A quaternion and its negative are the same rotation. Lengths below 1 m have an
+    # absolute tolerance, because they may be differences of longer lengths.
     rotation = built[3:] * (1.0 if expected[3:] @ built[3:] >= 0 else -1.0)
     return _near(expected[:3], built[:3], 1.0) and _near(expected[3:], rotation, 1.0)
 
@@ -188,11 +193,12 @@ def verify(built: BuiltModel, description: Description) -> None:
     """Compares every number of the model with the file.
 
     Args:
-        built: What Newton built.
-        description: What the file says, read independently.
+        built: Newton's model.
+        description: The content of the file, read without Newton.
 
     Raises:
-        ModelMismatchError: They differ; names the link or joint and both values.
+        ModelMismatchError: They differ. The message names the link or joint and both
+            values.
     """
     checker = _Checker(built, description)
     checker.names()

@@ -1,4 +1,4 @@
-"""Reads attributes of an XML file; every error names file, line and element."""
+"""Reads attributes of an XML file. Each error names file, line and element."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ IDENTITY.setflags(write=False)
 
 
 class RobotDescriptionError(ValueError):
-    """A robot's URDF file or its row is not one that the physics can run."""
+    """The physics does not support a robot's URDF file or its ``RobotSpec``."""
 
 
 class XmlReader:
-    """Reads attributes of one file; its errors name the file, line and element.
+    """Reads attributes of one file. Its errors name the file, the line and the element.
 
     Raises:
         RobotDescriptionError: The file is not XML.
@@ -33,7 +33,7 @@ class XmlReader:
         self.root = self._parse()
 
     def _parse(self) -> ElementTree.Element:
-        # ElementTree's own parser does not say on which line an element starts.
+        # The parser of ElementTree does not report the line of an element.
         tree = ElementTree.TreeBuilder()
         parser = expat.ParserCreate()
         parser.buffer_text = True
@@ -75,14 +75,14 @@ class XmlReader:
     def refused(
         self, element: ElementTree.Element, name: str, value: object, allowed: str
     ) -> RobotDescriptionError:
-        """Returns an error about a value, with file, line and element in front."""
+        """Returns an error about a value that begins with file, line and element."""
         return self.error(element, message(name, value, allowed))
 
     def text(self, element: ElementTree.Element, key: str) -> str:
-        """Returns an attribute that must be there and not be empty.
+        """Returns an attribute.
 
         Raises:
-            RobotDescriptionError: It is not.
+            RobotDescriptionError: The attribute is missing or empty.
         """
         value = element.get(key)
         if not value:
@@ -90,10 +90,10 @@ class XmlReader:
         return value
 
     def child(self, element: ElementTree.Element, tag: str) -> ElementTree.Element:
-        """Returns the first child element of a tag; there must be one.
+        """Returns the first child element with a tag.
 
         Raises:
-            RobotDescriptionError: There is none.
+            RobotDescriptionError: The element has no child with this tag.
         """
         found = element.find(tag)
         if found is None:
@@ -112,7 +112,8 @@ class XmlReader:
         """Returns the ``count`` numbers of an attribute.
 
         Raises:
-            RobotDescriptionError: They are missing, of another count or not finite.
+            RobotDescriptionError: The attribute is missing, has the wrong number of
+                values, or one that is not finite (with ``finite=False``: not a number).
         """
         text = element.get(key, default)
         if text is None:
@@ -129,10 +130,11 @@ class XmlReader:
     def number(
         self, element: ElementTree.Element, key: str, default: str | None = None
     ) -> float:
-        """Returns an attribute that is one finite number.
+        """Returns the number in an attribute.
 
         Raises:
-            RobotDescriptionError: It is not.
+            RobotDescriptionError: The attribute is missing, or is not one finite
+                number.
         """
         return float(self.numbers(element, key, 1, default)[0])
 
@@ -142,7 +144,8 @@ class XmlReader:
         """Returns the ``count`` numbers of an attribute, all above zero.
 
         Raises:
-            RobotDescriptionError: They are missing, of another count or not above zero.
+            RobotDescriptionError: The attribute is missing, has the wrong number of
+                values, or one that is not finite or not above zero.
         """
         values = self.numbers(element, key, count)
         if not (values > 0).all():
@@ -153,7 +156,7 @@ class XmlReader:
         """Returns the frame (7,) of the element's ``<origin>``.
 
         Raises:
-            RobotDescriptionError: Its numbers are malformed.
+            RobotDescriptionError: The numbers of ``<origin>`` are malformed.
         """
         origin = element.find("origin")
         if origin is None:
