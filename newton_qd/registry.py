@@ -82,8 +82,7 @@ def register(
         **options: Keyword arguments of ``base``. ``create`` may replace them.
 
     Raises:
-        TypeError: An argument has the wrong type, ``base`` does not take an option, or
-            ``robot`` is missing and ``base`` needs it.
+        TypeError: An argument has the wrong type, or ``base`` does not take an option.
         ValueError: The name is in use, a name is not text or is empty, or
             ``reward_offset`` is not finite.
     """
@@ -102,11 +101,7 @@ def register(
         descriptor_extractor = getattr(
             described[0].wrapper, "descriptor_extractor", None
         )
-    if _takes_robot(base):
-        why = f"and {getattr(base, '__name__', 'base')} needs a robot"
-        if robot is None:
-            allowed = "a newton_qd.robots.RobotSpec"
-            raise TypeError(message("robot", None, allowed, why=why))
+    if robot is not None and _takes_robot(base):
         options = {"robot": robot, **options}
     if options:
         _require_keywords(env_name, base, options)
@@ -276,13 +271,17 @@ def _base(
     """Returns the environment inside all wrappers.
 
     Raises:
-        TypeError: ``material`` is not a ``Material``, an option is unknown, or a method
-            does not return an array.
+        TypeError: ``material`` is not a ``Material``, an option is unknown, the robot
+            is missing, or a method does not return an array.
         ValueError: A method returns a wrong shape.
     """
     allowed = "newton_qd.robots.Material"
     checks.instance("material", material, Material, allowed, optional=True)
     _require_keywords(env_name, spec.base, options)
+    if "robot" not in options and _takes_robot(spec.base):
+        why = f"and {getattr(spec.base, '__name__', 'base')} needs a robot"
+        allowed = "a newton_qd.robots.RobotSpec, as robot=... of register or of create"
+        raise TypeError(message("robot", None, allowed, why=why))
     env = spec.base(**options)
     check_methods(env)
     return env if material is None else env.with_material(material)

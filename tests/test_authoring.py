@@ -242,9 +242,11 @@ def test_create_checks_the_methods(
 
 
 def test_what_register_and_evolve_need(page: dict[str, Any]) -> None:
-    with pytest.raises(TypeError, match="robot: got None, and Still needs a robot; a"):
-        nq.register("mine", Still)
     robot = page["ROBOT"]
+    nq.register("any_robot", Still)
+    with pytest.raises(TypeError, match="robot: got None, and Still needs a robot; a"):
+        nq.create("any_robot")
+    assert nq.create("any_robot", robot=robot).unwrapped.name == robot.name
     nq.register("mine", Still, robot=robot, descriptor=nq.XYPositionWrapper)
     with pytest.raises(ConfigError, match="so pass reward_offset to newton_qd"):
         make_task(EvolveConfig(env_name="mine"))
