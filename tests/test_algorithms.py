@@ -95,6 +95,7 @@ def test_defaults_of_an_environment_are_accepted(env_name: str) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("sigint")
 @pytest.mark.parametrize("name", OPTIONS)
 def test_a_stop_changes_nothing(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compiled: list[str]
@@ -266,6 +267,7 @@ def test_a_whole_number_is_a_number() -> None:
     assert type(config.iso_sigma) is float
 
 
+@pytest.mark.usefixtures("sigint")
 @pytest.mark.slow
 def test_a_resume_may_write_a_number_in_another_way(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -322,6 +324,7 @@ def test_lost_gradients_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     np.testing.assert_array_equal(metrics["rejected"], [0, 2, 2])
 
 
+@pytest.mark.usefixtures("sigint")
 @pytest.mark.slow
 def test_a_checkpoint_of_another_emitter_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

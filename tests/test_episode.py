@@ -48,7 +48,9 @@ def line() -> tuple[Episode, jax.Array]:
     return episode, 0.1 * jnp.ones((3, STEPS, 1), jnp.float32)
 
 
-@pytest.mark.parametrize("options", [None, OPTIONS])
+@pytest.mark.parametrize(
+    "options", [None, pytest.param(OPTIONS, marks=pytest.mark.slow)]
+)
 def test_methods_are_the_functions_that_were(hopper: Any, options: Any) -> None:
     """Bitwise, with default options and others."""
     parts, weights = hopper
@@ -80,6 +82,7 @@ def test_mixed_gradients_are_the_function_that_was(line: Any) -> None:
     assert equal(lambda: episode.mixed(plans, KEY, **settings), lambda: old(plans, KEY))
 
 
+@pytest.mark.slow
 def test_gradients_begin_from_a_state_with_parameters(hopper: Any) -> None:
     parts, weights = hopper
     env, episode = parts[0], Episode(*parts, episode_length=STEPS)

@@ -204,7 +204,10 @@ print(json.dumps([found, refused]))
 """
     first, second, alone = two_processes_and_one(EVOLVE + code)
     assert first[0] == second[0] == alone[0]
-    assert first[1].startswith("resume: a run of 2 processes") and alone[1] == ""
+    assert (
+        first[1].startswith("resume: got True, with 2 processes; allowed: ")
+        and alone[1] == ""
+    )
 
 
 def check_devices(**variables: str) -> None:

@@ -35,6 +35,7 @@ def scalars(path: Path) -> dict[int, dict[str, float]]:
     return found
 
 
+@pytest.mark.usefixtures("sigint")
 def test_event_files_hold_the_metrics(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
