@@ -94,8 +94,8 @@ def checked_layout(env: str, blocks: object) -> tuple[tuple[str, int], ...]:
             given = Fact(f"a {type(block).__name__}")
             allowed = f"an array of {allowed}"
             raise TypeError(message(f"{env}.observe: {name!r}", given, allowed))
-        if jnp.ndim(block) != 1:
-            given = Fact(f"shape {jnp.shape(block)}")
+        if len(block.shape) != 1:
+            given = Fact(f"shape {block.shape}")
             raise ValueError(message(f"{env}.observe: {name!r}", given, allowed))
     return tuple((name, block.shape[0]) for name, block in blocks.items())
 
