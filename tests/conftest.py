@@ -85,10 +85,9 @@ def choose_compilation(config: pytest.Config) -> None:
 
 
 @pytest.hookimpl(optionalhook=True)
-def pytest_xdist_setupnodes(config: pytest.Config, specs: list[Any]) -> None:
+def pytest_xdist_setupnodes() -> None:
     """Builds the kernels once, before every worker process would do so."""
-    del config
-    prebuild.main(len(specs))
+    prebuild.main()
 
 
 @functools.cache

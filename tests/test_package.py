@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import email
+import functools
 import itertools
 import json
 import os
@@ -381,11 +382,16 @@ def test_readme_names_commands_that_exist() -> None:
 
 @pytest.mark.parametrize("index", range(len(readme_blocks("python"))))
 def test_readme_examples_run(index: int) -> None:
-    # A later block goes on where the one before it ended.
-    source = "\n".join(readme_blocks("python")[: index + 1])
-    namespace: dict[str, object] = {}
-    exec(compile(source, "README.md", "exec"), namespace)
-    assert "state" in namespace
+    assert "state" in readme_namespace(index)
+
+
+@functools.cache
+def readme_namespace(index: int) -> dict[str, object]:
+    """Names after a block of the README; each goes on where the last one ended."""
+    namespace = dict(readme_namespace(index - 1)) if index else {}
+    block = readme_blocks("python")[index]
+    exec(compile(block, "README.md", "exec"), namespace)
+    return namespace
 
 
 def test_readme_table_of_environments() -> None:
