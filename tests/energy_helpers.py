@@ -225,7 +225,8 @@ def ledger(system: System, control: Control = undriven) -> Callable[..., Ledger]
         first = jax.vmap(lambda q, v: energy(short, q, v))(q, v)
 
         def advance(carry: Any, action: jax.Array) -> Any:
-            u = jax.vmap(lambda q, v, a: control(state_of(q, v), a))(*carry, action)
+            q, v = carry
+            u = jax.vmap(lambda q, v, a: control(state_of(q, v), a))(q, v, action)
             return jax.lax.scan(
                 lambda carry, _: several(carry, u), carry, length=system.robot.substeps
             )

@@ -25,6 +25,7 @@ TABLES = (
     layout.outputs,
     layout.dynamics,
     layout.gaps,
+    layout.impulses,
     layout.scratch_parameters,
 )
 

@@ -9,6 +9,7 @@ from newton_qd.physics.bridge import (
 from newton_qd.physics.inspection import (
     bias_forces,
     contact_gaps,
+    contact_impulses,
     forward_kinematics,
     lowest_contact,
     mass_matrix,
@@ -27,6 +28,7 @@ __all__ = [
     "System",
     "bias_forces",
     "contact_gaps",
+    "contact_impulses",
     "default_params",
     "episode_final",
     "episode_proportion",

@@ -210,6 +210,23 @@ def contact_gaps(system: System, q: jax.Array) -> jax.Array:
     return call(row, output_dims=written.size)[0]
 
 
+def contact_impulses(
+    system: System, q: jax.Array, v: jax.Array, control: jax.Array
+) -> jax.Array:
+    """Returns the contact impulses (substeps, nc, 4) of a control step [N s].
+
+    The last column is the normal part.
+
+    Raises:
+        TypeError: The type of an array is not that of the system.
+        ValueError: An array has the wrong shape.
+    """
+    read, written = layout.inputs(system), layout.impulses(system)
+    call = _kernel_call(system, "contact_impulses", read.size)
+    row = _row(system, read.shapes, q=q, v=v, control=control)
+    return _split(call(row, output_dims=written.size)[0], written)["impulse"]
+
+
 @functools.cache
 def _episode_call(name: str, dtype: str, steps: int, nd: int) -> RowCall:
     """Wraps a kernel of ``kernels.episodes`` as a function of one episode's row."""

@@ -1,4 +1,4 @@
-"""Functions that inspect a state: kinematics, gaps, mass matrix, bias forces."""
+"""Functions that inspect a state: kinematics, contacts, mass matrix, bias forces."""
 
 from __future__ import annotations
 
@@ -121,6 +121,36 @@ def contact_gaps(system: System, q: jax.Array) -> jax.Array:
     if not len(system.contact_body):
         return jnp.zeros((0,), q.dtype)
     return bridge.contact_gaps(system, q)
+
+
+def contact_impulses(
+    system: System, state: PhysicsState, control: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Computes the impulse of each contact in every substep of a control step.
+
+    A step reports the sums for each body. The result is not differentiable.
+
+    Args:
+        system: The system.
+        state: State of one world at the start of the step.
+        control: (nu,) actions [-].
+
+    Returns:
+        (substeps, nc, 3) impulse on the body of each row of the system's contact
+        tables, with friction, in world axes [N s]; and (substeps, nc) its normal part
+        [N s], never negative.
+
+    Raises:
+        ValueError: The state or the control has the wrong shape.
+    """
+    q = _checked(system, "q", state.q, system.nq)
+    v = _checked(system, "v", state.v, system.nv)
+    control = _checked(system, "control", control, system.nu)
+    if not len(system.contact_body):
+        empty = jnp.zeros((system.robot.substeps, 0, 4), q.dtype)
+        return empty[..., :3], empty[..., 3]
+    found = bridge.contact_impulses(system, q, v, control)
+    return found[..., :3], found[..., 3]
 
 
 def lowest_contact(system: System, q: jax.Array) -> jax.Array:

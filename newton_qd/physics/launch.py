@@ -22,6 +22,7 @@ _MODULES = {
     "step_forward": "forward",
     "step_backward": "backward",
     "contact_gaps": "gaps",
+    "contact_impulses": "impulses",
 }
 # The fastest numbers of lanes for 4,096 and 16,384 worlds of the ant on an H200.
 _LANES = {"step_forward": 16, "step_backward": 8}

@@ -141,6 +141,12 @@ def gaps(system: System) -> Layout:
     return Layout({"gap": system.contact_body.shape})
 
 
+def impulses(system: System) -> Layout:
+    """Returns the row of contact impulses: linear, then its normal part."""
+    shape = (system.robot.substeps, len(system.contact_body), 4)
+    return Layout({"impulse": shape})
+
+
 def scratch_parameters(system: System) -> Layout:
     """Returns the row of values that a parametric kernel computes from its parameters.
 

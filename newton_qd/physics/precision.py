@@ -67,6 +67,7 @@ class Kernels:
         backward: Kernel ``step_backward``.
         inspect: Kernels for kinematics and dynamics.
         gaps: Kernel ``contact_gaps``.
+        impulses: Kernel ``contact_impulses``.
         episodes: Kernels for descriptors of episodes.
     """
 
@@ -77,6 +78,7 @@ class Kernels:
     backward: ModuleType
     inspect: ModuleType
     gaps: ModuleType
+    impulses: ModuleType
     episodes: ModuleType
 
 

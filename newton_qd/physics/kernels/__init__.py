@@ -14,8 +14,8 @@ neighbours.
 and where these begin (``Offsets``); :mod:`.rows` where the fields of a row of inputs or
 outputs begin. :mod:`.world` moves these rows, with :mod:`.parameters` for parameters
 of each world. :mod:`.forward` and :mod:`.backward` are the kernels of a step;
-:mod:`.inspect` and :mod:`.gaps` show a system from inside; :mod:`.episodes` and
-:mod:`.conventions` do not use packs.
+:mod:`.inspect`, :mod:`.gaps` and :mod:`.impulses` show a system from inside;
+:mod:`.episodes` and :mod:`.conventions` do not use packs.
 
 **Variants.** The package is a template. Its files run once for each
 :class:`~newton_qd.physics.precision.Variant`, as a package of its own name: float32 and
