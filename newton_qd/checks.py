@@ -213,6 +213,21 @@ def text(
         raise error(message(name, value, f"{_none(optional)}text that is not empty"))
 
 
+def choice(name: str, value: object, allowed: Collection[str]) -> None:
+    """Checks that a value is one of several names.
+
+    Args:
+        name: Name of the argument.
+        value: Value of the argument.
+        allowed: The names.
+
+    Raises:
+        ValueError: The value is none of them.
+    """
+    if not isinstance(value, str) or value not in allowed:
+        raise ValueError(message(name, value, listed(allowed)))
+
+
 def instance(
     name: str,
     value: object,

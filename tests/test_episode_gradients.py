@@ -419,5 +419,7 @@ def test_smooth_descriptor_leaves_the_environment_as_it_was() -> None:
         assert same.state_descriptor_name == "xy_position"
     with pytest.raises(ValueError, match=r"width: got 0.*above 0"):
         with_smooth_descriptor(env, 0.0)
+    with pytest.raises(ValueError, match=r"tail: got 'none'; allowed: exponential, a"):
+        with_smooth_descriptor(env, 0.1, tail="none")
     with pytest.raises(ValueError, match=r"smooth_width: got None.*width above 0"):
         newton_qd.create("ant_uni", qdax_wrappers_kwargs=[{"straight_through": True}])

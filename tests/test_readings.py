@@ -106,6 +106,71 @@ def test_feet_touch_above_one_percent_of_the_weight(x64: None) -> None:
     np.testing.assert_allclose(state.smooth_feet_contact, smooth, rtol=1e-12)
 
 
+@functools.cache
+def algebraic(robot: RobotSpec, dtype: str = "float64") -> System:
+    return physics.load_system(robot, dtype, feet_width=WIDTH, feet_tail="algebraic")
+
+
+def test_algebraic_tail(x64: None) -> None:
+    """The reading of the smooth step, its start without load, and its gradient."""
+    system = algebraic(ANT)
+    q, v, control = random_states(system, np.random.default_rng(5), 100)
+    state, _ = step_of(system)(q, v, control)
+    weight = system.total_mass * ANT.gravity * ANT.dt
+    excess = np.asarray(state.normal_impulse)[:, system.feet] / weight - 0.01
+    excess /= WIDTH
+    expected = 0.5 + 0.5 * excess / (1 + np.sqrt(1 + excess**2))
+    np.testing.assert_allclose(state.smooth_feet_contact, expected, rtol=1e-12)
+    unloaded = expected[excess == excess.min()][0]
+    assert excess.min() == pytest.approx(-0.01 / WIDTH)
+    begun = physics.initial_state(system, q[0], v[0])
+    np.testing.assert_allclose(begun.smooth_feet_contact, unloaded, rtol=1e-12)
+
+    def value(q: jax.Array, v: jax.Array, control: jax.Array) -> jax.Array:
+        start = physics.initial_state(system, q, v)
+        return physics.step(system, start, control)[0].smooth_feet_contact.sum()
+
+    some = tuple(x[:20] for x in (q, v, control))
+    errors = directional_errors(value, some)
+    report("largest error for q, v, control", errors.max(axis=1))
+    assert errors.max() < 1e-6
+
+
+@pytest.mark.parametrize("tail", ["exponential", "algebraic"])
+def test_gradient_of_a_foot_that_stands(x64: None, tail: str) -> None:
+    """In single precision it has the direction of double precision at every load.
+
+    The exponential step ends at 1 - 1e-11 where feet carry half of the weight, and
+    single precision rounds this to 1. The slope of the algebraic step is 1e8 times as
+    large there.
+    """
+    gradients = []
+    for dtype in ("float32", "float64"):
+        system = physics.load_system(ANT, dtype, feet_width=0.02, feet_tail=tail)
+        # all four feet are pressed in, until each carries half of the weight
+        depths = np.linspace(0.002, 0.02, 8)
+        q = np.tile(system.rest_q, (8, 1))
+        q[:, 2] -= depths
+        v = np.zeros((8, system.nv))
+
+        def value(v: jax.Array, q: jax.Array, system: System = system) -> jax.Array:
+            start = physics.initial_state(system, q, v)
+            control = jnp.zeros(system.nu, system.dtype)
+            return physics.step(system, start, control)[0].smooth_feet_contact.sum()
+
+        slope = jax.jit(jax.vmap(jax.grad(value)))
+        found = slope(v.astype(dtype), q.astype(np.float32).astype(dtype))
+        gradients.append(np.asarray(found, np.float64))
+    single, double = gradients
+    norms = np.linalg.norm(single, axis=1), np.linalg.norm(double, axis=1)
+    cosines = (single * double).sum(axis=1) / (norms[0] * norms[1])
+    report("norm and cosine by depth", (norms[1], 1 - cosines))
+    assert cosines.min() > 0.99999
+    np.testing.assert_allclose(norms[0], norms[1], rtol=1e-3)
+    if tail == "algebraic":
+        assert norms[1].min() > 1e-3
+
+
 def test_contact_that_is_not_smooth_has_no_gradient(x64: None) -> None:
     system = system_of(ANT)
     inputs = random_states(system, np.random.default_rng(3), 20)
@@ -142,3 +207,9 @@ def test_variants_are_made_once() -> None:
     assert dataclasses.replace(smooth).mass is plain.mass
     with pytest.raises(ValueError, match=r"feet_width: got 0.0.*above 0"):
         physics.load_system(ANT, feet_width=0.0)
+    slow = physics.load_system(ANT, feet_tail="algebraic")
+    assert slow is physics.load_system(ANT, feet_tail="algebraic") is not plain
+    with pytest.raises(
+        ValueError, match=r"feet_tail: got 'x'; allowed: exponential, a"
+    ):
+        physics.load_system(ANT, feet_tail="x")

@@ -350,6 +350,19 @@ def test_feet_contact_can_be_smooth() -> None:
         Ant().with_feet_width(-1.0)
 
 
+def test_smooth_feet_contact_can_have_an_algebraic_tail() -> None:
+    options = {"smooth_width": 0.1, "smooth_tail": "algebraic"}
+    env = newton_qd.create("ant_uni", qdax_wrappers_kwargs=[options])
+    state = jax.jit(env.reset)(KEY)
+    unloaded = 0.5 - 0.05 / (1 + np.sqrt(1.01))
+    np.testing.assert_allclose(state.info["state_descriptor"], unloaded, rtol=1e-6)
+    allowed = r"got 'flat'; allowed: exponential, algebraic"
+    with pytest.raises(ValueError, match=f"smooth_tail: {allowed}"):
+        FeetContactWrapper(Ant(), "ant", smooth_width=0.1, smooth_tail="flat")
+    with pytest.raises(ValueError, match=f"feet_tail: {allowed}"):
+        Ant().with_feet_width(0.1, "flat")
+
+
 def test_feet_contact_needs_feet() -> None:
     with pytest.raises(NotImplementedError, match="does not support line yet"):
         FeetContactWrapper(Line(), "line")

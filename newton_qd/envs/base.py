@@ -103,6 +103,7 @@ class PhysicsEnv(Env):
         if reset_velocity_noise_scale is not None:
             self._velocity_noise = reset_velocity_noise_scale
         self._feet_width: float | None = None
+        self._feet_tail = "exponential"
         self._load(scene)
 
     def _load(self, scene: Scene | None) -> None:
@@ -111,6 +112,7 @@ class PhysicsEnv(Env):
             self._dtype.name,
             scene,
             feet_width=self._feet_width,
+            feet_tail=self._feet_tail,
             reports_bodies=self.reads_bodies,
         )
         self.system: System = system
@@ -154,17 +156,20 @@ class PhysicsEnv(Env):
         changed._load(self.system.scene)
         return changed
 
-    def with_feet_width(self, width: float) -> PhysicsEnv:
-        """Returns the same environment with another width of the smooth feet contact.
+    def with_feet_width(self, width: float, tail: str = "exponential") -> PhysicsEnv:
+        """Returns the same environment with another smooth feet contact.
 
         Args:
             width: Share of the robot's weight over which it rises from 0 to 1 [-].
+            tail: How its slope decays for large loads: ``"exponential"`` or
+                ``"algebraic"``.
 
         Raises:
-            ValueError: ``width`` is not above 0.
+            ValueError: ``width`` is not above 0, or ``tail`` is not allowed.
         """
         changed = copy.copy(self)
         changed._feet_width = width
+        changed._feet_tail = tail
         changed._load(self.system.scene)
         return changed
 

@@ -6,12 +6,16 @@ import copy
 
 from newton_qd import checks
 from newton_qd.envs.base import Env
+from newton_qd.physics.system import TAILS
 from newton_qd.wrappers import FeetContactWrapper
 from newton_qd.wrappers.base import Wrapper
 
 
 def with_smooth_descriptor(
-    env: Env, width: float = 0.02, straight_through: bool = False
+    env: Env,
+    width: float = 0.02,
+    straight_through: bool = False,
+    tail: str = "exponential",
 ) -> Env:
     """Returns the environment with a state descriptor that has a gradient.
 
@@ -19,7 +23,7 @@ def with_smooth_descriptor(
     The position of the torso is already smooth, so tasks with this descriptor do not
     change. For an existing environment, this is the same as ``create(...,
     qdax_wrappers_kwargs=[{"smooth_width": width, "straight_through":
-    straight_through}])``.
+    straight_through, "smooth_tail": tail}])``.
 
     Args:
         env: The environment; it does not change.
@@ -27,18 +31,22 @@ def with_smooth_descriptor(
             to 1 [-], above 0.
         straight_through: Whether the contact stays 0 or 1, but has the gradient of the
             smooth contact.
+        tail: How the slope of the smooth contact decays for large loads:
+            ``"exponential"``, or ``"algebraic"``, which has a useful gradient for a
+            foot that stands.
 
     Raises:
         TypeError: An argument has the wrong type.
-        ValueError: ``width`` is not finite and above 0.
+        ValueError: ``width`` is not finite and above 0, or ``tail`` is not allowed.
     """
     checks.environment(env)
     checks.number("width", width, above=0)
     checks.flag("straight_through", straight_through)
+    checks.choice("tail", tail, TAILS)
     if not isinstance(env, Wrapper):
         return env
     if isinstance(env, FeetContactWrapper):
-        return FeetContactWrapper(env.env, env.name, width, straight_through)
+        return FeetContactWrapper(env.env, env.name, width, straight_through, tail)
     changed = copy.copy(env)
-    changed.env = with_smooth_descriptor(env.env, width, straight_through)
+    changed.env = with_smooth_descriptor(env.env, width, straight_through, tail)
     return changed

@@ -12,6 +12,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from newton_qd.physics import layout, reference
+from newton_qd.physics.kinds import Tail
 from newton_qd.physics.layout import Layout
 from newton_qd.physics.precision import Kernels, Variant, build_kernels, pack_width
 from newton_qd.physics.system import CONTACT_FRACTION, STANDARD_GRAVITY, System
@@ -117,6 +118,7 @@ def build_model(system: System, device: wp.Device, parametric: bool = False) -> 
     model.foot_weight = system.total_mass * gravity * robot.dt
     model.foot_fraction = CONTACT_FRACTION
     model.foot_width = system.feet_width
+    model.foot_tail = Tail[system.feet_tail.upper()]
     _put_rows(model, space.structs, system, parametric)
     return model
 

@@ -1,4 +1,4 @@
-"""Kinds of joints and obstacles. Models and kernels both read them from here."""
+"""Kinds of joints, obstacles and smooth steps, for models and kernels."""
 
 import enum
 
@@ -9,6 +9,17 @@ class JointKind(enum.IntEnum):
     FREE = 0
     REVOLUTE = 1
     PRISMATIC = 2
+
+
+class Tail(enum.IntEnum):
+    """How the slope of a smooth step decays far from the step."""
+
+    EXPONENTIAL = 0
+    ALGEBRAIC = 1
+
+
+TAILS = tuple(tail.name.lower() for tail in Tail)
+"""Names of the tails, as arguments have them."""
 
 
 class ObstacleKind(enum.IntEnum):

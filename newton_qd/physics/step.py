@@ -36,18 +36,25 @@ def initial_state(system: System, q: jax.Array, v: jax.Array) -> PhysicsState:
         seen = bodies or forward_kinematics(system, q, v)
         torso_xy = seen.position[system.torso, :2]
     feet = system.feet.shape
-    # The value without load, 1 / (1 + exp(.)), in a form that does not overflow.
-    unloaded = np.exp(-np.logaddexp(0.0, CONTACT_FRACTION / system.feet_width))
     return PhysicsState(
         q=q,
         v=v,
         impulse=jnp.zeros((system.nb, 6), dtype),
         normal_impulse=jnp.zeros((system.nb,), dtype),
         feet_contact=jnp.zeros(feet, dtype),
-        smooth_feet_contact=jnp.full(feet, unloaded, dtype),
+        smooth_feet_contact=jnp.full(feet, _unloaded(system), dtype),
         torso_xy=torso_xy,
         bodies=bodies,
     )
+
+
+def _unloaded(system: System) -> float:
+    """Returns the smooth contact of a foot without load."""
+    deficit = CONTACT_FRACTION / system.feet_width
+    if system.feet_tail == "algebraic":
+        return 0.5 - 0.5 * deficit / (1.0 + np.hypot(1.0, deficit))
+    # 1 / (1 + exp(.)), in a form that does not overflow
+    return np.exp(-np.logaddexp(0.0, deficit))
 
 
 def step(

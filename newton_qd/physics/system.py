@@ -8,6 +8,7 @@ import jax
 import numpy as np
 
 from newton_qd.checks import Fact, message
+from newton_qd.physics.kinds import TAILS as TAILS
 from newton_qd.physics.kinds import JointKind as JointKind
 from newton_qd.physics.kinds import ObstacleKind as ObstacleKind
 from newton_qd.robots import RobotSpec
@@ -82,6 +83,8 @@ class System:
         feet: (nf,) body index of each foot.
         feet_width: Width of the smooth contact step of a foot, as a share of the
             robot's weight [-].
+        feet_tail: How the slope of this step decays for large loads:
+            ``"exponential"`` or ``"algebraic"``.
         reports_bodies: Whether a step reports the kinematics of the bodies.
         torso: Body index of the torso.
         rest_q: (nq,) coordinates of the default pose. Its velocities are 0.
@@ -131,6 +134,7 @@ class System:
     torso: int
     rest_q: np.ndarray
     feet_width: float
+    feet_tail: str
     reports_bodies: bool
 
     def __post_init__(self) -> None:
@@ -230,8 +234,8 @@ class PhysicsState:
         feet_contact: (nf,) 1 if a foot carried more than 1 % of the robot's weight
             over the control step, else 0. Its gradient is 0.
         smooth_feet_contact: (nf,) smooth version of ``feet_contact``: a smooth step
-            with the system's ``feet_width``. It is 0.5 at the load where
-            ``feet_contact`` switches.
+            with the system's ``feet_width`` and ``feet_tail``. It is 0.5 at the load
+            where ``feet_contact`` switches.
         torso_xy: (2,) x and y of the torso's link frame [m].
         bodies: Kinematics of the bodies. ``None`` if the system does not report them.
     """

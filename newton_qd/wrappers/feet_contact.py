@@ -10,7 +10,7 @@ from newton_qd.checks import message
 from newton_qd.envs.base import Env, PhysicsEnv
 from newton_qd.envs.state import State
 from newton_qd.extractors import get_feet_contact_proportion
-from newton_qd.physics.system import PhysicsState
+from newton_qd.physics.system import TAILS, PhysicsState
 from newton_qd.types import Descriptor
 from newton_qd.wrappers.base import unsupported
 from newton_qd.wrappers.descriptor import DescriptorWrapper
@@ -31,6 +31,7 @@ class FeetContactWrapper(DescriptorWrapper):
         env_name: str,
         smooth_width: float | None = None,
         straight_through: bool = False,
+        smooth_tail: str = "exponential",
     ) -> None:
         """Wraps a robot with feet.
 
@@ -42,12 +43,15 @@ class FeetContactWrapper(DescriptorWrapper):
                 robot's weight [-].
             straight_through: Whether the contact is 0 or 1, but has the gradient of
                 the smooth contact.
+            smooth_tail: How the slope of the smooth contact decays for large loads:
+                ``"exponential"``, or ``"algebraic"``, which has a useful gradient for
+                a foot that stands.
 
         Raises:
             NotImplementedError: The environment is not a simulated robot with feet.
             TypeError: The width is not a number.
             ValueError: The width is not finite or not above 0, or is missing for a
-                straight-through gradient.
+                straight-through gradient; or the tail is not allowed.
         """
         robot = env.unwrapped
         if not isinstance(robot, PhysicsEnv) or not len(robot.system.feet):
@@ -56,6 +60,7 @@ class FeetContactWrapper(DescriptorWrapper):
                 allowed += ", so set RobotSpec.feet"
             raise NotImplementedError(unsupported(env, env_name, allowed))
         checks.number("smooth_width", smooth_width, above=0, optional=True)
+        checks.choice("smooth_tail", smooth_tail, TAILS)
         if straight_through and smooth_width is None:
             allowed = (
                 "a width above 0 with straight_through=True, over which the gradient "
@@ -63,7 +68,9 @@ class FeetContactWrapper(DescriptorWrapper):
             )
             raise ValueError(message("smooth_width", None, allowed))
         if smooth_width is not None:
-            env = env.with_base(lambda base: _with_feet_width(base, smooth_width))
+            env = env.with_base(
+                lambda base: _with_smooth_feet(base, smooth_width, smooth_tail)
+            )
         super().__init__(env, env_name)
         self._smooth = smooth_width is not None
         self._straight_through = straight_through
@@ -103,6 +110,6 @@ class FeetContactWrapper(DescriptorWrapper):
         return jnp.zeros(size, self.dtype), jnp.ones(size, self.dtype)
 
 
-def _with_feet_width(env: Env, width: float) -> Env:
+def _with_smooth_feet(env: Env, width: float, tail: str) -> Env:
     assert isinstance(env, PhysicsEnv)
-    return env.with_feet_width(width)
+    return env.with_feet_width(width, tail)

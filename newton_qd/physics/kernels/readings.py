@@ -6,6 +6,8 @@ position and velocity of the centre of mass, and the angular velocity.
 
 import warp as wp
 
+from newton_qd.physics.kinds import Tail
+
 from . import real, scalar, stage, vec3
 from .cpp.algebra import (
     component,
@@ -19,7 +21,7 @@ from .cpp.algebra import (
 from .cpp.memory import constant, load, read_input, store, write_output
 from .cpp.numbers import above, choose, uniform
 from .cpp.operators import add, div, mul, sub  # noqa: F401
-from .cpp.smooth import logistic
+from .cpp.smooth import algebraic, logistic
 from .rows import Bodies
 from .structs import Model, Offsets, Scratch, offsets_at
 
@@ -185,8 +187,8 @@ def body_impulse(m: Model, sc: Scratch, slot: int, offsets: Offsets, i: int):
 def foot_contact(m: Model, sc: Scratch, slot: int, offsets: Offsets, f: int):
     """Whether foot ``f`` carries weight, at once and as a smooth step.
 
-    Reads: m.nf, m.foot, m.foot_weight, m.foot_fraction, m.foot_width, sc.fault,
-        sc.body_normal_impulse.
+    Reads: m.nf, m.foot, m.foot_weight, m.foot_fraction, m.foot_width, m.foot_tail,
+        sc.fault, sc.body_normal_impulse.
     Writes: sc.foot_contact, sc.smooth_foot_contact.
     """
     impulse = load(sc.body_normal_impulse, offsets.reading + load(m.foot, f))
@@ -195,4 +197,7 @@ def foot_contact(m: Model, sc: Scratch, slot: int, offsets: Offsets, f: int):
     at = slot * m.nf + f
     store(sc.foot_contact, at, above(share, m.foot_fraction))
     excess = (share - m.foot_fraction) / uniform(m.foot_width)
-    store(sc.smooth_foot_contact, at, logistic(excess))
+    if m.foot_tail == Tail.ALGEBRAIC:
+        store(sc.smooth_foot_contact, at, algebraic(excess))
+    else:
+        store(sc.smooth_foot_contact, at, logistic(excess))

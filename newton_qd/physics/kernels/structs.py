@@ -87,6 +87,7 @@ class Model:
     foot_weight: scalar  # impulse of the robot's weight over a control step [N s]
     foot_fraction: scalar  # share of it above which a foot touches the ground
     foot_width: scalar  # share of it over which the smooth contact rises
+    foot_tail: int  # how its slope decays
     # rows of the caller's arrays
     inputs: Inputs
     outputs: Outputs

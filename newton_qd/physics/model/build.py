@@ -25,7 +25,7 @@ from newton_qd.physics.model.robot_checks import check_robot, index_of, refusal
 from newton_qd.physics.model.scene import obstacle_tables, read_scene
 from newton_qd.physics.model.verify import BuiltModel, ModelMismatchError, verify
 from newton_qd.physics.model.xml_reader import IDENTITY, RobotDescriptionError
-from newton_qd.physics.system import JointKind, System
+from newton_qd.physics.system import TAILS, JointKind, System
 from newton_qd.robots import RobotSpec
 from newton_qd.scenes import Scene
 
@@ -272,6 +272,7 @@ def build_system(robot: RobotSpec, dtype: str, scene: Scene | None = None) -> Sy
         torso=body_of(robot, "torso", robot.torso, bodies),
         rest_q=np.zeros(int(model.joint_coord_count)),
         feet_width=0.02,
+        feet_tail="exponential",
         reports_bodies=False,
         **_body_arrays(bodies),
         **_dof_arrays(robot, built, bodies, control),
@@ -291,12 +292,16 @@ def _cached_system(robot: RobotSpec, dtype: str, scene: Scene | None) -> System:
 
 @functools.cache
 def _cached_variant(
-    system: System, feet_width: float | None, reports_bodies: bool
+    system: System, feet_width: float, feet_tail: str, reports_bodies: bool
 ) -> System:
-    width = system.feet_width if feet_width is None else feet_width
-    if (width, reports_bodies) == (system.feet_width, system.reports_bodies):
+    changes = {
+        "feet_width": feet_width,
+        "feet_tail": feet_tail,
+        "reports_bodies": reports_bodies,
+    }
+    if all(getattr(system, name) == value for name, value in changes.items()):
         return system
-    return dataclasses.replace(system, feet_width=width, reports_bodies=reports_bodies)
+    return dataclasses.replace(system, **changes)
 
 
 def load_system(
@@ -305,6 +310,7 @@ def load_system(
     scene: Scene | None = None,
     *,
     feet_width: float | None = None,
+    feet_tail: str = "exponential",
     reports_bodies: bool = False,
 ) -> System:
     """Returns the system of a robot. A process builds it once for the same arguments.
@@ -316,6 +322,8 @@ def load_system(
         scene: The obstacles on the flat ground. ``None``: no obstacles.
         feet_width: Width of the smooth contact step of a foot, as a share of the
             robot's weight [-], above 0. ``None``: 0.02.
+        feet_tail: How the slope of this step decays for large loads:
+            ``"exponential"``, or ``"algebraic"`` with the inverse square of the load.
         reports_bodies: Whether a step reports the kinematics of the bodies.
 
     Raises:
@@ -324,12 +332,14 @@ def load_system(
         RobotDescriptionError: The physics does not support a file or the robot.
         ModelMismatchError: Newton's model differs from the file.
         ValueError: ``dtype`` is not allowed, or needs JAX's 64-bit mode. Or
-            ``feet_width`` is not above 0.
+            ``feet_width`` is not above 0, or ``feet_tail`` is not allowed.
     """
     dtype = checks.precision(dtype).name
     checks.number(
         "feet_width", feet_width, above=0, endless=True, optional=True, error=ValueError
     )
+    checks.choice("feet_tail", feet_tail, TAILS)
     check_robot(robot)  # before the cache computes its hash
     system = _cached_system(robot, dtype, scene)
-    return _cached_variant(system, feet_width, reports_bodies)
+    width = system.feet_width if feet_width is None else feet_width
+    return _cached_variant(system, width, feet_tail, reports_bodies)

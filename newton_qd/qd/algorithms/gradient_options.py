@@ -25,11 +25,14 @@ class DifferentiableOptions(Options):
     Attributes:
         smooth_width: Share of a robot's weight over which the contact of a foot has a
             gradient [-]; its value stays 0 or 1.
+        algebraic_tail: Whether this gradient decays with the inverse square of the
+            load, instead of exponentially.
         initial_scale: Factor of the weights of the initial population [-]; with small
             weights, gradients stay small over more control steps.
     """
 
     smooth_width: float = 0.1
+    algebraic_tail: bool = False
     initial_scale: float = 1.0
 
 
@@ -121,11 +124,12 @@ def on_robots_that_fall(**defaults: object) -> dict[str, Mapping[str, object]]:
     return dict.fromkeys((*names, "humanoidtrap"), defaults)
 
 
-def differentiable(task: Task, smooth_width: float) -> Task:
+def differentiable(task: Task, options: DifferentiableOptions) -> Task:
     """Returns the task with a descriptor that has the same values and a gradient."""
     from newton_qd.gradients import with_smooth_descriptor
 
-    env = with_smooth_descriptor(task.env, smooth_width, straight_through=True)
+    tail = "algebraic" if options.algebraic_tail else "exponential"
+    env = with_smooth_descriptor(task.env, options.smooth_width, True, tail)
     return dataclasses.replace(task, env=env)
 
 
@@ -135,7 +139,7 @@ def gradient_scoring(
     """Returns a scoring function with the gradients of fitness and descriptor."""
     from newton_qd.qd.scoring.rollout import episode_of
 
-    smooth = differentiable(task, options.smooth_width)
+    smooth = differentiable(task, options)
     length = config.episode_length
     episode = episode_of(smooth, policy, length, options=options.flow())
     return episode.scoring(options.gradient(episode))

@@ -56,7 +56,7 @@ def _make(context: EmitterContext, options: ActorCriticOptions) -> Any:
     from newton_qd.qd.emitters.actor_critic_learner import measure_of
 
     config, policy = context.config, context.policy
-    task = differentiable(context.task, options.smooth_width)
+    task = differentiable(context.task, options)
     method = ActorCritic(
         task.env,
         lambda weights, obs: policy.apply(policy.unravel(weights), obs),

@@ -63,7 +63,7 @@ def _make(context: EmitterContext, options: MEGradientOptions) -> Any:
     from newton_qd.qd.scoring.rollout import episode_of
 
     config, key = context.config, context.reset_key
-    task = differentiable(context.task, options.smooth_width)
+    task = differentiable(context.task, options)
     length = config.episode_length
     episode = episode_of(task, context.policy, length, options=options.flow())
     emitter = GradientLineEmitter(

@@ -9,7 +9,7 @@ import warp as wp
 from .. import quat, real, scalar, vec3
 from .algebra import dot
 from .native import native
-from .numbers import sqrt
+from .numbers import ROOT, sqrt
 from .operators import add, mul, sub  # noqa: F401
 
 # Distances are of vectors no shorter than this [m]: a direction is always finite.
@@ -84,12 +84,33 @@ for (int i = 0; i < sizeof(Real) / sizeof(Number); ++i) power[i] = wp::exp(-A[i]
 @wp.func_native(
     *native(
         "Real(1) / (Real(1) + power)",
-        "adj_A += RET * (Real(1) - RET) * adj_RET;",
+        # RET (1 - RET) would lose all digits where RET is nearly 1
+        """
+Real small = A > Real(0) ? power : Real(1) / power;
+Real whole = Real(1) + small;
+adj_A += small / (whole * whole) * adj_RET;
+""",
         _EXPONENTIAL,
     )
 )
 def logistic(a: real) -> real:
-    """Smooth step from 0 to 1."""
+    """Smooth step from 0 to 1; its slope decays exponentially."""
+    ...
+
+
+@wp.func_native(
+    *native(
+        "half + half * A / (Real(1) + distance)",
+        "adj_A += half / (distance * (Real(1) + distance)) * adj_RET;",
+        ROOT
+        + """
+Real half = Real(0.5);
+Real distance = root(Real(1) + A * A);
+""",
+    )
+)
+def algebraic(a: real) -> real:
+    """Smooth step from 0 to 1, as steep at 0; its slope decays as 1/a^2."""
     ...
 
 
