@@ -327,7 +327,7 @@ def test_fixed_links_join_their_parent(tmp_path: Path) -> None:
     turned = '<origin xyz="0.3 0 0" rpy="0 1.5707963267948966 0"/>'
     text = f"""<robot name="welded">{link("base")}{toe}{link("tail")}
     {joint("weld", "fixed", "base", "toe", turned)}
-    {joint("hinge", "revolute", "toe", "tail", '<origin xyz="0 0 1"/>')}</robot>"""
+    {joint("hinge", "continuous", "toe", "tail", '<origin xyz="0 0 1"/>')}</robot>"""
     robot = row(
         write(tmp_path, text), "base", contacts=(Contact("toe"),), feet=("toe",)
     )

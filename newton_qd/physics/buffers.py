@@ -16,7 +16,7 @@ from newton_qd.physics.kinds import Tail
 from newton_qd.physics.layout import Layout
 from newton_qd.physics.precision import Kernels, Variant, build_kernels, pack_width
 from newton_qd.physics.system import CONTACT_FRACTION, STANDARD_GRAVITY, System
-from newton_qd.physics.tree import Tree, build_tree, origin_axes
+from newton_qd.physics.tree import Tree, build_tree
 from newton_qd.physics.warp_internals import field_dtype
 
 # Iterations in a substep, and solves in an iteration. A system with contacts has one
@@ -97,7 +97,7 @@ def build_model(system: System, device: wp.Device, parametric: bool = False) -> 
     model.gravity = robot.gravity
     model.total_mass = system.total_mass
     put("rest_q", system.rest_q)
-    put("origin_axis", origin_axes(system))
+    put("origin_axis", reference.origin_axes(system))
     _put_bodies(put, system, tree)
     model.body_levels = len(tree.body_level[0]) - 1
     _put_dofs(put, system)

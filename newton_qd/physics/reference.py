@@ -140,6 +140,29 @@ def mass_matrix(system: System, q: np.ndarray) -> np.ndarray:
     return total
 
 
+def origin_axes(system: System) -> np.ndarray:
+    """Returns the derivative of the origin O with respect to the first coordinates.
+
+    O is the origin of spatial vectors. With a free root, O is the position of the root.
+    Otherwise O starts at the origin of the world and moves with the prismatic joints at
+    the root.
+
+    Returns:
+        (3, 3) row i is the motion of O per metre of coordinate i, world axes [-].
+    """
+    if system.joint_kind[0] == JointKind.FREE:
+        return np.eye(3)
+    axes = np.zeros((3, 3))
+    frames = body_frames(system, np.zeros(system.nq))
+    for body in range(min(3, system.nb)):
+        slides = system.joint_kind[body] == JointKind.PRISMATIC
+        if not slides or system.parent[body] != body - 1:
+            break
+        side = compose(frames[body], system.child_frame[body])
+        axes[body] = rotation_matrix(side[3:]) @ system.joint_axis[body]
+    return axes
+
+
 def penetration(gap: float, width: float) -> float:
     """Returns the kernels' smooth ``max(-gap, 0)``. It is exact for |gap| >= width."""
     if abs(gap) >= width:

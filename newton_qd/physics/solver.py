@@ -229,7 +229,7 @@ def _launcher(system: System, device: wp.Device, dt: float) -> Launcher:
 def _one_world(robot: RobotSpec, device: wp.Device) -> newton.Model:
     """Returns Newton's model of the robot alone, built as users build it."""
     path = find_urdf(robot.urdf)
-    floating = read_description(path).floating
+    floating = read_description(path, robot.fixed_base).floating
     builder = newton_builder(str(path), floating, robot.gravity)
     with warnings.catch_warnings():
         # Newton has already warned about corrected inertias in the caller's model.

@@ -1,4 +1,4 @@
-"""Index tables of a kinematic tree, and the origin of spatial vectors."""
+"""Index tables of a kinematic tree."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from newton_qd.physics import reference
-from newton_qd.physics.system import JointKind, System
+from newton_qd.physics.system import System
 
 
 def _ragged(rows: Sequence[Sequence[int]]) -> tuple[np.ndarray, np.ndarray]:
@@ -63,26 +62,3 @@ def build_tree(system: System) -> Tree:
         child=_ragged(children),
         contact=np.asarray([0, *np.cumsum(contact_counts)], np.int32),
     )
-
-
-def origin_axes(system: System) -> np.ndarray:
-    """Returns the derivative of the origin O with respect to the first coordinates.
-
-    O is the origin of spatial vectors. With a free root, O is the position of the root.
-    Otherwise O starts at the origin of the world and moves with the prismatic joints at
-    the root.
-
-    Returns:
-        (3, 3) row i is the motion of O per metre of coordinate i, world axes [-].
-    """
-    if system.joint_kind[0] == JointKind.FREE:
-        return np.eye(3)
-    axes = np.zeros((3, 3))
-    frames = reference.body_frames(system, np.zeros(system.nq))
-    for body in range(min(3, system.nb)):
-        slides = system.joint_kind[body] == JointKind.PRISMATIC
-        if not slides or system.parent[body] != body - 1:
-            break
-        side = reference.compose(frames[body], system.child_frame[body])
-        axes[body] = reference.rotation_matrix(side[3:]) @ system.joint_axis[body]
-    return axes

@@ -87,6 +87,8 @@ class RobotSpec:
         substeps: Physics steps in a control step [-].
         gravity: Downward acceleration [m/s^2].
         material: Softness of contacts and limits.
+        fixed_base: Whether the root link is fixed to the world. ``None``: only a root
+            with the name ``world`` is.
 
     Raises:
         TypeError: ``original_names`` is given; it has moved to
@@ -109,6 +111,7 @@ class RobotSpec:
     material: Material = Material()
     original_names: dataclasses.InitVar[tuple[()]] = ()  # an error tells the new place
     pairs: tuple[tuple[Contact, Contact], ...] = ()
+    fixed_base: bool | None = None
 
     def __post_init__(self, original_names: tuple[()]) -> None:
         if original_names:

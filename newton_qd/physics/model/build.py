@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,8 +19,15 @@ from newton_qd.assets import find_urdf
 from newton_qd.checks import Fact, listed, message
 from newton_qd.physics import reference
 from newton_qd.physics.model.contacts import body_of, contact_tables, pair_shares
-from newton_qd.physics.model.description import Body, Description, read_description
+from newton_qd.physics.model.description import (
+    Body,
+    Description,
+    read_description,
+    warn_unbounded,
+)
 from newton_qd.physics.model.elements import UNLIMITED, Shape
+from newton_qd.physics.model.inertia import check_inertia
+from newton_qd.physics.model.newton_input import merge_fixed_bodies, newton_text
 from newton_qd.physics.model.rest import rest_coordinates
 from newton_qd.physics.model.robot_checks import check_robot, index_of, refusal
 from newton_qd.physics.model.scene import obstacle_tables, read_scene
@@ -36,13 +44,23 @@ _EARTH_GRAVITY = 9.81  # [m/s^2]
 _DEFAULT_GEAR = 100.0  # [N m]
 
 
-def newton_builder(path: str, floating: bool, gravity: float) -> newton.ModelBuilder:
+def newton_builder(
+    path: str, floating: bool, gravity: float, meshes: bool = True
+) -> newton.ModelBuilder:
     """Imports a URDF file into a Newton builder, with the settings of this package.
+
+    Nothing is downloaded: a mesh or a texture with an address in the network is left
+    out, with a warning.
 
     Args:
         path: The file.
         floating: Whether the root link floats. If false, it is fixed to the world.
         gravity: Downward acceleration [m/s^2].
+        meshes: Whether the files of meshes and textures are read.
+
+    Raises:
+        RobotDescriptionError: The file is not XML.
+        OSError: The file cannot be read.
     """
     import newton
 
@@ -50,7 +68,9 @@ def newton_builder(path: str, floating: bool, gravity: float) -> newton.ModelBui
     # Links without <inertial> have no mass. By default Newton computes a mass from the
     # colliders.
     builder.default_shape_cfg.density = 0.0
-    builder.add_urdf(path, floating=floating, collapse_fixed_joints=True)
+    builder.add_urdf(newton_text(Path(path), meshes=meshes), floating=floating)
+    fixed = [kind == newton.JointType.FIXED for kind in builder.joint_type]
+    merge_fixed_bodies(builder, fixed)
     return builder
 
 
@@ -63,7 +83,6 @@ def _read_shapes(model: newton.Model) -> tuple[tuple[Shape, ...], ...]:
         GeoType.CAPSULE: "capsule",
         GeoType.CYLINDER: "cylinder",
         GeoType.BOX: "box",
-        GeoType.MESH: "mesh",
     }
     shapes: list[list[Shape]] = [[] for _ in range(model.body_count)]
     rows = zip(
@@ -237,8 +256,11 @@ def build_system(robot: RobotSpec, dtype: str, scene: Scene | None = None) -> Sy
     """
     dtype = checks.precision(dtype).name
     check_robot(robot)
-    description = read_description(find_urdf(robot.urdf))
-    builder = newton_builder(str(description.path), description.floating, robot.gravity)
+    description = read_description(find_urdf(robot.urdf), robot.fixed_base)
+    warn_unbounded(description)
+    builder = newton_builder(
+        str(description.path), description.floating, robot.gravity, False
+    )
     # The inertias of the file are already checked. Newton would change some silently.
     model = builder.finalize(skip_validation_inertia=True)
     built = _read_newton(model, description)
@@ -282,6 +304,7 @@ def build_system(robot: RobotSpec, dtype: str, scene: Scene | None = None) -> Sy
         scene_frames=np.array(list(still.values())).reshape(-1, 7),
     )
     system = dataclasses.replace(system, rest_q=rest_coordinates(system))
+    check_inertia(system, description.path)
     return dataclasses.replace(system, contact_pair_share=pair_shares(system))
 
 

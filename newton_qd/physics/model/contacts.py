@@ -35,7 +35,7 @@ def body_of(robot: RobotSpec, field: str, link: str, bodies: list[Body]) -> int:
         RobotDescriptionError: No body contains the link.
     """
     links = {name: i for i, body in enumerate(bodies) for name in body.links}
-    index_of(robot, field, link, tuple(links))
+    index_of(robot, field, link, tuple(links), "a moving link ")
     return links[link]
 
 

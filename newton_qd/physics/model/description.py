@@ -8,6 +8,7 @@ them to one kinematic tree. The reading does not depend on Newton.
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -18,26 +19,30 @@ from newton_qd.physics.model.elements import (
     Link,
     Shape,
     by_name,
+    check_meshes,
+    is_real,
     read_joint,
     read_link,
 )
 from newton_qd.physics.model.xml_reader import (
     IDENTITY,
     RobotDescriptionError,
+    RobotDescriptionWarning,
     XmlReader,
 )
-from newton_qd.physics.reference import compose
+from newton_qd.physics.reference import compose, rotation_matrix
 
 WORLD = "world"
-"""Name of a root link that is fixed to the world. A root with another name floats."""
+"""Name of a root link that is fixed to the world by its name. Other roots float."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Body:
-    """A moving link, together with the massless links that are fixed to it.
+    """A moving link, together with the links that are fixed to it.
 
     Attributes:
-        link: The moving link. Its frame is the frame of the body.
+        link: The moving link, with the mass, the centre of mass and the inertia of
+            all links of the body. Its frame is the frame of the body.
         joint: The joint that moves it. The joint's frame is in the parent body.
             ``None`` for a floating root.
         parent: Name of the parent body. ``None`` for the world.
@@ -63,6 +68,7 @@ class Description:
         bodies: Bodies by name, in depth-first order with parents first.
         still: World frames (7,) of the links that are fixed to the world, by name.
         fixed: Names of the fixed joints.
+        unbounded: Names of the revolute joints for which the file gives no bounds.
     """
 
     path: Path
@@ -71,6 +77,7 @@ class Description:
     bodies: dict[str, Body]
     still: dict[str, np.ndarray]
     fixed: tuple[str, ...]
+    unbounded: tuple[str, ...]
 
 
 def read_joints(reader: XmlReader, links: dict[str, Link]) -> dict[str, list[Joint]]:
@@ -118,19 +125,14 @@ def find_root(
 
 
 def _merge_fixed(
-    reader: XmlReader,
-    root: Link,
-    links: dict[str, Link],
-    children: dict[str, list[Joint]],
-) -> tuple[dict[str, np.ndarray], tuple[Shape, ...], list[Joint]]:
+    root: Link, links: dict[str, Link], children: dict[str, list[Joint]]
+) -> tuple[Link, dict[str, np.ndarray], tuple[Shape, ...], list[Joint]]:
     """Merges a link with all links that are fixed to it.
 
     Returns:
-        Frames (7,) of the links by name, their colliders, and the moving joints that
-        start at them. All are in the frame of ``root``.
-
-    Raises:
-        RobotDescriptionError: A fixed link has mass.
+        The link with the mass and the inertia of all, the frames (7,) of the links by
+        name, their colliders, and the moving joints that start at them. All are in the
+        frame of ``root``.
     """
     frames, shapes, moving = {root.name: IDENTITY}, list(root.shapes), []
     pending = [(joint, IDENTITY) for joint in children[root.name]]
@@ -141,20 +143,72 @@ def _merge_fixed(
             moving.append(dataclasses.replace(joint, frame=frame))
             continue
         link = links[joint.child]
-        if link.mass > 0:
-            # When Newton 1.8 merges links, it ignores the offset of the centre of mass.
-            name = f"{reader.path}: mass of link {link.name!r}"
-            given = Fact(f"{link.mass:g}")
-            why = f"and it is fixed to {joint.parent!r}"
-            allowed = f"0, so give the mass of both to {joint.parent!r}"
-            raise RobotDescriptionError(message(name, given, allowed, why=why))
         frames[link.name] = frame
         shapes += [
             dataclasses.replace(shape, frame=compose(frame, shape.frame))
             for shape in link.shapes
         ]
         pending = [(inner, frame) for inner in children[link.name]] + pending
-    return frames, tuple(shapes), moving
+    merged = _with_masses(root, [(links[name], at) for name, at in frames.items()])
+    return merged, frames, tuple(shapes), moving
+
+
+def _with_masses(root: Link, parts: list[tuple[Link, np.ndarray]]) -> Link:
+    """Returns ``root`` with the mass and the inertia of links at frames (7,)."""
+    parts = [(link, frame) for link, frame in parts if link.mass > 0]
+    if all(link is root for link, _ in parts):
+        return root
+    mass, com, inertia = merged_inertia(
+        [
+            (
+                link.mass,
+                compose(frame, np.append(link.com, IDENTITY[3:]))[:3],
+                _turned(link.inertia, frame[3:]),
+            )
+            for link, frame in parts
+        ]
+    )
+    return dataclasses.replace(root, mass=mass, com=com, inertia=inertia)
+
+
+def _check_real(merged: Link, parts: list[Link]) -> None:
+    """Checks the inertia of a body.
+
+    A link that is no real body alone may be part of one: many files have a sensor of a
+    gram with wrong moments, fixed to a trunk.
+
+    Raises:
+        RobotDescriptionError: No real body has this inertia. The error names a link.
+    """
+    for link in parts:
+        if link.unreal is not None and not is_real(merged.mass, merged.inertia):
+            raise link.unreal
+
+
+def _turned(inertia: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
+    rotation = rotation_matrix(quaternion)
+    return rotation @ inertia @ rotation.T
+
+
+def merged_inertia(
+    parts: list[tuple[float, np.ndarray, np.ndarray]],
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """Returns the inertia of rigid bodies that move as one.
+
+    Args:
+        parts: Mass [kg], centre of mass (3,) [m] and inertia (3, 3) about it [kg m^2]
+            of each body, all in the same axes.
+
+    Returns:
+        The same three of all bodies together.
+    """
+    mass = sum(mass for mass, _, _ in parts)
+    com = np.sum([mass * com for mass, com, _ in parts], axis=0) / mass
+    total = np.zeros((3, 3))
+    for part, centre, inertia in parts:
+        arm = centre - com
+        total += inertia + part * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+    return float(mass), com, total
 
 
 def _check_masses(path: Path, bodies: dict[str, Body]) -> None:
@@ -168,8 +222,24 @@ def _check_masses(path: Path, bodies: dict[str, Body]) -> None:
             carried[body.parent] += carried[name]
 
 
-def read_description(path: Path) -> Description:
+def warn_unbounded(description: Description) -> None:
+    """Warns about revolute joints for which the file gives no bounds."""
+    if description.unbounded:
+        names = listed(description.unbounded)
+        name = f"{description.path}: limits of revolute joint(s) {names}"
+        allowed = "lower and upper in <limit>, or the type continuous"
+        why = "so they turn freely"
+        text = message(name, Fact("none"), allowed, why=why)
+        warnings.warn(text, RobotDescriptionWarning, stacklevel=3)
+
+
+def read_description(path: Path, fixed_base: bool | None = None) -> Description:
     """Reads a URDF file.
+
+    Args:
+        path: The file.
+        fixed_base: Whether the root link is fixed to the world. ``None``: only a root
+            with the name ``world`` is.
 
     Raises:
         RobotDescriptionError: The file is malformed, or has content that the physics
@@ -183,23 +253,27 @@ def read_description(path: Path) -> Description:
     if not elements:
         raise reader.error(reader.root, "element <link> is missing")
     links = {name: read_link(reader, element) for name, element in elements.items()}
+    for element in elements.values():
+        check_meshes(reader, element)
     children = read_joints(reader, links)
     root = links[find_root(reader, links, children)]
-    floating = root.name != WORLD
+    floating = root.name != WORLD if fixed_base is None else not fixed_base
     bodies: dict[str, Body] = {}
     still: dict[str, np.ndarray] = {}
 
     def grow(link: Link, joint: Joint | None, parent: str | None) -> None:
-        frames, shapes, moving = _merge_fixed(reader, link, links, children)
+        merged, frames, shapes, moving = _merge_fixed(link, links, children)
         fixed = joint is None and not floating
-        if fixed and (link.shapes or link.mass > 0):
+        if fixed and link.name == WORLD and (link.shapes or link.mass > 0):
             given = Fact("a collider or a mass")
             allowed = "neither on a robot's world link"
             raise reader.refused(elements[WORLD], "link", given, allowed)
+        if not fixed:
+            _check_real(merged, [links[name] for name in frames])
         if fixed:
             still.update((name, at) for name, at in frames.items() if name != WORLD)
         else:
-            bodies[link.name] = Body(link, joint, parent, tuple(frames), shapes)
+            bodies[link.name] = Body(merged, joint, parent, tuple(frames), shapes)
         for next_joint in moving:
             grow(links[next_joint.child], next_joint, None if fixed else link.name)
 
@@ -208,6 +282,12 @@ def read_description(path: Path) -> Description:
         raise reader.error(reader.root, "nothing in it moves")
     _check_masses(path, bodies)
     joints = [joint for found in children.values() for joint in found]
-    fixed = tuple(joint.name for joint in joints if joint.kind == "fixed")
-    name = reader.root.get("name", "")
-    return Description(path, name, floating, bodies, still, fixed)
+    return Description(
+        path,
+        reader.root.get("name", ""),
+        floating,
+        bodies,
+        still,
+        fixed=tuple(joint.name for joint in joints if joint.kind == "fixed"),
+        unbounded=tuple(joint.name for joint in joints if not joint.names_bounds),
+    )

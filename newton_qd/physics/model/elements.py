@@ -12,18 +12,25 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from newton_qd.checks import Fact, listed
-from newton_qd.physics.model.xml_reader import XmlReader
+from newton_qd.checks import Fact, listed, message
+from newton_qd.physics.model.xml_reader import (
+    RobotDescriptionError,
+    XmlReader,
+    asset_file,
+)
 from newton_qd.physics.reference import rotation_matrix
 
 UNLIMITED = 1e9
 """A limit of this size or larger means no limit. Newton writes 1e10 [rad or m]."""
 
+# A body of this size is a point [m].
+_POINT = 1e-9
+
 _JOINT_TYPES = ("revolute", "continuous", "prismatic", "fixed")
 # Attributes that a shape must have. Newton uses 1 for a missing size.
 _SHAPES = {
     "sphere": ("radius",),
-    "capsule": ("radius", "height"),
+    "capsule": ("radius", "length"),
     "cylinder": ("radius", "length"),
     "box": ("size",),
     "mesh": ("filename",),
@@ -63,17 +70,35 @@ class Joint:
     lower: float
     upper: float
     damping: float
+    names_bounds: bool = True
+    """Whether the file gives bounds, or says by the type that there are none."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Link:
-    """A link: ``com`` (3,) [m], ``inertia`` (3, 3) about it in link axes [kg m^2]."""
+    """A link: ``com`` (3,) [m], ``inertia`` (3, 3) about it in link axes [kg m^2].
+
+    No real body alone has its inertia if ``unreal`` is an error.
+    """
 
     name: str
     mass: float
     com: np.ndarray
     inertia: np.ndarray
     shapes: tuple[Shape, ...]
+    unreal: RobotDescriptionError | None = None
+
+
+def is_real(mass: float, inertia: np.ndarray) -> bool:
+    """Returns whether a rigid body can have this inertia (3, 3) about its centre.
+
+    Each principal moment is at most the sum of the other two. A rod has a moment of 0,
+    and a point has no other. Rounding may make it negative.
+    """
+    moments = np.linalg.eigvalsh(inertia)
+    least = -1e-9 * moments[2] - _POINT**2 * mass
+    largest = (moments[0] + moments[1]) * (1 + 1e-6) - least
+    return bool(moments[0] >= least and moments[2] <= largest)
 
 
 def _read_shape(reader: XmlReader, element: ElementTree.Element, link: str) -> Shape:
@@ -90,56 +115,86 @@ def _read_shape(reader: XmlReader, element: ElementTree.Element, link: str) -> S
     elif shape.tag == "box":
         size[:] = reader.positive(shape, "size", 3) / 2
     else:
-        for i, key in enumerate(_SHAPES[shape.tag]):
-            size[i] = reader.positive(shape, key, 1)[0] / (1 if i == 0 else 2)
-    # Newton reads the height of a capsule. MuJoCo reads its length.
-    if shape.tag == "capsule" and shape.get("length") is not None:
-        if 2 * size[1] != reader.number(shape, "length"):
-            given = (shape.get("height"), shape.get("length"))
-            allowed = "two equal numbers, as both mean the straight part"
-            raise reader.refused(shape, "height, length", given, allowed)
+        size[0] = reader.positive(shape, "radius", 1)[0]
+        if shape.tag != "sphere":
+            size[1] = _straight_length(reader, shape) / 2
     return Shape(link, shape.tag, reader.frame(element), size, element.get("name", ""))
 
 
-def _read_inertial(
-    reader: XmlReader, link: ElementTree.Element
-) -> tuple[float, np.ndarray, np.ndarray]:
-    """Returns mass, centre of mass (3,) and inertia (3, 3) about it, in link axes."""
-    inertial = link.find("inertial")
-    if inertial is None:
-        return 0.0, np.zeros(3), np.zeros((3, 3))
-    mass = reader.positive(reader.child(inertial, "mass"), "value", 1)[0]
-    element = reader.child(inertial, "inertia")
-    inertia = np.empty((3, 3))
-    for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)):
-        key = "i" + "xyz"[i] + "xyz"[j]
-        inertia[i, j] = inertia[j, i] = reader.number(element, key)
-    moments = np.linalg.eigvalsh(inertia)
-    # For a real body, each principal moment is at most the sum of the other two.
-    if moments[0] <= 0 or moments[2] > (moments[0] + moments[1]) * (1 + 1e-6):
-        given = Fact(listed([f"{moment:g}" for moment in moments]))
-        allowed = "positive, none larger than the sum of the other two"
-        raise reader.refused(element, "principal moments", given, allowed)
-    frame = reader.frame(inertial)
-    rotation = rotation_matrix(frame[3:])
-    return float(mass), frame[:3], rotation @ inertia @ rotation.T
+def _straight_length(reader: XmlReader, shape: ElementTree.Element) -> float:
+    """Returns the length of a cylinder, or of a capsule without its caps [m]."""
+    keys = ["length"]
+    if shape.tag == "capsule" and shape.get("height") is not None:
+        # Newton reads the height of a capsule. ROS, MuJoCo and Bullet read its length.
+        keys = ["height"] if shape.get("length") is None else ["height", "length"]
+    lengths = [float(reader.positive(shape, key, 1)[0]) for key in keys]
+    if lengths[0] != lengths[-1]:
+        given = tuple(shape.get(key) for key in keys)
+        allowed = "two equal numbers, as both mean the straight part"
+        raise reader.refused(shape, ", ".join(keys), given, allowed)
+    return lengths[0]
 
 
 def read_link(reader: XmlReader, element: ElementTree.Element) -> Link:
     """Reads a link: its inertia and its colliders.
 
     Raises:
-        RobotDescriptionError: The link is malformed, or no real body has its inertia.
+        RobotDescriptionError: The link is malformed.
     """
     name = reader.text(element, "name")
-    mass, com, inertia = _read_inertial(reader, element)
+    link = _read_inertial(reader, element, name)
     for visual in element.findall("visual"):
         _read_shape(reader, visual, name)
     shapes = [
         _read_shape(reader, collision, name)
         for collision in element.findall("collision")
     ]
-    return Link(name, mass, com, inertia, tuple(shapes))
+    return dataclasses.replace(link, shapes=tuple(shapes))
+
+
+def _read_inertial(reader: XmlReader, link: ElementTree.Element, name: str) -> Link:
+    """Returns a link with the mass, the centre and the inertia of the element."""
+    inertial = link.find("inertial")
+    if inertial is None:
+        return Link(name, 0.0, np.zeros(3), np.zeros((3, 3)), ())
+    mass_element = reader.child(inertial, "mass")
+    element = reader.child(inertial, "inertia")
+    inertia = np.empty((3, 3))
+    for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)):
+        key = "i" + "xyz"[i] + "xyz"[j]
+        inertia[i, j] = inertia[j, i] = reader.number(element, key)
+    frame = reader.frame(inertial)
+    com = frame[:3]
+    if reader.number(mass_element, "value") == 0 and not inertia.any():
+        # a link without mass, written as zeros
+        return Link(name, 0.0, com, inertia, ())
+    mass = float(reader.positive(mass_element, "value", 1)[0])
+    unreal = None
+    if not is_real(mass, inertia):
+        moments = np.linalg.eigvalsh(inertia)
+        given = Fact(listed([f"{moment:g}" for moment in moments]))
+        allowed = "numbers from 0, none larger than the sum of the other two"
+        unreal = reader.refused(element, "principal moments", given, allowed)
+    rotation = rotation_matrix(frame[3:])
+    return Link(name, mass, com, rotation @ inertia @ rotation.T, (), unreal)
+
+
+def check_meshes(reader: XmlReader, link: ElementTree.Element) -> None:
+    """Checks that the meshes of a link's colliders are files on this machine.
+
+    Raises:
+        RobotDescriptionError: One is not, so a viewer or Newton cannot read it.
+    """
+    for mesh in link.iterfind("collision/geometry/mesh"):
+        filename = reader.text(mesh, "filename")
+        if asset_file(reader.path, filename) is None:
+            why = "which is no file on this machine; contacts do not support a mesh"
+            allowed = (
+                "sphere or capsule, or box, cylinder or the file of a mesh where "
+                "nothing touches"
+            )
+            name = f"link {link.get('name')!r} has a mesh as collider, filename"
+            raise reader.error(mesh, message(name, filename, allowed, why=why))
 
 
 def _refuse_limits(reader: XmlReader, limit: ElementTree.Element) -> None:
@@ -155,13 +210,16 @@ def _refuse_limits(reader: XmlReader, limit: ElementTree.Element) -> None:
             raise reader.refused(limit, key, limit.get(key), allowed)
 
 
-def _read_limits(reader: XmlReader, joint: ElementTree.Element) -> tuple[float, float]:
+def _read_limits(
+    reader: XmlReader, joint: ElementTree.Element
+) -> tuple[float, float] | None:
+    """Returns the lower and the upper limit; ``None`` if the file gives neither."""
     limit = joint.find("limit")
-    if limit is None:
-        return -math.inf, math.inf
-    if joint.get("type") == "continuous":
+    if joint.get("type") == "continuous" and limit is not None:
         _refuse_limits(reader, limit)
-        return -math.inf, math.inf
+        return None
+    if limit is None or (limit.get("lower") is None and limit.get("upper") is None):
+        return None
     lower = float(reader.numbers(limit, "lower", 1, finite=False)[0])
     upper = float(reader.numbers(limit, "upper", 1, finite=False)[0])
     if lower > upper:
@@ -185,36 +243,41 @@ def read_joint(reader: XmlReader, element: ElementTree.Element) -> Joint:
         raise reader.refused(element, "type", kind, listed(_JOINT_TYPES))
     if element.find("mimic") is not None:
         raise reader.error(element, "<mimic> is not supported")
-    axis = np.array([1.0, 0.0, 0.0])
-    axis_element = element.find("axis")
-    if axis_element is not None:
-        axis = reader.numbers(axis_element, "xyz", 3)
-        if not np.linalg.norm(axis) > 0:
-            given = axis_element.get("xyz")
-            raise reader.refused(axis_element, "xyz", given, "a direction")
-    damping = 0.0
-    dynamics = element.find("dynamics")
-    if dynamics is not None:
-        damping = reader.number(dynamics, "damping", "0")
-        if damping < 0:
-            given = Fact(f"{damping:g}")
-            raise reader.refused(dynamics, "damping", given, "numbers from 0")
-        friction = reader.number(dynamics, "friction", "0")
-        if friction != 0:
-            allowed = "0, as joint friction is not supported"
-            raise reader.refused(dynamics, "friction", friction, allowed)
-    lower, upper = _read_limits(reader, element)
-    return Joint(
-        name,
-        kind,
-        reader.text(reader.child(element, "parent"), "link"),
-        reader.text(reader.child(element, "child"), "link"),
-        reader.frame(element),
-        axis / np.linalg.norm(axis),
-        lower,
-        upper,
-        damping,
-    )
+    parent = reader.text(reader.child(element, "parent"), "link")
+    child = reader.text(reader.child(element, "child"), "link")
+    frame = reader.frame(element)
+    axis, damping, limits = np.array([1.0, 0.0, 0.0]), 0.0, None
+    if kind != "fixed":  # what a fixed joint says about its motion has no meaning
+        axis, damping = _read_axis(reader, element), _read_damping(reader, element)
+        limits = _read_limits(reader, element)
+    lower, upper = limits or (-math.inf, math.inf)
+    given = limits is not None or kind != "revolute"
+    return Joint(name, kind, parent, child, frame, axis, lower, upper, damping, given)
+
+
+def _read_axis(reader: XmlReader, joint: ElementTree.Element) -> np.ndarray:
+    element = joint.find("axis")
+    if element is None:
+        return np.array([1.0, 0.0, 0.0])
+    axis = reader.numbers(element, "xyz", 3)
+    if not np.linalg.norm(axis) > 0:
+        raise reader.refused(element, "xyz", element.get("xyz"), "a direction")
+    return axis / np.linalg.norm(axis)
+
+
+def _read_damping(reader: XmlReader, joint: ElementTree.Element) -> float:
+    dynamics = joint.find("dynamics")
+    if dynamics is None:
+        return 0.0
+    damping = reader.number(dynamics, "damping", "0")
+    if damping < 0:
+        given = Fact(f"{damping:g}")
+        raise reader.refused(dynamics, "damping", given, "numbers from 0")
+    friction = reader.number(dynamics, "friction", "0")
+    if friction != 0:
+        allowed = "0, as joint friction is not supported"
+        raise reader.refused(dynamics, "friction", friction, allowed)
+    return damping
 
 
 def by_name(reader: XmlReader, tag: str) -> dict[str, ElementTree.Element]:

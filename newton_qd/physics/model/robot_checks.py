@@ -59,15 +59,21 @@ def refusal(
     return RobotDescriptionError(message(name, value, allowed, why=why))
 
 
-def index_of(robot: RobotSpec, field: str, name: str, allowed: tuple[str, ...]) -> int:
+def index_of(
+    robot: RobotSpec, field: str, name: str, allowed: tuple[str, ...], what: str = ""
+) -> int:
     """Returns the index of the name of a link or joint in ``allowed``.
+
+    ``what`` says for the error what the names have in common, for example ``"a moving
+    link "``.
 
     Raises:
         RobotDescriptionError: The name is not in ``allowed``.
     """
     if not name or name not in allowed:
         known = listed([known for known in allowed if known])
-        raise refusal(robot, field, name, known, why=f"which is not in {robot.urdf}")
+        why = f"which is not {what}in {robot.urdf}"
+        raise refusal(robot, field, name, known, why=why)
     return allowed.index(name)
 
 
@@ -118,6 +124,8 @@ def _check_types(robot: RobotSpec) -> None:
     if not isinstance(rotation, tuple) or len(rotation) != 3:
         allowed = "a tuple of roll, pitch and yaw"
         raise refusal(robot, "rest_rotation", rotation, allowed)
+    if robot.fixed_base is not None and not isinstance(robot.fixed_base, bool):
+        raise refusal(robot, "fixed_base", robot.fixed_base, "None, True, False")
     if not isinstance(robot.material, Material):
         raise refusal(robot, "material", robot.material, "a Material")
 

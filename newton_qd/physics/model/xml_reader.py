@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from urllib.parse import unquote, urlsplit
 from xml.etree import ElementTree
 from xml.parsers import expat
 
@@ -17,6 +18,35 @@ IDENTITY.setflags(write=False)
 
 class RobotDescriptionError(ValueError):
     """The physics does not support a robot's URDF file or its ``RobotSpec``."""
+
+
+class RobotDescriptionWarning(UserWarning):
+    """A robot's URDF file says less than it could, and this package chose a meaning."""
+
+
+def asset_file(urdf: Path, name: str) -> Path | None:
+    """Returns the file on this machine that a URDF file names, or ``None``.
+
+    Args:
+        urdf: The URDF file.
+        name: A path, relative to the file's folder, or ``file:///path``, or
+            ``package://NAME/path`` with a folder NAME that contains the URDF file.
+    """
+    folder = urdf.absolute().parent
+    if name.startswith(("package://", "model://")):
+        package = name.split("://")[1].split("/")[0]
+        roots = [above.parent for above in (folder, *folder.parents)]
+        names = [above.name for above in (folder, *folder.parents)]
+        if package not in names:
+            return None
+        path = roots[names.index(package)] / name.split("://")[1]
+    elif name.startswith("file://"):
+        path = Path(unquote(urlsplit(name).path))
+    elif "://" in name:
+        return None
+    else:
+        path = folder / name
+    return path if path.is_file() else None
 
 
 class XmlReader:
