@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import dataclasses
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -257,6 +258,26 @@ def test_what_register_and_evolve_need(page: dict[str, Any]) -> None:
     nq.register("footless", Still, robot=robot, descriptor=nq.FeetContactWrapper)
     with pytest.raises(NotImplementedError, match=r"feet, so set RobotSpec\.feet$"):
         nq.create("footless")
+
+
+@pytest.mark.parametrize("feet", [0, 6])
+def test_long_descriptors_are_told_early(feet: int, page: dict[str, Any]) -> None:
+    """Before the robot's file is read: here it does not exist."""
+
+    class Six(page["ArmAngles"]):
+        limits = (0.0,) * 6, (1.0,) * 6
+
+    names = tuple(f"foot_{leg}" for leg in range(feet))
+    robot = dataclasses.replace(page["ROBOT"], urdf="./absent.urdf", feet=names)
+    descriptor = nq.FeetContactWrapper if feet else Six
+    own = {"robot": robot, "descriptor": descriptor, "reward_offset": 1.0}
+    nq.register("six", Still, **own)
+    config = EvolveConfig(env_name="six")
+    message = "grid: got None, and a descriptor of 6 components .*, such as 1024"
+    with pytest.raises(ConfigError, match=message):
+        make_task(config)
+    with pytest.raises(FileNotFoundError):
+        make_task(config.replace(centroids=1024))
 
 
 def test_descriptors_have_the_length_of_their_limits(page: dict[str, Any]) -> None:

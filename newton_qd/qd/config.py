@@ -132,7 +132,7 @@ class EvolveConfig:
                 why = (
                     f"and a descriptor of {descriptor_length} components has no default"
                 )
-                allowed = "a grid, or centroids (a number of cells)"
+                allowed = "a grid, or centroids (a number of cells), such as 1024"
                 raise ConfigError(message("grid", None, allowed, why=why))
             return dataclasses.replace(self, grid=DEFAULT_GRIDS[descriptor_length])
         if len(self.grid) != descriptor_length:

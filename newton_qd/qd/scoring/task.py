@@ -50,7 +50,7 @@ def make_task(config: EvolveConfig) -> Task:
     Raises:
         UnknownEnvironment: No environment of this name is registered.
         ConfigError: The environment has no descriptor, no reward offset, or no finite
-            limits of its descriptor.
+            limits of its descriptor. Or the grid does not fit the descriptor.
     """
     # imported here, because the registry imports every environment
     import newton_qd
@@ -66,6 +66,9 @@ def make_task(config: EvolveConfig) -> Task:
         allowed = "names with one, so pass reward_offset to newton_qd.register"
         why = "which has no reward_offset"
         raise ConfigError(message("env_name", name, allowed, why=why))
+    length = _declared_length(name)
+    if length is not None:
+        config.resolve(length)  # its error comes before the slow part
     env: Any = newton_qd.create(
         name, episode_length=config.episode_length, auto_reset=False
     )
@@ -81,6 +84,30 @@ def make_task(config: EvolveConfig) -> Task:
         labels=_labels(env, len(low)),
         reward_offset=float(newton_qd.tables.reward_offset[name]),
     )
+
+
+def _declared_length(name: str) -> int | None:
+    """Returns the length of a descriptor without building its environment.
+
+    ``None``: only the environment knows it.
+    """
+    from newton_qd import tasks, wrappers
+
+    spec = tasks.ENVIRONMENTS[name]
+    found = [
+        wrapper.wrapper
+        for wrapper in spec.wrappers
+        if isinstance(wrapper.wrapper, type)
+        and issubclass(wrapper.wrapper, wrappers.DescriptorWrapper)
+    ]
+    if not found:
+        return None
+    if issubclass(found[-1], wrappers.FeetContactWrapper):
+        return len(spec.feet) if spec.feet else None
+    match getattr(found[-1], "limits", None):
+        case (tuple() | list() as lowest, _):
+            return len(lowest)
+    return None  # wrong limits have an error of their own
 
 
 def _labels(env: Any, length: int) -> tuple[str, ...]:
