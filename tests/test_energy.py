@@ -7,17 +7,9 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from energy_helpers import (
-    SUBJECTS,
-    compressed,
-    energy,
-    finer,
-    ledger,
-    motion,
-    poses,
-    subject,
-)
+from energy_helpers import compressed, energy, ledger
 from physics_helpers import order, penetration, report
+from subjects import SUBJECTS, finer, motion, poses, subject
 
 from newton_qd.physics import reference
 
