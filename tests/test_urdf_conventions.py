@@ -406,6 +406,14 @@ def test_nothing_is_downloaded(tmp_path: Path, no_network: None) -> None:
     )
 
 
+def test_a_visual_may_have_no_size(tmp_path: Path) -> None:
+    """Sensors are often drawn as a box of size 0; a collider must have a size."""
+    box = "<{0}><geometry><box size='0 0 0'/></geometry></{0}>"
+    assert built(tmp_path, robot_text(link("a", box.format("visual"))), "a").nb == 1
+    message = refusal(tmp_path, robot_text(link("a", box.format("collision"))), "a")
+    assert "<box>: size: got '0 0 0'; allowed: positive numbers" in message
+
+
 def test_meshes_of_a_package(tmp_path: Path) -> None:
     """The folder of the package contains the URDF file, as in every ROS package."""
     folder = tmp_path / "a_description" / "urdf"

@@ -101,7 +101,10 @@ def is_real(mass: float, inertia: np.ndarray) -> bool:
     return bool(moments[0] >= least and moments[2] <= largest)
 
 
-def _read_shape(reader: XmlReader, element: ElementTree.Element, link: str) -> Shape:
+def _read_shape(
+    reader: XmlReader, element: ElementTree.Element, link: str, *, drawn: bool = False
+) -> Shape:
+    """Returns a collider, or with ``drawn`` a visual. A visual may have a size of 0."""
     geometry = reader.child(element, "geometry")
     kinds = [child for child in geometry if child.tag in _SHAPES]
     if len(kinds) != 1 or len(geometry) != 1:
@@ -113,21 +116,25 @@ def _read_shape(reader: XmlReader, element: ElementTree.Element, link: str) -> S
     if shape.tag == "mesh":
         reader.text(shape, "filename")
     elif shape.tag == "box":
-        size[:] = reader.positive(shape, "size", 3) / 2
+        size[:] = reader.positive(shape, "size", 3, or_zero=drawn) / 2
     else:
-        size[0] = reader.positive(shape, "radius", 1)[0]
+        size[0] = reader.positive(shape, "radius", 1, or_zero=drawn)[0]
         if shape.tag != "sphere":
-            size[1] = _straight_length(reader, shape) / 2
+            size[1] = _straight_length(reader, shape, or_zero=drawn) / 2
     return Shape(link, shape.tag, reader.frame(element), size, element.get("name", ""))
 
 
-def _straight_length(reader: XmlReader, shape: ElementTree.Element) -> float:
+def _straight_length(
+    reader: XmlReader, shape: ElementTree.Element, *, or_zero: bool
+) -> float:
     """Returns the length of a cylinder, or of a capsule without its caps [m]."""
     keys = ["length"]
     if shape.tag == "capsule" and shape.get("height") is not None:
         # Newton reads the height of a capsule. ROS, MuJoCo and Bullet read its length.
         keys = ["height"] if shape.get("length") is None else ["height", "length"]
-    lengths = [float(reader.positive(shape, key, 1)[0]) for key in keys]
+    lengths = [
+        float(reader.positive(shape, key, 1, or_zero=or_zero)[0]) for key in keys
+    ]
     if lengths[0] != lengths[-1]:
         given = tuple(shape.get(key) for key in keys)
         allowed = "two equal numbers, as both mean the straight part"
@@ -144,7 +151,7 @@ def read_link(reader: XmlReader, element: ElementTree.Element) -> Link:
     name = reader.text(element, "name")
     link = _read_inertial(reader, element, name)
     for visual in element.findall("visual"):
-        _read_shape(reader, visual, name)
+        _read_shape(reader, visual, name, drawn=True)
     shapes = [
         _read_shape(reader, collision, name)
         for collision in element.findall("collision")

@@ -169,17 +169,25 @@ class XmlReader:
         return float(self.numbers(element, key, 1, default)[0])
 
     def positive(
-        self, element: ElementTree.Element, key: str, count: int
+        self,
+        element: ElementTree.Element,
+        key: str,
+        count: int,
+        *,
+        or_zero: bool = False,
     ) -> np.ndarray:
         """Returns the ``count`` numbers of an attribute, all above zero.
+
+        With ``or_zero``, zero is allowed, too.
 
         Raises:
             RobotDescriptionError: The attribute is missing, has the wrong number of
                 values, or one that is not finite or not above zero.
         """
         values = self.numbers(element, key, count)
-        if not (values > 0).all():
-            raise self.refused(element, key, element.get(key), "positive numbers")
+        if not ((values >= 0) if or_zero else (values > 0)).all():
+            allowed = "numbers from 0" if or_zero else "positive numbers"
+            raise self.refused(element, key, element.get(key), allowed)
         return values
 
     def frame(self, element: ElementTree.Element) -> np.ndarray:
