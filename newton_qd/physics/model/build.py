@@ -56,7 +56,7 @@ def newton_builder(
         path: The file.
         floating: Whether the root link floats. If false, it is fixed to the world.
         gravity: Downward acceleration [m/s^2].
-        meshes: Whether visuals, and the files of meshes and textures, are read.
+        meshes: Whether the files of meshes and textures are read.
 
     Raises:
         RobotDescriptionError: The file is not XML.

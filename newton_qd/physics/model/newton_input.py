@@ -32,8 +32,8 @@ def newton_text(path: Path, *, meshes: bool) -> str:
 
     Args:
         path: The file.
-        meshes: Whether Newton reads visuals, and the files of meshes and textures. It
-            never downloads one.
+        meshes: Whether Newton may read the files of meshes and textures. It never
+            downloads one.
 
     Raises:
         RobotDescriptionError: The file is not XML.
@@ -47,8 +47,6 @@ def newton_text(path: Path, *, meshes: bool) -> str:
     for capsule in root.iter("capsule"):
         if capsule.get("height") is None and capsule.get("length") is not None:
             capsule.set("height", capsule.attrib["length"])
-    if not meshes:
-        _drop_visuals(root)
     skipped = []
     for parent in list(root.iter()):
         for child in list(parent):
@@ -69,12 +67,6 @@ def newton_text(path: Path, *, meshes: bool) -> str:
         text = message(f"{path}: filename", given, allowed)
         warnings.warn(text, RobotDescriptionWarning, stacklevel=3)
     return ElementTree.tostring(root, encoding="unicode")
-
-
-def _drop_visuals(root: ElementTree.Element) -> None:
-    for link in root.iterfind("link"):
-        for visual in link.findall("visual"):
-            link.remove(visual)
 
 
 def _drop_prefixed(element: ElementTree.Element) -> None:
