@@ -7,6 +7,8 @@ finite, no world reported a fault and the robots moved. ``README.md`` says how t
 make the peer's environment.
 
     python benchmarks/compare_brax.py --peer-python PEER/bin/python --out result.json
+
+With ``--gaits``, it compares the motion instead: returns of the same sine gaits.
 """
 
 from __future__ import annotations
@@ -22,6 +24,8 @@ import subprocess
 import sys
 from pathlib import Path
 from typing import Any
+
+import gaits
 
 WORKER = Path(__file__).with_name("worker.py")
 OURS, PEER = "newton_qd", "brax_v1"
@@ -214,7 +218,12 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument(
         "--platform", default="cpu", help="JAX platform of both sides, default: cpu"
     )
-    parser.add_argument("--out", type=Path, help="JSON file for the result")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        help="JSON file for the result; with --gaits, folder for csv files",
+    )
+    add_gait_options(parser)
     arguments = parser.parse_args()
     if arguments.repetitions < 1:
         parser.error(f"--repetitions is {arguments.repetitions}; it must be at least 1")
@@ -228,13 +237,35 @@ def parse_arguments() -> argparse.Namespace:
     return arguments
 
 
+def add_gait_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of ``--gaits``."""
+    group = parser.add_argument_group("gaits")
+    group.add_argument(
+        "--gaits", action="store_true", help="compare returns of gaits, not speeds"
+    )
+    group.add_argument(
+        "--robots",
+        nargs="+",
+        choices=list(gaits.ROBOTS),
+        default=list(gaits.ROBOTS),
+        help="default: all",
+    )
+    group.add_argument(
+        "--ours",
+        type=json.loads,
+        default={},
+        help="JSON with changes to our robots, such as "
+        '{"substeps": 20, "material": {"friction": 0.8}}',
+    )
+
+
 def main() -> int:
     """Run the comparison; returns 1 if a scenario does not count."""
     arguments = parse_arguments()
     chosen = arguments.scenarios or [scenario.name for scenario in SCENARIOS]
     scenarios = [scenario for scenario in SCENARIOS if scenario.name in chosen]
     load = os.getloadavg()[0]
-    if load > BUSY_LOAD:
+    if load > BUSY_LOAD and not arguments.gaits:
         print(f"warning: the load is {load:.1f}: other processes share the cores")
     pythons = {}
     if not arguments.only_peer:
@@ -246,6 +277,10 @@ def main() -> int:
         for library, python in pythons.items()
     ]
     try:
+        if arguments.gaits:
+            asks = {worker.library: worker.ask for worker in workers}
+            print(gaits.compare(asks, arguments.robots, arguments.ours, arguments.out))
+            return 0
         described = {worker.library: worker.ask("describe") for worker in workers}
         rows = measure(workers, scenarios, arguments.repetitions)
     finally:

@@ -21,6 +21,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from gait_runs import GaitRuns
 
 ENV_NAME = "ant_uni"
 EPISODE_LENGTH = 1000
@@ -132,10 +133,12 @@ class Worker:
     """Compiled scenarios of one library."""
 
     def __init__(self, library: str) -> None:
-        make, packages = LIBRARIES[library]
-        self._packages = packages
-        self._env = make()
+        self._make, self._packages = LIBRARIES[library]
         self._runs: dict[str, Callable[[], Any]] = {}
+
+    @functools.cached_property
+    def _env(self) -> Any:
+        return self._make()
 
     def describe(self) -> dict[str, Any]:
         """Return versions, device and what could keep the library off a core."""
@@ -192,6 +195,7 @@ def main() -> None:
         "describe": worker.describe,
         "prepare": worker.prepare,
         "measure": worker.measure,
+        "gaits": GaitRuns(sys.argv[1]).run,
     }
     for line in sys.stdin:
         message = json.loads(line)
