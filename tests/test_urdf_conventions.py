@@ -11,7 +11,17 @@ import mujoco
 import newton
 import numpy as np
 import pytest
-from urdf_text import joint, link, row, sphere, write
+from urdf_text import (
+    built,
+    heavy,
+    joint,
+    link,
+    refusal,
+    robot_text,
+    row,
+    sphere,
+    write,
+)
 
 from newton_qd.physics import reference
 from newton_qd.physics.model import (
@@ -23,26 +33,10 @@ from newton_qd.physics.model import (
 )
 from newton_qd.physics.model.verify import ModelMismatchError
 from newton_qd.physics.solver import NewtonQDSolver
-from newton_qd.physics.system import JointKind, System
-from newton_qd.robots import Contact, RobotSpec
-
-
-def robot_text(*parts: str) -> str:
-    return f"<robot name='r'>{''.join(parts)}</robot>"
-
-
-def built(folder: Path, text: str, torso: str, **changes: object) -> System:
-    return build_system(row(write(folder, text), torso, **changes), "float32")
-
+from newton_qd.physics.system import JointKind
+from newton_qd.robots import Contact
 
 # Links on fixed joints.
-
-
-def heavy(name: str, mass: float, com: str, moments: str, inside: str = "") -> str:
-    ixx, iyy, izz = moments.split()
-    return f"""<link name="{name}"><inertial><origin xyz="{com}" rpy="0.2 -0.4 0.7"/>
-      <mass value="{mass}"/><inertia ixx="{ixx}" iyy="{iyy}" izz="{izz}" ixy="0.001"
-      ixz="0" iyz="-0.002"/></inertial>{inside}</link>"""
 
 
 # A trunk with a head on its back, a lamp on the head, and an arm on the lamp.
@@ -247,131 +241,6 @@ def test_the_solver_takes_a_fixed_base(tmp_path: Path) -> None:
     robot = row(path, "arm", fixed_base=True)
     model = newton_builder(path, False, robot.gravity).finalize()
     assert NewtonQDSolver(model, robot).model is model  # it compares both
-
-
-# Singular inertia.
-
-
-def refusal(folder: Path, text: str, torso: str, **changes: object) -> str:
-    with pytest.raises(RobotDescriptionError) as caught:
-        built(folder, text, torso, **changes)
-    assert str(folder / "robot.urdf") in str(caught.value)
-    return str(caught.value)
-
-
-CARTPOLE = Path(newton.__file__).parent / "examples" / "assets" / "cartpole.urdf"
-
-
-def test_cartpole_of_newton_needs_a_fixed_base() -> None:
-    """Its root is a rail without mass. Newton's example fixes it to the world."""
-    robot = RobotSpec("cartpole", str(CARTPOLE), "cart")
-    with pytest.raises(
-        RobotDescriptionError,
-        match=r"cartpole.urdf: inertia of the floating root link 'slider' and all .*"
-        r"allowed: .* <inertial> on 'slider', or fixed_base=True",
-    ):
-        build_system(robot, "float32")
-    fixed = RobotSpec("cartpole", str(CARTPOLE), "cart", fixed_base=True)
-    system = build_system(fixed, "float32")
-    assert system.joint_names == ("slider_to_cart", "cart_to_pole1", "pole1_to_pole2")
-
-
-def test_massless_floating_root(tmp_path: Path) -> None:
-    hinge = joint("hinge", "continuous", "rail", "cart", '<axis xyz="0 0 1"/>')
-    text = robot_text('<link name="rail"/>', link("cart"), hinge)
-    message = refusal(tmp_path, text, "cart")
-    assert "inertia of the floating root link 'rail' and all that" in message
-    weld = text.replace("continuous", "fixed")
-    assert built(tmp_path, weld, "cart").nv == 6
-
-
-def chain(axes: dict[str, str], tip: str | None = None) -> str:
-    """Hinges from the world to a link with mass, with massless links between."""
-    names = list(axes)
-    parts = ['<link name="world"/>']
-    for place, name in enumerate(names):
-        inner = place < len(names) - 1
-        parts.append(f'<link name="{name}"/>' if inner else tip or link(name))
-        parent = names[place - 1] if place else "world"
-        axis = f'<axis xyz="{axes[name]}"/>'
-        parts.append(joint(f"to_{name}", "continuous", parent, name, axis))
-    return robot_text(*parts)
-
-
-def test_two_joints_about_one_axis(tmp_path: Path) -> None:
-    text = chain({"ring": "0 0 1", "ball": "0 0 1"})
-    message = refusal(tmp_path, text, "ball")
-    assert "link 'ring' and all that hangs on it, which joint 'to_ring'" in message
-
-
-def test_a_ball_joint_of_hinges(tmp_path: Path) -> None:
-    """Singular only where two axes are parallel, and there it is refused."""
-    text = chain({"yaw": "0 0 1", "pitch": "0 1 0", "ball": "1 0 0"})
-    assert built(tmp_path, text, "ball").nv == 3
-    locked = (("to_pitch", math.pi / 2),)
-    message = refusal(tmp_path, text, "ball", rest_pose=locked)
-    assert "joint 'to_yaw'" in message and "in the default pose" in message
-
-
-def test_four_hinges_of_a_ball_joint(tmp_path: Path) -> None:
-    """Regular nowhere, because three hinges already give every rotation."""
-    axes = {"a": "0 0 1", "b": "0 1 0", "c": "1 0 0", "ball": "0.3 0.5 0.8"}
-    message = refusal(tmp_path, chain(axes), "ball")
-    assert "which joint 'to_a' moves" in message
-    assert "default pose" not in message
-
-
-POINT = """<link name="bob"><inertial><origin xyz="{} 0 0"/><mass value="1"/>
-  <inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
-
-
-def test_point_masses(tmp_path: Path) -> None:
-    pendulum = built(tmp_path, chain({"bob": "0 1 0"}, POINT.format(0.5)), "bob")
-    assert reference.mass_matrix(pendulum, pendulum.rest_q)[0, 0] == 0.25
-    message = refusal(tmp_path, chain({"bob": "0 1 0"}, POINT.format(0)), "bob")
-    assert "link 'bob' and all that hangs on it, which joint 'to_bob' moves" in message
-    message = refusal(tmp_path, robot_text(POINT.format(0)), "bob")
-    assert "the floating root link 'bob'" in message
-
-
-def nearly_singular(small: float) -> str:
-    tiny = f"""<link name="ring"><inertial><mass value="1"/><inertia ixx="{small}"
-      iyy="{small}" izz="{small}" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
-    return chain({"ring": "0 0 1", "ball": "0 0 1"}).replace(
-        '<link name="ring"/>', tiny
-    )
-
-
-def test_nearly_singular_inertia(tmp_path: Path, x64: None) -> None:
-    """What single precision loses is refused; double precision may keep it."""
-    assert built(tmp_path, nearly_singular(1e-3), "ball").nv == 2
-    message = refusal(tmp_path, nearly_singular(1e-7), "ball")
-    assert "or dtype='float64'" in message and "joint 'to_ring'" in message
-    robot = row(write(tmp_path, nearly_singular(1e-7)), "ball")
-    assert build_system(robot, "float64").nv == 2
-    assert "float64" not in refusal(tmp_path, nearly_singular(1e-16), "ball")
-
-
-def test_inertia_that_is_lost_far_from_the_origin(tmp_path: Path) -> None:
-    """A rotor of 1e-8 kg m^2 at the end of a boom of 10 m."""
-    rotor = POINT.format(0).replace('="0"', '="1e-8"', 3)
-    far = '<axis xyz="0 0 1"/><origin xyz="{} 0 0"/>'
-    text = robot_text(
-        link("boom"), rotor, joint("spin", "continuous", "boom", "bob", far)
-    )
-    assert built(tmp_path, text.format(0.0), "boom").nv == 7
-    assert "joint 'spin'" in refusal(tmp_path, text.format(10.0), "boom")
-
-
-ZEROS = """<inertial><mass value="0"/><inertia ixx="0" iyy="0" izz="0" ixy="0"
-  ixz="0" iyz="0"/></inertial>"""
-
-
-def test_a_massless_link_may_be_written_with_zeros(tmp_path: Path) -> None:
-    zeros = chain({"yaw": "0 0 1", "ball": "1 0 0"})
-    zeros = zeros.replace('"yaw"/>', f'"yaw">{ZEROS}</link>', 1)
-    assert ZEROS in zeros
-    assert built(tmp_path, zeros, "ball").mass.tolist() == [0.0, 1.0]
 
 
 # Files that a URDF file names.

@@ -5,6 +5,10 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
+import pytest
+
+from newton_qd.physics.model import RobotDescriptionError, build_system
+from newton_qd.physics.system import System
 from newton_qd.robots import RobotSpec
 
 
@@ -33,3 +37,29 @@ def joint(name: str, kind: str, parent: str, child: str, inside: str = "") -> st
 def sphere(radius: float, origin: str = "0 0 0") -> str:
     return f"""<collision><origin xyz="{origin}"/><geometry>
       <sphere radius="{radius}"/></geometry></collision>"""
+
+
+def robot_text(*parts: str) -> str:
+    """A robot of these elements."""
+    return f"<robot name='r'>{''.join(parts)}</robot>"
+
+
+def heavy(name: str, mass: float, com: str, moments: str, inside: str = "") -> str:
+    """A link with an uneven inertia in turned axes."""
+    ixx, iyy, izz = moments.split()
+    return f"""<link name="{name}"><inertial><origin xyz="{com}" rpy="0.2 -0.4 0.7"/>
+      <mass value="{mass}"/><inertia ixx="{ixx}" iyy="{iyy}" izz="{izz}" ixy="0.001"
+      ixz="0" iyz="-0.002"/></inertial>{inside}</link>"""
+
+
+def built(folder: Path, text: str, torso: str, **changes: object) -> System:
+    """The system of a robot's text in float32."""
+    return build_system(row(write(folder, text), torso, **changes), "float32")
+
+
+def refusal(folder: Path, text: str, torso: str, **changes: object) -> str:
+    """The error that refuses a robot; it names the file."""
+    with pytest.raises(RobotDescriptionError) as caught:
+        built(folder, text, torso, **changes)
+    assert str(folder / "robot.urdf") in str(caught.value)
+    return str(caught.value)

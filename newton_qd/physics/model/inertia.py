@@ -17,7 +17,7 @@ from newton_qd.physics import reference
 from newton_qd.physics.model.xml_reader import RobotDescriptionError
 from newton_qd.physics.system import JointKind, System
 
-# A pivot may lose all but six bits to cancellation: then it is right to about 2 %.
+# A pivot may lose all but six bits to cancellation. Then a step is right to about 2 %.
 _KEPT = 64
 # Poses other than the default one. Almost every pose shows a robot that is singular in
 # all poses. The best of several poses is not near a singular one by chance.
@@ -25,8 +25,14 @@ _POSES = 4
 
 
 @dataclasses.dataclass(frozen=True)
-class _Pivot:
-    """What is left for a joint to accelerate, and its size before cancellation."""
+class Pivot:
+    """What is left for a joint to accelerate, and its size before cancellation.
+
+    Attributes:
+        body: Index of the body that the joint moves.
+        left: Inertia of the joint after the joints below it moved freely.
+        size: Sum of the absolute values from which ``left`` was computed.
+    """
 
     body: int
     left: float
@@ -34,6 +40,7 @@ class _Pivot:
 
     @property
     def share(self) -> float:
+        """What is left, as a share of the numbers that cancel [-]."""
         return self.left / self.size if self.size > 0 else 0.0
 
 
@@ -51,15 +58,15 @@ def check_inertia(system: System, path: Path) -> None:
             or so small that it is lost to rounding.
     """
     least = _KEPT * float(np.finfo(system.dtype).eps)
-    at_rest = _pivots(system, system.rest_q)
+    at_rest = pivots(system, system.rest_q)
     rng = np.random.default_rng(0)
-    poses = [_pivots(system, _pose(system, rng)) for _ in range(_POSES)]
+    poses = [pivots(system, _pose(system, rng)) for _ in range(_POSES)]
     best = [
         max(several, key=lambda pivot: pivot.share)
         for several in zip(*poses, strict=True)
     ]
-    for pivots, where in ((best, ""), (at_rest, " in the default pose")):
-        weak = [pivot for pivot in pivots if not pivot.share >= least]
+    for found, where in ((best, ""), (at_rest, " in the default pose")):
+        weak = [pivot for pivot in found if not pivot.share >= least]
         if weak:
             name, given, allowed = _refusal(system, weak[0], where, least)
             why = "which is singular or lost to rounding"
@@ -69,7 +76,7 @@ def check_inertia(system: System, path: Path) -> None:
 
 
 def _refusal(
-    system: System, pivot: _Pivot, where: str, least: float
+    system: System, pivot: Pivot, where: str, least: float
 ) -> tuple[str, Fact, str]:
     """Returns what has too little inertia, how little, and what is allowed."""
     link, joint = system.body_names[pivot.body], system.joint_names[pivot.body]
@@ -100,15 +107,15 @@ def _pose(system: System, rng: np.random.Generator) -> np.ndarray:
     return q
 
 
-def _pivots(system: System, q: np.ndarray) -> list[_Pivot]:
-    """Returns the pivot of each joint, in the order of the bodies."""
+def pivots(system: System, q: np.ndarray) -> list[Pivot]:
+    """Returns the pivot of each joint at coordinates ``q`` (nq,), by body."""
     frames = reference.body_frames(system, q)
     first = np.zeros(3)
     first[: min(3, system.nq)] = q[:3]
     origin = first @ reference.origin_axes(system)
     left = np.zeros((system.nb, 6, 6))
     size = np.zeros((system.nb, 6, 6))
-    pivots = []
+    found = []
     for body in reversed(range(system.nb)):
         own = _rigid_inertia(system, body, frames[body], origin)
         left[body] += own
@@ -119,17 +126,17 @@ def _pivots(system: System, q: np.ndarray) -> list[_Pivot]:
                 scaled = left[body] / np.outer(scale, scale)
             regular = bool(np.isfinite(scaled).all())
             share = float(np.linalg.eigvalsh(scaled)[0]) if regular else 0.0
-            pivots.append(_Pivot(body, share, 1.0))
+            found.append(Pivot(body, share, 1.0))
             continue
         motion = _motion(system, body, frames[body], origin)
         force = left[body] @ motion
         dof = system.v_start[body]
-        pivot = _Pivot(
+        pivot = Pivot(
             body,
             float(motion @ force + system.armature[dof]),
             float(np.abs(motion) @ size[body] @ np.abs(motion) + system.armature[dof]),
         )
-        pivots.append(pivot)
+        found.append(pivot)
         parent = system.parent[body]
         if parent < 0:
             continue
@@ -138,7 +145,7 @@ def _pivots(system: System, q: np.ndarray) -> list[_Pivot]:
             passed = np.outer(force, force) / pivot.left
         left[parent] += left[body] - passed
         size[parent] += size[body] + np.abs(passed)
-    return pivots[::-1]
+    return found[::-1]
 
 
 def _rigid_inertia(
