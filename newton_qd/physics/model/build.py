@@ -239,6 +239,22 @@ def _dof_arrays(
     }
 
 
+def _verified(robot: RobotSpec, description: Description) -> BuiltModel:
+    """Builds Newton's model, and compares it with the file.
+
+    Raises:
+        RobotDescriptionError: The kind of a joint is not supported.
+        ModelMismatchError: Newton's model differs from the file.
+    """
+    path, floating = str(description.path), description.floating
+    builder = newton_builder(path, floating, robot.gravity, False)
+    # The inertias of the file are already checked. Newton would change some silently.
+    model = builder.finalize(skip_validation_inertia=True)
+    built = _read_newton(model, description)
+    verify(built, description)
+    return built
+
+
 def build_system(robot: RobotSpec, dtype: str, scene: Scene | None = None) -> System:
     """Builds the immutable description of a robot in a scene.
 
@@ -258,13 +274,7 @@ def build_system(robot: RobotSpec, dtype: str, scene: Scene | None = None) -> Sy
     check_robot(robot)
     description = read_description(find_urdf(robot.urdf), robot.fixed_base)
     warn_unbounded(description)
-    builder = newton_builder(
-        str(description.path), description.floating, robot.gravity, False
-    )
-    # The inertias of the file are already checked. Newton would change some silently.
-    model = builder.finalize(skip_validation_inertia=True)
-    built = _read_newton(model, description)
-    verify(built, description)
+    built = _verified(robot, description)
     bodies = [description.bodies[name] for name in built.body_names]
     links = () if scene is None else read_scene(scene)
     still = description.still | {link.name: link.frame for link in links}
@@ -292,7 +302,7 @@ def build_system(robot: RobotSpec, dtype: str, scene: Scene | None = None) -> Sy
             dtype=np.int32,
         ),
         torso=body_of(robot, "torso", robot.torso, bodies),
-        rest_q=np.zeros(int(model.joint_coord_count)),
+        rest_q=np.zeros(int(np.where(built.joint_kind == JointKind.FREE, 7, 1).sum())),
         feet_width=0.02,
         feet_tail="exponential",
         reports_bodies=False,
