@@ -73,6 +73,9 @@ def ball_system(folder: Path, dtype: str, scene: Scene) -> System:
 
 # Distances
 
+# of a plate, on which nothing is thrown
+THIN = pytest.mark.filterwarnings("ignore::newton_qd.physics.SoftWallWarning")
+
 
 def box_distance(points: np.ndarray, half: np.ndarray) -> np.ndarray:
     """Signed distance (...,) of points (..., 3) from a box."""
@@ -88,6 +91,7 @@ def contact_with_box(system: System) -> int:
 SIZES = ["1.0 0.8 0.6", "2.0 3.0 0.2", "0.02 1.0 1.0"]
 
 
+@THIN
 @pytest.mark.parametrize("size", SIZES)
 def test_nearest_points(x64: None, tmp_path: Path, size: str) -> None:
     system = rod_system(tmp_path, size)
@@ -118,6 +122,7 @@ def test_nearest_points(x64: None, tmp_path: Path, size: str) -> None:
     assert np.abs(found.share).max() <= 1.0
 
 
+@THIN
 @pytest.mark.parametrize("size", SIZES)
 def test_nearest_point_of_a_sphere(x64: None, tmp_path: Path, size: str) -> None:
     """Exact on faces and about edges; inside, the depth below the nearest face."""

@@ -17,6 +17,7 @@ from newton_qd.physics.inspection import (
 )
 from newton_qd.physics.model import load_system
 from newton_qd.physics.model.rest import grounding_coordinate, raising_coordinate
+from newton_qd.physics.model.wall_speeds import SoftWallWarning, wall_speeds
 from newton_qd.physics.parameters import PhysicsParams, default_params
 from newton_qd.physics.step import initial_state, step
 from newton_qd.physics.system import Kinematics, PhysicsState, System
@@ -25,6 +26,7 @@ __all__ = [
     "Kinematics",
     "PhysicsParams",
     "PhysicsState",
+    "SoftWallWarning",
     "System",
     "bias_forces",
     "contact_gaps",
@@ -43,4 +45,5 @@ __all__ = [
     "seen_bodies",
     "step",
     "to_jax",
+    "wall_speeds",
 ]

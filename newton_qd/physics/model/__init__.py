@@ -4,7 +4,7 @@
 the ``RobotSpec``. ``newton_input`` is what Newton gets of the file. ``build`` builds
 Newton's model, and ``verify`` compares this model with the file. ``contacts`` adds the
 contacts, ``scene`` the obstacles and ``rest`` the default pose. ``inertia`` checks what
-the joints move.
+the joints move. ``wall_speeds`` computes how fast a robot may hit a wall.
 """
 
 from newton_qd.physics.model.build import build_system, load_system, newton_builder

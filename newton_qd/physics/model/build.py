@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -32,6 +33,7 @@ from newton_qd.physics.model.rest import rest_coordinates
 from newton_qd.physics.model.robot_checks import check_robot, index_of, refusal
 from newton_qd.physics.model.scene import obstacle_tables, read_scene
 from newton_qd.physics.model.verify import BuiltModel, ModelMismatchError, verify
+from newton_qd.physics.model.wall_speeds import SoftWallWarning, soft_walls
 from newton_qd.physics.model.xml_reader import IDENTITY, RobotDescriptionError
 from newton_qd.physics.system import TAILS, JointKind, System
 from newton_qd.robots import RobotSpec
@@ -324,6 +326,11 @@ def _cached_system(robot: RobotSpec, dtype: str, scene: Scene | None) -> System:
 
 
 @functools.cache
+def _cached_warnings(system: System) -> tuple[str, ...]:
+    return soft_walls(system)
+
+
+@functools.cache
 def _cached_variant(
     system: System, feet_width: float, feet_tail: str, reports_bodies: bool
 ) -> System:
@@ -347,6 +354,9 @@ def load_system(
     reports_bodies: bool = False,
 ) -> System:
     """Returns the system of a robot. A process builds it once for the same arguments.
+
+    A wall that does not hold the robot at 10 m/s gives a ``SoftWallWarning``:
+    :func:`~newton_qd.physics.wall_speeds`.
 
     Args:
         robot: The robot.
@@ -374,5 +384,7 @@ def load_system(
     checks.choice("feet_tail", feet_tail, TAILS)
     check_robot(robot)  # before the cache computes its hash
     system = _cached_system(robot, dtype, scene)
+    for text in _cached_warnings(system):
+        warnings.warn(text, SoftWallWarning, stacklevel=2)
     width = system.feet_width if feet_width is None else feet_width
     return _cached_variant(system, width, feet_tail, reports_bodies)
