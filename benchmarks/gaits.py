@@ -27,6 +27,11 @@ CANDIDATES = 1000  # gaits of a random search
 GENERATIONS, POPULATION, ELITE, LEAST_SPREAD, SEARCHES = 10, 200, 20, 0.02, 4
 DEFAULT_POSE = -1  # start without noise, instead of the seed of a reset
 
+HEAD = """# Sine gaits in newton_qd and in brax v1
+
+Written by `benchmarks/compare_brax.py --gaits`. README.md explains the columns.
+"""
+
 Ask = Callable[..., dict[str, Any]]
 
 
@@ -192,7 +197,8 @@ def compare(
             only this project's numbers are in the tables.
         robots: Names of the environments.
         ours: Changes to this project's simulation.
-        folder: Folder for ``gaits.csv`` and ``gaits_search.csv``; ``None``: no files.
+        folder: Folder for ``gaits.md``, ``gaits.csv`` and ``gaits_search.csv``;
+            ``None``: no files.
 
     Returns:
         The tables as Markdown.
@@ -212,10 +218,13 @@ def compare(
                 mean = found.returns.mean()
                 print(f"{robot}, {kind}, {one.label}: {mean:.1f}", flush=True)
     searches = search_all(asks, simulations, [r for r in robots if r in SEARCHED])
+    text = table(outcomes)
+    if searches:
+        text += f"\n\n{search_table(searches)}"
     if folder is not None:
         write(folder, outcomes, searches)
-    text = table(outcomes)
-    return f"{text}\n\n{search_table(searches)}" if searches else text
+        (folder / "gaits.md").write_text(f"{HEAD}\n{text}\n", encoding="utf-8")
+    return text
 
 
 def search_all(

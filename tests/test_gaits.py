@@ -78,6 +78,7 @@ def test_comparison(gaits: ModuleType, tmp_path: Path) -> None:
     assert len(ours) == 4
     assert all("| 0.50 |" in line for line in ours)
     assert all("| 1.00 | 1.00 |" in line for line in ours[:2])
+    assert (tmp_path / "gaits.md").read_text(encoding="utf-8").endswith(f"{text}\n")
     with (tmp_path / "gaits_search.csv").open(encoding="utf-8") as file:
         best = [
             float(row["best_return"])
