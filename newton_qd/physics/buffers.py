@@ -15,23 +15,20 @@ from newton_qd.physics import layout, reference
 from newton_qd.physics.kinds import Tail
 from newton_qd.physics.layout import Layout
 from newton_qd.physics.precision import Kernels, Variant, build_kernels, pack_width
+from newton_qd.physics.stepping import substep_solves
 from newton_qd.physics.system import CONTACT_FRACTION, STANDARD_GRAVITY, System
 from newton_qd.physics.tree import Tree, build_tree
 from newton_qd.physics.warp_internals import field_dtype
 
-# Iterations in a substep, and solves in an iteration. A system with contacts has one
-# iteration with three solves: a predictor and two correctors of the contacts. A system
-# without contacts has three iterations. The second and the third use the mean
-# velocity of the previous iteration.
-_TOUCHING, _FREE = (1, 3), (3, 1)
 # Names of the scratch arrays, grouped by what one entry belongs to.
-_PER_BODY = ("pose", "twist_w", "twist_v", "bias_w", "bias_v", "inertia", "moment")
-_PER_BODY += ("wrench_w", "wrench_v")
-_PER_CONTACT = ("point", "arm", "normal", "velocity", "load")
-_PER_SOLVE_CONTACT = ("push", "weight_n", "weight_t", "slip")
+_PER_BODY = ("pose", "inertia", "moment")
+_PER_MOTION = ("twist_w", "twist_v", "bias_w", "bias_v", "wrench_w", "wrench_v")
+_PER_CONTACT = ("point", "arm", "normal", "velocity", "gap")
+_PER_SOLVE_CONTACT = ("load", "push_n", "push", "weight_n")
+_PER_SOLVE_CONTACT += ("weight_t", "slip")
 _PER_SOLVE_BODY = ("total_ww", "total_wv", "total_vv", "total_w", "total_v")
 _PER_SOLVE_BODY += ("passed_ww", "passed_wv", "passed_vv", "passed_w", "passed_v")
-_PER_SOLVE_BODY += ("lever_w", "lever_v", "effort", "change_w", "change_v")
+_PER_SOLVE_BODY += ("lever_w", "lever_v", "effort", "share")
 _PER_READING = ("body_impulse", "body_angular_impulse", "body_normal_impulse")
 _PER_READING += ("position", "com", "com_velocity")
 _REPORTED = ("impulse", "angular_impulse", "normal_impulse")
@@ -53,10 +50,6 @@ def _with_world(table: np.ndarray) -> np.ndarray:
     return np.concatenate([table[:1], table])
 
 
-def _iterations_and_solves(system: System) -> tuple[int, int]:
-    return _TOUCHING if len(system.contact_body) else _FREE
-
-
 def kernels_of(system: System, device: wp.Device, parametric: bool = False) -> Kernels:
     """Returns the smallest variant of the kernels that fits a system and a device.
 
@@ -66,7 +59,9 @@ def kernels_of(system: System, device: wp.Device, parametric: bool = False) -> K
         parametric: Whether each world has its own physical parameters.
     """
     width = pack_width(system.dtype, device)
-    return build_kernels(Variant(system.dtype, width, parametric, system.has_boxes))
+    return build_kernels(
+        Variant(system.dtype, width, parametric, system.has_boxes, system.has_pairs)
+    )
 
 
 def build_model(system: System, device: wp.Device, parametric: bool = False) -> Any:
@@ -92,7 +87,12 @@ def build_model(system: System, device: wp.Device, parametric: bool = False) -> 
     model.nb, model.nq, model.nv = system.nb, system.nq, system.nv
     model.nu, model.nc = system.nu, len(system.contact_body)
     model.substeps = robot.substeps
-    model.iterations, model.solves = _iterations_and_solves(system)
+    model.pairs = len(system.contact_pairs)
+    model.changes = 2 if model.pairs else 1
+    solves = substep_solves(system)
+    model.iterations, model.solves = solves.iterations, solves.solves
+    model.given = solves.given
+    model.follows = 1.0 if solves.given > 1 else 0.0
     model.h = robot.dt / robot.substeps
     model.gravity = robot.gravity
     model.total_mass = system.total_mass
@@ -102,6 +102,7 @@ def build_model(system: System, device: wp.Device, parametric: bool = False) -> 
     model.body_levels = len(tree.body_level[0]) - 1
     _put_dofs(put, system)
     model.limit_smoothing = material.limit_smoothing
+    model.limit_dissipation = material.limit_dissipation
     _put_contacts(put, system, tree)
     model.contact_stiffness = system.contact_stiffness
     model.contact_smoothing = material.smoothing
@@ -210,21 +211,22 @@ def _put_dofs(put: Put, system: System) -> None:
 
 def _put_contacts(put: Put, system: System, tree: Tree) -> None:
     put("contact_start", tree.contact)
+    paired = np.bincount(
+        system.contact_body[system.contact_pairs.ravel()] + 1, minlength=system.nb + 1
+    )
+    put("contact_stop", tree.contact[1:] - paired)
     put("contact_body", system.contact_body + 1)
     put("contact_position", system.contact_position)
     put("contact_segment", system.contact_segment)
     put("contact_radius", system.contact_radius)
     put("contact_obstacle", system.contact_obstacle)
     partner, lead = np.full((2, len(system.contact_body)), -1, np.int32)
-    split = np.ones(len(partner))
     first, second = system.contact_pairs.T
     partner[first], partner[second] = second, first
     lead[first] = lead[second] = first
-    split[first] = 1.0 / system.contact_pair_share
-    split[second] = 1.0 / (1.0 - system.contact_pair_share)
     put("contact_partner", partner)
     put("contact_lead", lead)
-    put("contact_split", split)
+    put("pair_lead", first if len(first) else [0])
     put("obstacle_kind", system.obstacle_kind)
     put("obstacle_frame", system.obstacle_frame)
     put("obstacle_size", system.obstacle_size)
@@ -234,11 +236,14 @@ def _entries(system: System, adjoint: bool) -> dict[str, int]:
     """Returns the length of each scratch array for one pack of worlds."""
     n, nc = system.robot.substeps, max(len(system.contact_body), 1)
     nf = len(system.feet)
-    iterations, solves = _iterations_and_solves(system)
-    turns = n * iterations
+    chosen = substep_solves(system)
+    turns = n * chosen.iterations
     # one more: the kinematics after the last substep
-    steps = turns + 1 if adjoint else 1
-    solves = turns * solves if adjoint else 1
+    steps = n + 1 if adjoint else 1
+    motions = turns + 1 if adjoint else 1
+    solves = turns * chosen.solves if adjoint else 1
+    pairs = len(system.contact_pairs)
+    changes, coupled = (2 if pairs else 1), solves * pairs
     return {
         "fault": 1,
         "lost": 1,
@@ -247,12 +252,18 @@ def _entries(system: System, adjoint: bool) -> dict[str, int]:
         "ctrl": max(system.nu, 1),
         "parameter": layout.scratch_parameters(system).size,
         **dict.fromkeys(_PER_BODY, steps * (system.nb + 1)),
+        **dict.fromkeys(_PER_MOTION, motions * (system.nb + 1)),
         **dict.fromkeys(("axis_w", "axis_v"), steps * system.nv),
-        **dict.fromkeys(_PER_CONTACT, steps * nc),
+        **dict.fromkeys(_PER_CONTACT, (n if adjoint else 1) * nc),
         **dict.fromkeys(_REPORTED, n * nc),
         **dict.fromkeys(_PER_SOLVE_CONTACT, solves * nc),
         **dict.fromkeys(_PER_SOLVE_BODY, solves * (system.nb + 1)),
-        "dv": solves * system.nv,
+        **dict.fromkeys(("change_w", "change_v"), solves * changes * (system.nb + 1)),
+        "dv": solves * changes * system.nv,
+        **dict.fromkeys(("answer_w", "answer_v"), 3 * coupled * (system.nb + 1)),
+        "answer_dv": 3 * coupled * system.nv,
+        **dict.fromkeys(("pair_weight", "pair_impulse"), coupled),
+        "pair_coupling": coupled * pairs,
         **dict.fromkeys(_PER_READING, system.nb + 1),
         "torso_xy": 2,
         **dict.fromkeys(("foot_contact", "smooth_foot_contact"), max(nf, 1)),

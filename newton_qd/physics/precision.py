@@ -36,12 +36,14 @@ class Variant:
         width: Number of worlds in a pack, see :mod:`newton_qd.physics.kernels`.
         parametric: Whether each world has its own physical parameters.
         boxes: Whether obstacles may be boxes.
+        pairs: Whether bodies of the robot may touch each other.
     """
 
     dtype: str
     width: int
     parametric: bool = False
     boxes: bool = False
+    pairs: bool = False
 
     @property
     def scalar(self) -> type:
@@ -52,6 +54,7 @@ class Variant:
     def package(self) -> str:
         """Name of the variant's package. Warp's cache uses it as a prefix too."""
         own = "_parametric" * self.parametric + "_boxes" * self.boxes
+        own += "_pairs" * self.pairs
         return f"{_TEMPLATE_PACKAGE}_{self.dtype}_{self.width}{own}"
 
 
@@ -85,7 +88,7 @@ class Kernels:
 # The template under its own name is a variant too, with one world in a pack and with
 # boxes. Tools import it under this name. So do users of `conventions`, which does not
 # depend on the variant.
-_VARIANTS = {_TEMPLATE_PACKAGE: Variant("float32", 1, boxes=True)}
+_VARIANTS = {_TEMPLATE_PACKAGE: Variant("float32", 1, boxes=True, pairs=True)}
 
 
 def variant_of(package: str) -> Variant:

@@ -69,8 +69,6 @@ class System:
         contact_obstacle: (nc,) row of the obstacle tables, -1 for a side of a pair.
         contact_pairs: (np, 2) rows of the contact tables for the two sides of each
             pair. A pair is two colliders on two bodies that may touch each other.
-        contact_pair_share: (np,) share of a pair's relative motion that an impulse
-            gives to its first side, between 0 and 1 [-].
         obstacle_kind: (no,) see :class:`ObstacleKind`.
         obstacle_frame: (no, 7) pose in the world. The normal of a plane and the axis
             of a capsule are the local z axis.
@@ -123,7 +121,6 @@ class System:
     contact_radius: np.ndarray
     contact_obstacle: np.ndarray
     contact_pairs: np.ndarray
-    contact_pair_share: np.ndarray
     obstacle_kind: np.ndarray
     obstacle_frame: np.ndarray
     obstacle_size: np.ndarray
@@ -179,6 +176,11 @@ class System:
     def has_boxes(self) -> bool:
         """Whether an obstacle is a box. Boxes need another variant of the kernels."""
         return bool(np.any(self.obstacle_kind == ObstacleKind.BOX))
+
+    @property
+    def has_pairs(self) -> bool:
+        """Whether bodies may touch each other. Pairs need another variant."""
+        return bool(len(self.contact_pairs))
 
     @property
     def ground_contacts(self) -> np.ndarray:

@@ -30,9 +30,9 @@ HALFCHEETAH = RobotSpec(
         ("fshin", -0.165),
     ),
     dt=0.05,
-    # with steps of 10 ms, a foot would oscillate about its limit for ever: it is light
-    # and has no damping
-    substeps=10,
+    # as many as the original: the feet are light and undamped, and turn at 40 rad/s;
+    # with 10, 4 % of worlds gain 1 to 2 % of their energy in some substep
+    substeps=16,
     # smoothing: a quarter to a third of the radius of the capsules
     material=Material(friction=0.6, smoothing=0.015, limit_swing=0.36),
 )

@@ -47,6 +47,8 @@ class Material:
         limit_swing: Upper bound of the angle past its limit that a joint reaches from
             rest with its full gear alone [rad]. It has no effect on the physics; tests
             check it.
+        limit_dissipation: Hunt-Crossley dissipation of joint limits [s/rad], of a slide
+            [s/m].
         limit_smoothing: Half width of the zone in which a limit switches on [rad]. The
             zone begins at the limit, with torque 0.
     """
@@ -60,6 +62,7 @@ class Material:
     limit_overshoot: float = 0.1
     limit_swing: float = 0.25
     limit_smoothing: float = 0.05
+    limit_dissipation: float = 0.5
 
 
 @dataclasses.dataclass(frozen=True)

@@ -53,6 +53,7 @@ scalar = _variant.scalar
 width = _variant.width
 parametric = _variant.parametric
 boxes = _variant.boxes
+pairs = _variant.pairs
 
 # One value for each world of a pack.
 real = wp.types.vector(length=width, dtype=scalar)

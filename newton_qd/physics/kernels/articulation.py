@@ -25,22 +25,24 @@ from .cpp.algebra import (
 )
 from .cpp.memory import constant, load, store
 from .cpp.numbers import uniform
-from .cpp.operators import add, div, mul, sub  # noqa: F401
+from .cpp.operators import add, div, mul, neg, sub  # noqa: F401
 from .cpp.smooth import gate, penetration
 from .parameters import body_mass, joint_damping
 from .structs import Model, Offsets, Scratch
 
+# Hunt-Crossley factors switch over this fraction of their natural scale.
+DISSIPATION_WIDTH = wp.constant(scalar(0.25))
+
 
 @wp.func
-def point_weight(m: Model, sc: Scratch, offsets: Offsets, c: int):
-    """3 x 3 weight of a contact: impulse per change of the body's velocity [kg].
+def point_weight(sc: Scratch, offsets: Offsets, c: int):
+    """3 x 3 weight of a contact: impulse per change of the point's velocity [kg].
 
-    Reads: m.contact_split, sc.normal, sc.weight_n, sc.weight_t.
+    Reads: sc.normal, sc.weight_n, sc.weight_t.
     """
     n = load(sc.normal, offsets.contact + c)
-    split = constant(m.contact_split, c)
-    wt = split * load(sc.weight_t, offsets.solve_contact + c)
-    wn = split * load(sc.weight_n, offsets.solve_contact + c)
+    wt = load(sc.weight_t, offsets.solve_contact + c)
+    wn = load(sc.weight_n, offsets.solve_contact + c)
     return add_diagonal((wn - wt) * outer(n, n), wt)
 
 
@@ -48,12 +50,14 @@ def point_weight(m: Model, sc: Scratch, offsets: Offsets, c: int):
 def gather_children(m: Model, sc: Scratch, offsets: Offsets, i: int):
     """Inertia and wrench of body ``i``: its own, its contacts', its children's.
 
+    Contacts of pairs are not among them: :mod:`.coupling` adds them.
+
     With R = [r]x a contact's weight W adds ww = R^T W R, wv = -(W R)^T, vv = W.
 
-    Reads: m.h, m.child_start, m.child, m.contact_start, sc.parameter, sc.inertia,
-        sc.moment, sc.wrench_w, sc.wrench_v, sc.point, sc.normal, sc.push,
-        sc.weight_n, sc.weight_t, sc.passed_ww, sc.passed_wv, sc.passed_vv,
-        sc.passed_w, sc.passed_v.
+    Reads: m.h, m.child_start, m.child, m.contact_start, m.contact_stop,
+        sc.parameter, sc.inertia, sc.moment, sc.wrench_w, sc.wrench_v, sc.point,
+        sc.normal, sc.push, sc.weight_n, sc.weight_t, sc.passed_ww, sc.passed_wv,
+        sc.passed_vv, sc.passed_w, sc.passed_v.
     Writes: sc.total_ww, sc.total_wv, sc.total_vv, sc.total_w, sc.total_v.
     """
     ww = mat33()
@@ -61,9 +65,9 @@ def gather_children(m: Model, sc: Scratch, offsets: Offsets, i: int):
     vv = mat33()
     n = vec3()
     f = vec3()
-    for c in range(load(m.contact_start, i), load(m.contact_start, i + 1)):
+    for c in range(load(m.contact_start, i), load(m.contact_stop, i)):
         r = load(sc.point, offsets.contact + c)
-        weight = point_weight(m, sc, offsets, c)
+        weight = point_weight(sc, offsets, c)
         lever = skew(r)
         turned = weight * lever
         p = load(sc.push, offsets.solve_contact + c)
@@ -84,8 +88,8 @@ def gather_children(m: Model, sc: Scratch, offsets: Offsets, i: int):
     store(sc.total_ww, at, ww + load(sc.inertia, body))
     store(sc.total_wv, at, wv + skew(load(sc.moment, body)))
     store(sc.total_vv, at, add_diagonal(vv, body_mass(m, sc, offsets, i)))
-    store(sc.total_w, at, n - m.h * load(sc.wrench_w, body))
-    store(sc.total_v, at, f - m.h * load(sc.wrench_v, body))
+    store(sc.total_w, at, n - m.h * load(sc.wrench_w, offsets.motion + i))
+    store(sc.total_v, at, f - m.h * load(sc.wrench_v, offsets.motion + i))
 
 
 @stage
@@ -94,30 +98,51 @@ def eliminate_axis(m: Model, sc: Scratch, offsets: Offsets, i: int):
 
     Reads: m.h, m.q_start, m.v_start, m.dof_control, m.gear, m.armature,
         m.stiffness, m.spring_rest, m.limit_lower, m.limit_upper, m.limit_stiffness,
-        m.limit_smoothing, sc.q, sc.v, sc.ctrl, sc.parameter, sc.axis_w, sc.axis_v,
-        sc.total_ww, sc.total_wv, sc.total_vv, sc.total_w, sc.total_v.
+        m.limit_smoothing, m.limit_dissipation, sc.q, sc.v, sc.ctrl, sc.parameter,
+        sc.axis_w, sc.axis_v, sc.total_ww, sc.total_wv, sc.total_vv, sc.total_w,
+        sc.total_v, sc.dv.
     Writes: sc.passed_ww, sc.passed_wv, sc.passed_vv, sc.passed_w, sc.passed_v,
-        sc.lever_w, sc.lever_v, sc.effort.
+        sc.lever_w, sc.lever_v, sc.effort, sc.share.
     """
     at = offsets.solve_body + i
     k = load(m.v_start, i)
     h = m.h
     qk = load(sc.q, offsets.q + load(m.q_start, i))
     vk = load(sc.v, offsets.v + k)
-    # angle predicted at the old velocity: limits are linearised about it
-    ahead = qk + h * vk
+    # limits are linearised about the velocity that the solve before found
+    change = real()
+    if offsets.corrects > 0:
+        change = load(sc.dv, offsets.before_dof + k)
+    rate = vk + change
+    ahead = qk + h * rate
     ks = constant(m.stiffness, k)
     kl = constant(m.limit_stiffness, k)
     kd = joint_damping(m, sc, offsets, k)
     width = uniform(m.limit_smoothing)
     lower = ahead - constant(m.limit_lower, k)
     upper = constant(m.limit_upper, k) - ahead
+    # Hunt and Crossley's factor: a limit gives back less than it takes
+    away = m.limit_dissipation * rate
+    inward = neg(away) - scalar(1.0)
+    away = away - scalar(1.0)
+    brake = uniform(DISSIPATION_WIDTH)
+    depth_lower = kl * penetration(lower, width)
+    depth_upper = kl * penetration(upper, width)
+    damper_lower = penetration(away, brake)
+    damper_upper = penetration(inward, brake)
+    weight = h * kl * (
+        damper_lower * gate(lower, width) + damper_upper * gate(upper, width)
+    ) + m.limit_dissipation * (
+        depth_lower * gate(away, brake) + depth_upper * gate(inward, brake)
+    )
     force = (
-        kl * (penetration(lower, width) - penetration(upper, width))
-        - ks * (ahead - constant(m.spring_rest, k))
+        depth_lower * damper_lower
+        - depth_upper * damper_upper
+        + weight * change
+        - ks * (qk + h * vk - constant(m.spring_rest, k))
         - kd * vk
     )
-    implicit = h * kd + h * h * (ks + kl * (gate(lower, width) + gate(upper, width)))
+    implicit = h * (weight + kd + h * ks)
     u = load(m.dof_control, k)
     if u >= 0:
         force = force + constant(m.gear, k) * load(sc.ctrl, offsets.ctrl + u)
@@ -144,6 +169,7 @@ def eliminate_axis(m: Model, sc: Scratch, offsets: Offsets, i: int):
     store(sc.lever_w, at, scaled_w)
     store(sc.lever_v, at, scaled_v)
     store(sc.effort, at, share * effort)
+    store(sc.share, at, share)
 
 
 @stage
@@ -152,8 +178,8 @@ def rest_world(sc: Scratch, offsets: Offsets):
 
     Writes: sc.change_w, sc.change_v.
     """
-    store(sc.change_w, offsets.solve_body, vec3())
-    store(sc.change_v, offsets.solve_body, vec3())
+    store(sc.change_w, offsets.tree, vec3())
+    store(sc.change_v, offsets.tree, vec3())
 
 
 @stage
@@ -165,7 +191,8 @@ def change_axis(m: Model, sc: Scratch, offsets: Offsets, i: int):
     Writes: sc.change_w, sc.change_v, sc.dv.
     """
     at = offsets.solve_body + i
-    up = offsets.solve_body + load(m.body_parent, i)
+    up = offsets.tree + load(m.body_parent, i)
+    to = offsets.tree + i
     k = load(m.v_start, i)
     w = load(sc.change_w, up)
     v = load(sc.change_v, up)
@@ -174,9 +201,9 @@ def change_axis(m: Model, sc: Scratch, offsets: Offsets, i: int):
         - dot(load(sc.lever_w, at), w)
         - dot(load(sc.lever_v, at), v)
     )
-    store(sc.dv, offsets.solve_dof + k, dv)
-    store(sc.change_w, at, w + dv * load(sc.axis_w, offsets.dof + k))
-    store(sc.change_v, at, v + dv * load(sc.axis_v, offsets.dof + k))
+    store(sc.dv, offsets.tree_dof + k, dv)
+    store(sc.change_w, to, w + dv * load(sc.axis_w, offsets.dof + k))
+    store(sc.change_v, to, v + dv * load(sc.axis_v, offsets.dof + k))
 
 
 @stage
@@ -207,13 +234,13 @@ def change_free(m: Model, sc: Scratch, offsets: Offsets, i: int):
     reduced = wv * compliance
     w = inverse(load(sc.total_ww, at) - reduced * transpose(wv)) * (n - reduced * f)
     v = compliance * (f - w * wv)
-    store(sc.change_w, at, w)
-    store(sc.change_v, at, v)
+    store(sc.change_w, offsets.tree + i, w)
+    store(sc.change_v, offsets.tree + i, v)
     # the joint's coordinates are the velocity of its origin and the angular velocity
     origin = v + cross(w, p)
     for j in range(3):
-        store(sc.dv, offsets.solve_dof + k + j, component(origin, j))
-        store(sc.dv, offsets.solve_dof + k + 3 + j, component(w, j))
+        store(sc.dv, offsets.tree_dof + k + j, component(origin, j))
+        store(sc.dv, offsets.tree_dof + k + 3 + j, component(w, j))
 
 
 @wp.func

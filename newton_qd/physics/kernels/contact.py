@@ -1,11 +1,13 @@
 """Contacts with static obstacles and of moving bodies, linearised for the solves.
 
-The predictor solve takes the normal force as linear in the new velocity. Its normal
-impulse may turn negative when a body lifts off, and its friction weight belongs to
-the old velocity. So the two corrector solves take the predicted normal impulse,
-clipped smoothly at zero, as given, and each takes friction at the slip that the solve
-before it leads one to expect. Normal impulses are thus never negative, and friction
-stays close to its cone.
+The normal impulse is a function of the new velocity: the spring is evaluated where the
+contact will be, and so is the damping. Each solve takes it as linear about the velocity
+that the solve before it found, which is Newton's method on the implicit law. The law
+falls with the velocity and is convex, so a linear impulse is never above the law. It
+can be a little below zero where a body lifts off; then what is reported, and what
+friction is bounded by, is zero.
+
+Each solve takes friction at the slip that the solve before it leads one to expect.
 """
 
 import warp as wp
@@ -28,15 +30,38 @@ CLIP_WIDTH = wp.constant(scalar(0.5))
 WEIGHT_STEPS = wp.constant(2)
 
 
+@wp.func
+def normal_law(
+    m: Model, sc: Scratch, offsets: Offsets, gap: real, vn: real, follows: scalar
+):
+    """Normal impulse at the normal velocity ``vn``, and its slope [N s, kg].
+
+    The spring is at the end of the substep, and the dissipation factor of Hunt and
+    Crossley (1975) is that of ``vn``. ``follows`` is 1 where the slope is also that of
+    the factor, and 0 where the factor stays.
+
+    Reads: m.h, m.contact_smoothing, m.dissipation, sc.parameter.
+    """
+    h = m.h
+    k = h * contact_stiffness(m, sc, offsets)
+    width = uniform(m.contact_smoothing)
+    reach = gap + h * vn
+    depth = k * penetration(reach, width)
+    rate = m.dissipation * vn - scalar(1.0)
+    damper = penetration(rate, uniform(DISSIPATION_WIDTH))
+    factor = (follows * m.dissipation) * gate(rate, uniform(DISSIPATION_WIDTH))
+    slope = (h * k) * (damper * gate(reach, width)) + depth * factor
+    return depth * damper, slope
+
+
 @stage
 def contact_predictor(m: Model, sc: Scratch, offsets: Offsets, c: int):
     """Geometry, and the contact law linearised about the velocity at the start.
 
-    Reads: m.h, m.com, m.contact_body, m.contact_partner, m.contact_smoothing,
-        m.slip_velocity, m.dissipation, sc.parameter, sc.pose, sc.twist_w,
-        sc.twist_v.
-    Writes: sc.point, sc.arm, sc.normal, sc.velocity, sc.load, sc.push, sc.weight_n,
-        sc.weight_t.
+    Reads: m.com, m.contact_body, m.contact_partner, m.slip_velocity, sc.parameter,
+        sc.pose, sc.twist_w, sc.twist_v, m.follows.
+    Writes: sc.point, sc.arm, sc.normal, sc.velocity, sc.gap, sc.load, sc.push_n,
+        sc.push, sc.weight_n, sc.weight_t.
     """
     i = load(m.contact_body, c)
     x = load(sc.pose, offsets.body + i)
@@ -49,19 +74,15 @@ def contact_predictor(m: Model, sc: Scratch, offsets: Offsets, c: int):
         r, normal, gap = touch_obstacle(m, sc, offsets, c)
     else:
         r, normal, gap = touch_partner(m, sc, offsets, c)
-    vc = load(sc.twist_v, offsets.body + i) + cross(
-        load(sc.twist_w, offsets.body + i), r
+    vc = load(sc.twist_v, offsets.motion + i) + cross(
+        load(sc.twist_w, offsets.motion + i), r
     )
     if partner >= 0:
-        other = offsets.body + load(m.contact_body, partner)
+        other = offsets.motion + load(m.contact_body, partner)
         vc = vc - (load(sc.twist_v, other) + cross(load(sc.twist_w, other), r))
     vn = dot(normal, vc)
     vt = vc - vn * normal
-    reach = gap + m.h * vn
-    damper = penetration(m.dissipation * vn - scalar(1.0), uniform(DISSIPATION_WIDTH))
-    k = (m.h * contact_stiffness(m, sc, offsets)) * damper
-    width = uniform(m.contact_smoothing)
-    push = k * penetration(reach, width)
+    push, wn = normal_law(m, sc, offsets, gap, vn, m.follows)
     wt = (
         friction(m, sc, offsets)
         * push
@@ -71,8 +92,10 @@ def contact_predictor(m: Model, sc: Scratch, offsets: Offsets, c: int):
     store(sc.arm, offsets.contact + c, r - transform_point(x, constant(m.com, i)))
     store(sc.normal, offsets.contact + c, normal)
     store(sc.velocity, offsets.contact + c, vc)
-    store(sc.load, offsets.contact + c, push)
-    store(sc.weight_n, offsets.solve_contact + c, m.h * k * gate(reach, width))
+    store(sc.gap, offsets.contact + c, gap)
+    store(sc.load, offsets.solve_contact + c, push)
+    store(sc.push_n, offsets.solve_contact + c, push)
+    store(sc.weight_n, offsets.solve_contact + c, wn)
     store(sc.weight_t, offsets.solve_contact + c, wt)
     store(sc.push, offsets.solve_contact + c, push * normal - wt * vt)
 
@@ -84,64 +107,101 @@ def contact_slip(m: Model, sc: Scratch, offsets: Offsets, c: int):
     Reads: m.contact_body, m.contact_partner, sc.point, sc.change_w, sc.change_v.
     Writes: sc.slip.
     """
-    at = offsets.solve_body + load(m.contact_body, c)
+    at = offsets.change + load(m.contact_body, c)
     r = load(sc.point, offsets.contact + c)
     dv = load(sc.change_v, at) + cross(load(sc.change_w, at), r)
     partner = load(m.contact_partner, c)
     if partner >= 0:
-        other = offsets.solve_body + load(m.contact_body, partner)
+        other = offsets.change + load(m.contact_body, partner)
         dv = dv - (load(sc.change_v, other) + cross(load(sc.change_w, other), r))
     store(sc.slip, offsets.solve_contact + c, dv)
 
 
-@stage
-def contact_clip(m: Model, sc: Scratch, offsets: Offsets, c: int):
-    """Normal impulse: the one of the predictor, ``offsets.before``, clipped at zero.
+@wp.func
+def clipped_impulse(sc: Scratch, offsets: Offsets, c: int):
+    """Normal impulse of contact ``c`` in the solve before: linear, clipped at zero.
 
-    Reads: sc.normal, sc.load, sc.weight_n, sc.slip.
-    Writes: sc.normal_impulse.
+    The clip is smooth, over a part of the law where it was linearised.
+
+    Reads: sc.normal, sc.load, sc.push_n, sc.weight_n, sc.slip.
     """
-    push = load(sc.load, offsets.contact + c)
-    approach = dot(
-        load(sc.normal, offsets.contact + c), load(sc.slip, offsets.before + c)
+    before = offsets.before + c
+    approach = dot(load(sc.normal, offsets.contact + c), load(sc.slip, before))
+    linear = load(sc.push_n, before) - load(sc.weight_n, before) * approach
+    return penetration(neg(linear), CLIP_WIDTH * load(sc.load, before))
+
+
+@wp.func
+def expected_weight(
+    m: Model, sc: Scratch, offsets: Offsets, c: int, applied: real, slip: vec3
+):
+    """Friction weight at the slip to expect after the solve before.
+
+    Reads: m.slip_velocity, sc.parameter, sc.weight_t.
+    """
+    return friction_weight(
+        total_mass(m, sc, offsets),
+        friction(m, sc, offsets) * applied,
+        load(sc.weight_t, offsets.before + c),
+        dot(slip, slip),
+        m.slip_velocity,
     )
-    linear = push - load(sc.weight_n, offsets.before + c) * approach
-    normal_impulse = penetration(neg(linear), CLIP_WIDTH * push)
-    store(sc.normal_impulse, offsets.report + c, normal_impulse)
 
 
 @stage
-def contact_corrector(m: Model, sc: Scratch, offsets: Offsets, c: int, p: int):
-    """Clipped normal impulse, and friction at the slip to expect, in solve ``p``.
+def contact_corrector(m: Model, sc: Scratch, offsets: Offsets, c: int):
+    """The law linearised about the velocity after the solve before, with friction.
 
-    In the last one a pair's friction is given too, from the slip so far: both sides
-    get the same impulse, and momentum is conserved whatever hangs on them.
+    Reads: sc.parameter, sc.normal, sc.velocity, sc.gap, sc.load, sc.push_n,
+        sc.weight_n, sc.weight_t, sc.slip.
+    Writes: sc.load, sc.push_n, sc.push, sc.weight_n, sc.weight_t.
+    """
+    n = load(sc.normal, offsets.contact + c)
+    vc = load(sc.velocity, offsets.contact + c)
+    vn = dot(n, vc)
+    v1 = vc + load(sc.slip, offsets.before + c)
+    vn1 = dot(n, v1)
+    applied = clipped_impulse(sc, offsets, c)
+    wt = expected_weight(m, sc, offsets, c, applied, v1 - vn1 * n)
+    gap = load(sc.gap, offsets.contact + c)
+    law, wn = normal_law(m, sc, offsets, gap, vn1, scalar(1.0))
+    # the impulse at the velocity at the start
+    push = law + wn * (vn1 - vn)
+    at = offsets.solve_contact + c
+    store(sc.load, at, law)
+    store(sc.push_n, at, push)
+    store(sc.weight_n, at, wn)
+    store(sc.weight_t, at, wt)
+    store(sc.push, at, push * n - wt * (vc - vn * n))
 
-    Reads: m.solves, m.contact_partner, m.slip_velocity, sc.parameter, sc.normal,
-        sc.velocity, sc.normal_impulse, sc.weight_t, sc.slip.
-    Writes: sc.push, sc.weight_n, sc.weight_t.
+
+@stage
+def contact_given(m: Model, sc: Scratch, offsets: Offsets, c: int, p: int):
+    """Given normal impulse, clipped at zero, and friction at the slip to expect.
+
+    Reads: m.given, sc.parameter, sc.normal, sc.velocity, sc.load, sc.push_n,
+        sc.weight_n, sc.weight_t, sc.slip, m.contact_partner, m.iterations, m.solves.
+    Writes: sc.load, sc.push_n, sc.push, sc.weight_n, sc.weight_t.
     """
     n = load(sc.normal, offsets.contact + c)
     vc = load(sc.velocity, offsets.contact + c)
     v1 = vc + load(sc.slip, offsets.before + c)
     slip = v1 - dot(n, v1) * n
-    normal_impulse = load(sc.normal_impulse, offsets.report + c)
-    mass = total_mass(m, sc, offsets)
-    before = load(sc.weight_t, offsets.before + c)
-    wt = friction_weight(
-        mass,
-        friction(m, sc, offsets) * normal_impulse,
-        before,
-        dot(slip, slip),
-        m.slip_velocity,
-    )
+    applied = load(sc.push_n, offsets.before + c)
+    if p == m.given:
+        applied = clipped_impulse(sc, offsets, c)
+    wt = expected_weight(m, sc, offsets, c, applied, slip)
     at = offsets.solve_contact + c
-    push = normal_impulse * n
+    store(sc.load, at, load(sc.load, offsets.before + c))
+    store(sc.push_n, at, applied)
     store(sc.weight_n, at, real())
-    if load(m.contact_partner, c) < 0 or p < m.solves - 1:
+    push = applied * n
+    if load(m.contact_partner, c) < 0 or p < m.iterations * m.solves - 1:
         store(sc.weight_t, at, wt)
         store(sc.push, at, push - wt * (vc - dot(n, vc) * n))
     else:
+        mass = total_mass(m, sc, offsets)
+        before = load(sc.weight_t, offsets.before + c)
         store(sc.weight_t, at, real())
         store(sc.push, at, push - (wt * (mass + before) / (mass + wt)) * slip)
 
@@ -187,16 +247,16 @@ def friction_weight(
 
 @stage
 def contact_impulse(sc: Scratch, offsets: Offsets, c: int):
-    """Impulse that the corrector applied, friction at the new velocity included.
+    """Impulse that the last solve applied, friction at the new velocity included.
 
-    Reads: sc.arm, sc.normal, sc.push, sc.weight_t, sc.slip.
-    Writes: sc.impulse, sc.angular_impulse.
+    Reads: sc.arm, sc.normal, sc.push_n, sc.push, sc.weight_t, sc.slip.
+    Writes: sc.impulse, sc.angular_impulse, sc.normal_impulse.
     """
+    at = offsets.solve_contact + c
     n = load(sc.normal, offsets.contact + c)
-    dv = load(sc.slip, offsets.solve_contact + c)
-    j = load(sc.push, offsets.solve_contact + c) - load(
-        sc.weight_t, offsets.solve_contact + c
-    ) * (dv - dot(n, dv) * n)
+    dv = load(sc.slip, at)
+    j = load(sc.push, at) - load(sc.weight_t, at) * (dv - dot(n, dv) * n)
+    store(sc.normal_impulse, offsets.report + c, load(sc.push_n, at))
     store(sc.impulse, offsets.report + c, j)
     store(
         sc.angular_impulse,

@@ -19,33 +19,42 @@ from .structs import Model, Offsets, Scratch
 
 @stage
 def rigid_inertia(m: Model, sc: Scratch, offsets: Offsets, i: int):
-    """Inertia about O and bias wrench of body ``i``.
+    """Inertia of body ``i`` about O.
 
-    A rigid inertia is (rotational inertia about O, first mass moment, mass); the bias
-    wrench is I a + v x* I v (Featherstone 2008, eq. 5.14 and 6.2).
+    A rigid inertia is (rotational inertia about O, first mass moment, mass).
 
-    Reads: m.com, m.isotropic, sc.parameter, sc.pose, sc.twist_w, sc.twist_v,
-        sc.bias_w, sc.bias_v.
-    Writes: sc.inertia, sc.moment, sc.wrench_w, sc.wrench_v.
+    Reads: m.com, m.isotropic, sc.parameter, sc.pose.
+    Writes: sc.inertia, sc.moment.
     """
     x = load(sc.pose, offsets.body + i)
     c = transform_point(x, constant(m.com, i))
-    mass = body_mass(m, sc, offsets, i)
-    hm = mass * c
+    hm = body_mass(m, sc, offsets, i) * c
     spin = body_inertia(m, sc, offsets, i)
     if load(m.isotropic, i) == 0:
         r = matrix(rotation(x))
         spin = r * body_inertia(m, sc, offsets, i) * transpose(r)
-    io = add_diagonal(spin - outer(hm, c), dot(hm, c))
-    w = load(sc.twist_w, offsets.body + i)
-    v = load(sc.twist_v, offsets.body + i)
-    aw = load(sc.bias_w, offsets.body + i)
-    av = load(sc.bias_v, offsets.body + i)
+    store(sc.inertia, offsets.body + i, add_diagonal(spin - outer(hm, c), dot(hm, c)))
+    store(sc.moment, offsets.body + i, hm)
+
+
+@stage
+def bias_wrench(m: Model, sc: Scratch, offsets: Offsets, i: int):
+    """Bias wrench of body ``i``: I a + v x* I v (Featherstone 2008, eq. 5.14 and 6.2).
+
+    Reads: sc.parameter, sc.inertia, sc.moment, sc.twist_w, sc.twist_v, sc.bias_w,
+        sc.bias_v.
+    Writes: sc.wrench_w, sc.wrench_v.
+    """
+    io = load(sc.inertia, offsets.body + i)
+    hm = load(sc.moment, offsets.body + i)
+    mass = body_mass(m, sc, offsets, i)
+    w = load(sc.twist_w, offsets.motion + i)
+    v = load(sc.twist_v, offsets.motion + i)
+    aw = load(sc.bias_w, offsets.motion + i)
+    av = load(sc.bias_v, offsets.motion + i)
     angular = io * w + cross(hm, v)
     linear = mass * v - cross(hm, w)
     n = io * aw + cross(hm, av) + cross(w, angular) + cross(v, linear)
     f = mass * av - cross(hm, aw) + cross(w, linear)
-    store(sc.inertia, offsets.body + i, io)
-    store(sc.moment, offsets.body + i, hm)
-    store(sc.wrench_w, offsets.body + i, n)
-    store(sc.wrench_v, offsets.body + i, f)
+    store(sc.wrench_w, offsets.motion + i, n)
+    store(sc.wrench_v, offsets.motion + i, f)

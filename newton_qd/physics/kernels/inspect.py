@@ -13,7 +13,7 @@ from .cpp.algebra import add_diagonal, cross, dot, skew, translation, vector
 from .cpp.memory import constant, load, read_input, store, write_output
 from .cpp.numbers import uniform
 from .cpp.operators import add, mul  # noqa: F401
-from .inertia import rigid_inertia
+from .inertia import bias_wrench, rigid_inertia
 from .readings import body_reading, seed_bodies, store_bodies
 from .simulate import kinematics
 from .structs import Model, Offsets, Scratch, offsets_at
@@ -116,8 +116,8 @@ def composite(m: Model, sc: Scratch, offsets: Offsets, i: int):
     ww = load(sc.inertia, body)
     wv = skew(load(sc.moment, body))
     vv = add_diagonal(mat33(), constant(m.mass, i))
-    n = load(sc.wrench_w, body)
-    f = load(sc.wrench_v, body)
+    n = load(sc.wrench_w, offsets.motion + i)
+    f = load(sc.wrench_v, offsets.motion + i)
     for j in range(load(m.child_start, i), load(m.child_start, i + 1)):
         child = offsets.solve_body + load(m.child, j)
         ww = ww + load(sc.total_ww, child)
@@ -220,6 +220,7 @@ def store_dynamics(
     """
     for i in range(1, m.nb + 1):
         rigid_inertia(m, sc, offsets, i)
+        bias_wrench(m, sc, offsets, i)
     # children come after their parents
     for n in range(m.nb):
         composite(m, sc, offsets, m.nb - n)

@@ -1,4 +1,4 @@
-"""Poses, motion subspaces, twists and bias accelerations, root to leaves.
+"""Poses and axes, then twists and bias accelerations, root to leaves.
 
 Spatial vectors are (angular, linear) in world axes about the origin O (Featherstone
 2008, ch. 2 and 5), which is where a free root or the slides under a root have moved:
@@ -24,8 +24,8 @@ from .structs import Model, Offsets, Scratch
 def world_frame(m: Model, sc: Scratch, offsets: Offsets):
     """Pose of the world frame seen from O.
 
-    Reads: m.nq, m.origin_axis, sc.q, sc.parameter.
-    Writes: sc.pose, sc.twist_w, sc.twist_v, sc.bias_w, sc.bias_v.
+    Reads: m.nq, m.origin_axis, sc.q.
+    Writes: sc.pose.
     """
     # a robot with fewer coordinates reads its last one again, times zero
     last = offsets.q + m.nq - 1
@@ -33,27 +33,35 @@ def world_frame(m: Model, sc: Scratch, offsets: Offsets):
     second = load(sc.q, wp.min(offsets.q + 1, last)) * constant(m.origin_axis, 1)
     third = load(sc.q, wp.min(offsets.q + 2, last)) * constant(m.origin_axis, 2)
     p = neg(first + second + third)
-    zero = vec3()
     store(
         sc.pose,
         offsets.body,
         rigid(p, quaternion(real(), real(), real(), uniform(scalar(1.0)))),
     )
-    store(sc.twist_w, offsets.body, zero)
-    store(sc.twist_v, offsets.body, zero)
-    store(sc.bias_w, offsets.body, zero)
-    store(sc.bias_v, offsets.body, vector(real(), real(), gravity(m, sc, offsets)))
+
+
+@stage
+def world_motion(m: Model, sc: Scratch, offsets: Offsets):
+    """The world rests, and accelerates upwards against gravity.
+
+    Reads: sc.parameter.
+    Writes: sc.twist_w, sc.twist_v, sc.bias_w, sc.bias_v.
+    """
+    zero = vec3()
+    store(sc.twist_w, offsets.motion, zero)
+    store(sc.twist_v, offsets.motion, zero)
+    store(sc.bias_w, offsets.motion, zero)
+    store(sc.bias_v, offsets.motion, vector(real(), real(), gravity(m, sc, offsets)))
 
 
 @stage
 def free_joint(m: Model, sc: Scratch, offsets: Offsets, i: int):
     """Six dofs: velocity of the body origin, then angular velocity, world axes.
 
-    Reads: m.body_parent, m.q_start, m.v_start, sc.q, sc.v, sc.pose, sc.bias_v.
-    Writes: sc.pose, sc.twist_w, sc.twist_v, sc.bias_w, sc.bias_v.
+    Reads: m.body_parent, m.q_start, sc.q, sc.pose.
+    Writes: sc.pose.
     """
     a = load(m.q_start, i)
-    k = load(m.v_start, i)
     p = vector(
         load(sc.q, offsets.q + a),
         load(sc.q, offsets.q + a + 1),
@@ -67,15 +75,26 @@ def free_joint(m: Model, sc: Scratch, offsets: Offsets, i: int):
     )
     x = load(sc.pose, offsets.body + load(m.body_parent, i)) * rigid(p, r)
     store(sc.pose, offsets.body + i, x)
-    at = translation(x)
+
+
+@stage
+def free_motion(m: Model, sc: Scratch, offsets: Offsets, i: int):
+    """Twist and bias acceleration of a free root.
+
+    Reads: m.v_start, sc.v, sc.pose, sc.bias_v.
+    Writes: sc.twist_w, sc.twist_v, sc.bias_w, sc.bias_v.
+    """
+    k = load(m.v_start, i)
+    at = translation(load(sc.pose, offsets.body + i))
     at_v = offsets.v_body + k
     vl = vector(load(sc.v, at_v), load(sc.v, at_v + 1), load(sc.v, at_v + 2))
     om = vector(load(sc.v, at_v + 3), load(sc.v, at_v + 4), load(sc.v, at_v + 5))
-    store(sc.twist_w, offsets.body + i, om)
-    store(sc.twist_v, offsets.body + i, vl + cross(at, om))
-    store(sc.bias_w, offsets.body + i, vec3())
+    store(sc.twist_w, offsets.motion + i, om)
+    store(sc.twist_v, offsets.motion + i, vl + cross(at, om))
+    store(sc.bias_w, offsets.motion + i, vec3())
     # d/dt (at x om) at constant coordinates, plus the world's acceleration
-    store(sc.bias_v, offsets.body + i, load(sc.bias_v, offsets.body) + cross(vl, om))
+    bias = load(sc.bias_v, offsets.motion) + cross(vl, om)
+    store(sc.bias_v, offsets.motion + i, bias)
 
 
 @stage
@@ -83,15 +102,12 @@ def axis_joint(m: Model, sc: Scratch, offsets: Offsets, i: int):
     """One revolute or prismatic dof about a fixed axis of the joint frame.
 
     Reads: m.body_parent, m.joint_kind, m.q_start, m.v_start, m.joint_axis,
-        m.parent_frame, m.child_frame_inverse, m.child_moved, sc.q, sc.v, sc.pose,
-        sc.twist_w, sc.twist_v, sc.bias_w, sc.bias_v.
-    Writes: sc.pose, sc.twist_w, sc.twist_v, sc.bias_w, sc.bias_v, sc.axis_w,
-        sc.axis_v.
+        m.parent_frame, m.child_frame_inverse, m.child_moved, sc.q, sc.pose.
+    Writes: sc.pose, sc.axis_w, sc.axis_v.
     """
     p = load(m.body_parent, i)
     k = load(m.v_start, i)
     qk = load(sc.q, offsets.q + load(m.q_start, i))
-    vk = load(sc.v, offsets.v_body + k)
     frame = load(sc.pose, offsets.body + p) * constant(m.parent_frame, i)
     axis = constant(m.joint_axis, i)
     a = rotate(rotation(frame), axis)
@@ -115,17 +131,32 @@ def axis_joint(m: Model, sc: Scratch, offsets: Offsets, i: int):
     store(sc.pose, offsets.body + i, x)
     store(sc.axis_w, offsets.dof + k, sw)
     store(sc.axis_v, offsets.dof + k, sv)
-    vw = load(sc.twist_w, offsets.body + p) + vk * sw
-    vv = load(sc.twist_v, offsets.body + p) + vk * sv
-    store(sc.twist_w, offsets.body + i, vw)
-    store(sc.twist_v, offsets.body + i, vv)
+
+
+@stage
+def axis_motion(m: Model, sc: Scratch, offsets: Offsets, i: int):
+    """Twist and bias acceleration of body ``i``, whose joint has one dof.
+
+    Reads: m.body_parent, m.v_start, sc.v, sc.axis_w, sc.axis_v, sc.twist_w,
+        sc.twist_v, sc.bias_w, sc.bias_v.
+    Writes: sc.twist_w, sc.twist_v, sc.bias_w, sc.bias_v.
+    """
+    p = offsets.motion + load(m.body_parent, i)
+    k = load(m.v_start, i)
+    vk = load(sc.v, offsets.v_body + k)
+    sw = load(sc.axis_w, offsets.dof + k)
+    sv = load(sc.axis_v, offsets.dof + k)
+    vw = load(sc.twist_w, p) + vk * sw
+    vv = load(sc.twist_v, p) + vk * sv
+    store(sc.twist_w, offsets.motion + i, vw)
+    store(sc.twist_v, offsets.motion + i, vv)
     store(
         sc.bias_w,
-        offsets.body + i,
-        load(sc.bias_w, offsets.body + p) + vk * cross(vw, sw),
+        offsets.motion + i,
+        load(sc.bias_w, p) + vk * cross(vw, sw),
     )
     store(
         sc.bias_v,
-        offsets.body + i,
-        load(sc.bias_v, offsets.body + p) + vk * (cross(vw, sv) + cross(vv, sw)),
+        offsets.motion + i,
+        load(sc.bias_v, p) + vk * (cross(vw, sv) + cross(vv, sw)),
     )

@@ -37,8 +37,8 @@ def body_reading(m: Model, sc: Scratch, offsets: Offsets, i: int):
     # the kernels work about O
     world = translation(load(sc.pose, offsets.body))
     com = transform_point(x, constant(m.com, i))
-    velocity = load(sc.twist_v, offsets.body + i) + cross(
-        load(sc.twist_w, offsets.body + i), com
+    velocity = load(sc.twist_v, offsets.motion + i) + cross(
+        load(sc.twist_w, offsets.motion + i), com
     )
     store(sc.position, offsets.reading + i, translation(x) - world)
     store(sc.com, offsets.reading + i, com - world)
@@ -68,7 +68,7 @@ def store_bodies(
         pose = load(sc.pose, offsets.body + i + 1)
         com = load(sc.com, offsets.reading + i + 1)
         linear = load(sc.com_velocity, offsets.reading + i + 1)
-        angular = load(sc.twist_w, offsets.body + i + 1)
+        angular = load(sc.twist_w, offsets.motion + i + 1)
         turn = at + fields.rotation + 4 * i
         for j in range(4):
             write_output(y, turn + j, size, count, component(pose, 3 + j))
@@ -118,7 +118,7 @@ def seed_bodies(
         store(g.pose, offsets.body + i + 1, rigid(vec3(), turn))
         store(g.com, offsets.reading + i + 1, com)
         store(g.com_velocity, offsets.reading + i + 1, linear)
-        store(g.twist_w, offsets.body + i + 1, angular)
+        store(g.twist_w, offsets.motion + i + 1, angular)
 
 
 @wp.func

@@ -13,16 +13,24 @@ from .articulation import (
     rest_world,
 )
 from .contact import (
-    contact_clip,
     contact_corrector,
+    contact_given,
     contact_impulse,
     contact_predictor,
     contact_slip,
 )
+from .coupling import PAIRS, SKIPS, couple_pairs, pairs_touch, skip_pairs
 from .cpp.memory import load
-from .inertia import rigid_inertia
+from .inertia import bias_wrench, rigid_inertia
 from .integration import mean_velocity, new_coordinates, new_velocity
-from .kinematics import axis_joint, free_joint, world_frame
+from .kinematics import (
+    axis_joint,
+    axis_motion,
+    free_joint,
+    free_motion,
+    world_frame,
+    world_motion,
+)
 from .readings import body_impulse, body_reading, foot_contact, torso_position
 from .structs import Model, Offsets, Scratch, offsets_after, offsets_at
 from .world import Pack, detect_fault, freeze_faulty
@@ -30,12 +38,13 @@ from .world import Pack, detect_fault, freeze_faulty
 
 @stage
 def kinematics(m: Model, sc: Scratch, offsets: Offsets, lane: int, lanes: int):
-    """Poses, twists and bias accelerations, root to leaves.
+    """Poses and axes, then twists and bias accelerations, root to leaves.
 
     Reads: m.joint_kind, m.body_levels, m.body_level_start, m.body_level.
     """
     if lane == 0:
         world_frame(m, sc, offsets)
+        world_motion(m, sc, offsets)
     sync(lane)
     for level in range(m.body_levels):
         start = load(m.body_level_start, level)
@@ -43,8 +52,30 @@ def kinematics(m: Model, sc: Scratch, offsets: Offsets, lane: int, lanes: int):
             i = load(m.body_level, p)
             if load(m.joint_kind, i) == JointKind.FREE:
                 free_joint(m, sc, offsets, i)
+                free_motion(m, sc, offsets, i)
             else:
                 axis_joint(m, sc, offsets, i)
+                axis_motion(m, sc, offsets, i)
+        sync(lane)
+
+
+@stage
+def motions(m: Model, sc: Scratch, offsets: Offsets, lane: int, lanes: int):
+    """Twists and bias accelerations at other velocities, in the same pose.
+
+    Reads: m.joint_kind, m.body_levels, m.body_level_start, m.body_level.
+    """
+    if lane == 0:
+        world_motion(m, sc, offsets)
+    sync(lane)
+    for level in range(m.body_levels):
+        start = load(m.body_level_start, level)
+        for p in range(start + lane, load(m.body_level_start, level + 1), lanes):
+            i = load(m.body_level, p)
+            if load(m.joint_kind, i) == JointKind.FREE:
+                free_motion(m, sc, offsets, i)
+            else:
+                axis_motion(m, sc, offsets, i)
         sync(lane)
 
 
@@ -52,7 +83,8 @@ def kinematics(m: Model, sc: Scratch, offsets: Offsets, lane: int, lanes: int):
 def linear_solve(m: Model, sc: Scratch, offsets: Offsets, lane: int, lanes: int):
     """Eliminate joints, leaves to root; velocity changes, root to leaves.
 
-    Reads: m.nc, m.joint_kind, m.body_levels, m.body_level_start, m.body_level.
+    Reads: m.nc, m.joint_kind, m.body_levels, m.body_level_start, m.body_level,
+        sc.load, sc.push_n, sc.weight_n, sc.weight_t.
     """
     if lane == 0:
         rest_world(sc, offsets)
@@ -74,6 +106,14 @@ def linear_solve(m: Model, sc: Scratch, offsets: Offsets, lane: int, lanes: int)
             else:
                 change_axis(m, sc, offsets, i)
         sync(lane)
+    if PAIRS:
+        touching = int(1)
+        if SKIPS:
+            touching = pairs_touch(m, sc, offsets)
+        if touching > 0:
+            couple_pairs(m, sc, offsets, lane, lanes)
+        else:
+            skip_pairs(m, sc, offsets, lane, lanes)
     for c in range(lane, m.nc, lanes):
         contact_slip(m, sc, offsets, c)
     sync(lane)
@@ -94,12 +134,14 @@ def substep(
 
     ``keep`` is as in ``offsets_at``.
 
-    Reads: m.nb, m.nv, m.nc, m.iterations, m.solves.
+    Reads: m.nb, m.nv, m.nc, m.iterations, m.solves, m.given.
     """
     start = iteration * m.solves
     first = offsets_at(m, slot, keep, s, start)
     for i in range(1 + lane, m.nb + 1, lanes):
-        rigid_inertia(m, sc, first, i)
+        if iteration == 0:
+            rigid_inertia(m, sc, first, i)
+        bias_wrench(m, sc, first, i)
     # predictor, then correctors
     for p in range(start, start + m.solves):
         offsets = offsets_at(m, slot, keep, s, p)
@@ -107,9 +149,10 @@ def substep(
             if p == 0:
                 contact_predictor(m, sc, offsets, c)
             else:
-                if p == 1:
-                    contact_clip(m, sc, offsets, c)
-                contact_corrector(m, sc, offsets, c, p)
+                if p < m.given:
+                    contact_corrector(m, sc, offsets, c)
+                else:
+                    contact_given(m, sc, offsets, c, p)
         sync(lane)
         linear_solve(m, sc, offsets, lane, lanes)
     last = offsets_at(m, slot, keep, s, start + m.solves - 1)
@@ -157,7 +200,10 @@ def simulate(
             )
             sync(lane)
         if s < m.substeps or m.reports_bodies == 1 or m.torso_q < 0:
-            kinematics(m, sc, offsets, lane, lanes)
+            if iteration == 0:
+                kinematics(m, sc, offsets, lane, lanes)
+            else:
+                motions(m, sc, offsets, lane, lanes)
         if s < m.substeps:
             substep(m, sc, slot, keep, s, iteration, lane, lanes)
     read_out(m, sc, slot, offsets_after(m, slot, keep), lane, lanes)

@@ -22,9 +22,15 @@ class Model:
     nv: int
     nu: int
     nc: int
+    pairs: int
+    changes: (
+        int  # sets of changes in a solve: the tree's and, with pairs, the final ones
+    )
     substeps: int
     total_mass: scalar  # [kg]
     iterations: int  # times that a substep finds the velocities of its bodies
+    follows: scalar  # 1: the predictor's slope is also that of the dissipation factor
+    given: int  # solve from which normal impulses are given
     solves: int  # solves of an iteration: predictor and correctors
     h: scalar  # [s]
     gravity: scalar  # [m/s^2]
@@ -59,8 +65,10 @@ class Model:
     limit_upper: wp.array[scalar]
     limit_stiffness: wp.array[scalar]
     limit_smoothing: scalar
+    limit_dissipation: scalar  # [s/rad or s/m]
     # contacts, (nc)
     contact_start: wp.array[int]  # (nb + 2)
+    contact_stop: wp.array[int]  # (nb + 1), where the body's rows of pairs begin
     contact_body: wp.array[int]
     contact_position: wp.array[_vec3]
     contact_segment: wp.array[_vec3]
@@ -68,7 +76,7 @@ class Model:
     contact_obstacle: wp.array[int]
     contact_partner: wp.array[int]  # row of the other side of a pair, else -1
     contact_lead: wp.array[int]  # row of the side that a pair is measured from
-    contact_split: wp.array[scalar]  # over the share of a pair's motion; else 1
+    pair_lead: wp.array[int]  # (pairs,)
     obstacle_kind: wp.array[int]
     obstacle_frame: wp.array[_transform]
     obstacle_size: wp.array[_vec3]
@@ -143,11 +151,13 @@ class Scratch:
     arm: wp.array[vec3]
     normal: wp.array[vec3]
     velocity: wp.array[vec3]
-    load: wp.array[real]
+    gap: wp.array[real]
     impulse: wp.array[vec3]
     angular_impulse: wp.array[vec3]
     normal_impulse: wp.array[real]
-    # contacts, per solve
+    # contacts, per solve: the law at the velocity expected, and linearised about it
+    load: wp.array[real]
+    push_n: wp.array[real]
     push: wp.array[vec3]
     weight_n: wp.array[real]
     weight_t: wp.array[real]
@@ -167,10 +177,19 @@ class Scratch:
     lever_w: wp.array[vec3]
     lever_v: wp.array[vec3]
     effort: wp.array[real]
+    share: wp.array[real]
     change_w: wp.array[vec3]
     change_v: wp.array[vec3]
     # degrees of freedom, per solve
     dv: wp.array[real]
+    # pairs, per solve, in three blocks: a unit impulse along each axis on its way to
+    # the root, what the tree answers, and what it answers with the pairs before
+    answer_w: wp.array[mat33]
+    answer_v: wp.array[mat33]
+    answer_dv: wp.array[vec3]
+    pair_weight: wp.array[mat33]  # impulse per velocity, for each pair
+    pair_coupling: wp.array[mat33]  # for each pair and each pair before it
+    pair_impulse: wp.array[vec3]
 
 
 @wp.struct
@@ -186,12 +205,19 @@ class Offsets:
     parameter: int
     body: int
     dof: int
+    motion: int  # bodies as they move in this iteration
     contact: int
     report: int
     before: int  # contacts of the solve before
+    before_dof: int  # degrees of freedom of the solve before
+    corrects: int  # above 0: limits take the velocity of the solve before
     solve_body: int
-    solve_dof: int
+    tree: int  # bodies in this solve: change by the tree alone
+    tree_dof: int
     solve_contact: int
+    change: int  # bodies in this solve: change with the pairs
+    change_dof: int
+    pair: int
     reading: int  # bodies of the slot
 
 
@@ -202,16 +228,18 @@ def offsets_at(m: Model, slot: int, keep: int, s: int, p: int):
     ``keep`` is 1 where every substep has entries of its own, as the adjoint needs, and
     0 where a slot's substeps share them.
 
-    Reads: m.nb, m.nq, m.nv, m.nu, m.nc, m.substeps, m.iterations, m.solves,
-        m.parameters.
+    Reads: m.nb, m.nq, m.nv, m.nu, m.nc, m.pairs, m.changes, m.substeps,
+        m.iterations, m.solves, m.parameters, m.given.
     """
     step = slot
+    turn = slot
     solve = slot
     before = slot
     iteration = p // m.solves
     iterations = m.substeps * m.iterations
     if keep == 1:
-        step = slot * (iterations + 1) + wp.min(
+        step = slot * (m.substeps + 1) + wp.min(s, m.substeps)
+        turn = slot * (iterations + 1) + wp.min(
             s * m.iterations + iteration, iterations
         )
         solve = m.solves * (slot * iterations + s * m.iterations) + p
@@ -230,12 +258,22 @@ def offsets_at(m: Model, slot: int, keep: int, s: int, p: int):
     r.parameter = slot * m.parameters.size
     r.body = step * (m.nb + 1)
     r.dof = step * m.nv
-    r.contact = step * m.nc
+    r.motion = turn * (m.nb + 1)
+    r.contact = slot * m.nc
+    if keep == 1:
+        r.contact = (slot * m.substeps + s) * m.nc
     r.report = (slot * m.substeps + s) * m.nc
     r.before = before * m.nc
+    r.before_dof = ((before + 1) * m.changes - 1) * m.nv
+    r.corrects = wp.min(p, m.given - 1)
     r.solve_body = solve * (m.nb + 1)
-    r.solve_dof = solve * m.nv
+    # the tree's own changes come first, those with the pairs last
+    r.tree = solve * m.changes * (m.nb + 1)
+    r.tree_dof = solve * m.changes * m.nv
+    r.change = r.tree + (m.changes - 1) * (m.nb + 1)
+    r.change_dof = r.tree_dof + (m.changes - 1) * m.nv
     r.solve_contact = solve * m.nc
+    r.pair = solve * m.pairs
     r.reading = slot * (m.nb + 1)
     return r
 

@@ -19,7 +19,7 @@ from newton_qd import checks
 from newton_qd.assets import find_urdf
 from newton_qd.checks import Fact, listed, message
 from newton_qd.physics import reference
-from newton_qd.physics.model.contacts import body_of, contact_tables, pair_shares
+from newton_qd.physics.model.contacts import body_of, contact_tables
 from newton_qd.physics.model.description import (
     Body,
     Description,
@@ -317,7 +317,7 @@ def build_system(robot: RobotSpec, dtype: str, scene: Scene | None = None) -> Sy
     )
     system = dataclasses.replace(system, rest_q=rest_coordinates(system))
     check_inertia(system, description.path)
-    return dataclasses.replace(system, contact_pair_share=pair_shares(system))
+    return system
 
 
 @functools.cache

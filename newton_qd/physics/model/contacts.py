@@ -17,7 +17,6 @@ from newton_qd.physics.model.scene import (
     wall_contacts,
     whole_collider,
 )
-from newton_qd.physics.system import System
 from newton_qd.robots import Contact, RobotSpec
 from newton_qd.scenes import Scene
 
@@ -162,32 +161,4 @@ def contact_tables(
         "contact_segment": np.array([row.segment for row in rows]).reshape(-1, 3),
         "contact_radius": np.array([row.radius for row in rows], dtype=np.float64),
         "contact_pairs": pairs.astype(np.int32),
-        "contact_pair_share": np.full(len(pairs), 0.5),
     }
-
-
-def pair_shares(system: System) -> np.ndarray:
-    """Returns the share (np,) of a pair's relative motion that its first side takes.
-
-    An impulse acts on both sides. The share is the mobility of the first side divided
-    by the sum of both. Mobility is computed at the centre of the collider, in the
-    default pose, summed over all directions. Shares are clipped to 0.01 and 0.99. A
-    share nearer to 0 or 1 belongs to a body that hardly moves, and would only add
-    stiffness to it.
-    """
-    if not len(system.contact_pairs):
-        return np.zeros(0)
-    compliance = np.linalg.inv(reference.mass_matrix(system, system.rest_q))
-    frames = reference.body_frames(system, system.rest_q)
-    linear, angular = reference.jacobians(system, system.rest_q)
-
-    def mobility(row: int) -> float:
-        body = system.contact_body[row]
-        arm = system.contact_position[row] - system.com[body]
-        arm = reference.rotation_matrix(frames[body, 3:]) @ arm
-        moved = linear[body] + np.cross(angular[body].T, arm).T
-        return float(np.trace(moved @ compliance @ moved.T))
-
-    sides = np.array([[mobility(row) for row in pair] for pair in system.contact_pairs])
-    share = sides[:, 0] / np.maximum(sides.sum(axis=1), 1e-30)
-    return np.clip(share, 0.01, 0.99)

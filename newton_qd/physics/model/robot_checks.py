@@ -11,7 +11,7 @@ from newton_qd.checks import Fact, listed, message
 from newton_qd.physics.model.xml_reader import RobotDescriptionError
 from newton_qd.robots import Contact, Material, RobotSpec
 
-_MAY_BE_ZERO = ("gravity", "friction", "dissipation")
+_MAY_BE_ZERO = ("gravity", "friction", "dissipation", "limit_dissipation")
 
 
 def _is_name(entry: object) -> bool:

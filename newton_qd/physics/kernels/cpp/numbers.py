@@ -77,3 +77,16 @@ adj_B += C != zero ? zero : adj_RET;
 def choose(c: real, a: real, b: real) -> real:
     """``a`` where ``c`` is not 0, else ``b``."""
     ...
+
+
+@wp.func_native(
+    snippet="""
+for (int i = 0; i < sizeof(a) / sizeof(a[0]); ++i)
+    if (a[i] != 0) return 1;
+return 0;
+""",
+    adj_snippet="",
+)
+def occurs(a: real) -> int:
+    """1 if a number is not 0 in some world of the pack, else 0; without adjoint."""
+    ...
