@@ -230,6 +230,63 @@ def penetration(gap: Any, width: float) -> np.ndarray:
     return np.where(gap <= -width, -gap, inside)
 
 
+def contact_law(
+    system: System, h: float, gap: float, vn: float, follows: float = 1.0
+) -> tuple[float, float]:
+    """Normal impulse [N s] of the implicit law at ``vn``, and its negative slope [kg].
+
+    Args:
+        system: The system.
+        h: Substep [s].
+        gap: Gap at the start of the substep [m].
+        vn: Velocity of parting at the end of the substep [m/s].
+        follows: 1 if the slope is also that of the dissipation factor, else 0.
+    """
+    material = system.robot.material
+    k = h * system.contact_stiffness
+    reach, rate = gap + h * vn, material.dissipation * vn - 1.0
+    depth = k * float(penetration(reach, material.smoothing))
+    damper = float(penetration(rate, 0.25))
+    slope = h * k * _gate(reach, material.smoothing) * damper
+    factor = follows * material.dissipation * depth * _gate(rate, 0.25)
+    return depth * damper, slope + factor
+
+
+def _gate(gap: float, width: float) -> float:
+    """The slope of ``penetration``, negative."""
+    u = np.clip(1.0 - gap / width, 0.0, 2.0)
+    return float(0.25 * u**2 * (3.0 - u))
+
+
+def solved_impulse(
+    system: System,
+    h: float,
+    gap: float,
+    vn: float,
+    free: float,
+    compliance: float,
+    solves: int,
+) -> float:
+    """Normal impulse of one contact after some solves by Newton's method [N s].
+
+    Args:
+        system: The system.
+        h: Substep [s].
+        gap: Gap at the start of the substep [m].
+        vn: Velocity of parting at the start [m/s].
+        free: Its change without the contact [m/s].
+        compliance: Its change per unit of impulse [1/kg].
+        solves: Solves; the first starts from ``vn``.
+    """
+    at, impulse = vn, 0.0
+    for _ in range(solves):
+        law, weight = contact_law(system, h, gap, at)
+        # law - weight (new - at), where new = vn + free + compliance * impulse
+        impulse = (law + weight * (at - vn - free)) / (1.0 + weight * compliance)
+        at = vn + free + compliance * impulse
+    return impulse
+
+
 def nearest(at: np.ndarray, along: np.ndarray, half: float) -> np.ndarray:
     """Distances (n,) of segments from a segment on the z axis, by brute force."""
     share = np.linspace(-1.0, 1.0, 801)[:, None]

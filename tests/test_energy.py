@@ -55,7 +55,9 @@ def test_energy_is_the_work_of_the_motors(name: str) -> None:
     """
     one = subject(name)
     still = one.system
-    material = dataclasses.replace(still.robot.material, friction=0.0, dissipation=0.0)
+    material = dataclasses.replace(
+        still.robot.material, friction=0.0, dissipation=0.0, limit_dissipation=0.0
+    )
     robot = dataclasses.replace(still.robot, material=material)
     free = dataclasses.replace(still, robot=robot, damping=np.zeros(still.nv))
     worlds, steps = 4, round(0.1 / robot.dt)

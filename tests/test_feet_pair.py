@@ -13,13 +13,15 @@ from physics_helpers import (
     functional,
     penetration,
     report,
+    solved_impulse,
     variant,
 )
 
 from newton_qd import physics
-from newton_qd.physics import reference
+from newton_qd.physics import buffers, reference
 from newton_qd.physics.model import build_system
 from newton_qd.physics.model.xml_reader import RobotDescriptionError
+from newton_qd.physics.stepping import Solves
 from newton_qd.physics.system import System
 from newton_qd.robots import HALFCHEETAH, ROBOTS, Contact
 
@@ -82,8 +84,15 @@ def test_pairs_are_those_of_the_original() -> None:
     np.testing.assert_allclose(system.contact_radius[sides], 0.046)
 
 
-def test_feet_push_each_other_apart(cheetah: System) -> None:
-    """A tree keeps its momentum too: its root's momentum is not changed."""
+def test_feet_push_each_other_apart(
+    cheetah: System, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A tree keeps its momentum too: its root's momentum is not changed.
+
+    In one iteration: a second one has velocity products, of the velocity gained.
+    """
+    monkeypatch.setattr(buffers, "substep_solves", lambda _: Solves(1, 3))
+    cheetah = dataclasses.replace(cheetah)  # one whose solves are not yet chosen
     q, _, u = pressed_feet(cheetah, np.random.default_rng(0), 20)
     still = np.zeros((20, cheetah.nv))
     after = batched_step(cheetah)(q, still, 0 * u)
@@ -172,7 +181,7 @@ def relative_motion(system: System, q: np.ndarray, normal: np.ndarray) -> np.nda
 def coupled(
     system: System, depth: float, vn: float, free: float, compliance: float
 ) -> float:
-    """Normal impulse that solves the contact law together with the motion.
+    """Normal impulse that solves the implicit law together with the motion.
 
     Args:
         system: The system.
@@ -181,21 +190,13 @@ def coupled(
         free: Its change without the contact [m/s].
         compliance: Its change per unit of impulse [1/kg].
     """
-    material, h = system.robot.material, system.robot.dt
-    width = material.smoothing
+    width = system.robot.material.smoothing
     low, high = -1.0, width
     for _ in range(60):
         gap = 0.5 * (low + high)
         low, high = (gap, high) if penetration(gap, width) > depth else (low, gap)
-    k = h * system.contact_stiffness
-    k *= float(penetration(material.dissipation * vn - 1.0, 0.25))
-    reach = low + h * vn
-    u = max(1.0 - reach / width, 0.0)
-    gate = 1.0 if reach <= -width else 0.25 * u**2 * (3.0 - u)
-    load = k * float(penetration(reach, width))
-    weight = h * k * gate
-    linear = (load - weight * free) / (1.0 + weight * compliance)
-    return float(penetration(-linear, 0.5 * load))
+    h = system.robot.dt
+    return solved_impulse(system, h, low, vn, free, compliance, solves=2)
 
 
 @pytest.mark.parametrize(("steps", "bound"), [(1, 1e-6), (8, 1e-4)])

@@ -34,7 +34,6 @@ def test_two_balls_collide(x64: None, tmp_path: Path, step: float) -> None:
     """Off centre, masses 1 and 3: momentum is kept, energy only lost, they part."""
     balls = body("a", ball(0.1)), body("b", ball(0.1), mass=3.0)
     system = world(tmp_path, *balls, dt=step)
-    np.testing.assert_allclose(system.contact_pair_share, 0.75)
     mass = np.array([1.0, 1.0, 1.0, 3.0, 3.0, 3.0])
     for speed in (1.0, 10.0):
         q = np.array([-0.15, 0.0, 0.0, 0.15, 0.05, 0.02])
@@ -292,7 +291,6 @@ def test_partner_that_cannot_move_is_a_wall(x64: None, tmp_path: Path) -> None:
         system,
         mass=mass,
         contact_pairs=np.array([[first, 1 - first]], np.int32),
-        contact_pair_share=np.array([1 - 1e-9]),
     )
     walled = dataclasses.replace(
         heavy,
@@ -302,7 +300,6 @@ def test_partner_that_cannot_move_is_a_wall(x64: None, tmp_path: Path) -> None:
         contact_segment=system.contact_segment[[first]],
         contact_radius=system.contact_radius[[first]],
         contact_pairs=np.zeros((0, 2), np.int32),
-        contact_pair_share=np.zeros(0),
         obstacle_kind=np.array([1], np.int32),
         obstacle_frame=np.array([[0.0, 0, 0, 0, 0, 0, 1]]),
         obstacle_size=np.array([[0.04, 0.25, 0.0]]),
