@@ -34,5 +34,8 @@ HALFCHEETAH = RobotSpec(
     # with 10, 4 % of worlds gain 1 to 2 % of their energy in some substep
     substeps=16,
     # smoothing: a quarter to a third of the radius of the capsules
-    material=Material(friction=0.6, smoothing=0.015, limit_swing=0.36),
+    # limits: without dissipation, a foot would bounce between them for ever
+    material=Material(
+        friction=0.6, smoothing=0.015, limit_swing=0.36, limit_dissipation=0.5
+    ),
 )

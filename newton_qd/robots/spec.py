@@ -62,7 +62,7 @@ class Material:
     limit_overshoot: float = 0.1
     limit_swing: float = 0.25
     limit_smoothing: float = 0.05
-    limit_dissipation: float = 0.5
+    limit_dissipation: float = 0.0
 
 
 @dataclasses.dataclass(frozen=True)
