@@ -16,9 +16,9 @@ FAST_TURN = 0.25
 class Solves:
     """Linear solves of a substep.
 
-    Every solve linearises contacts and limits about the velocity that the solve before
-    it found. An iteration also takes the velocity products at the mean of the old and
-    that velocity.
+    Several iterations linearise contacts and limits about the velocity that the solve
+    before found, and take the velocity products at the mean of the old and that
+    velocity. One iteration takes both at the old velocity.
 
     Attributes:
         iterations: Iterations of a substep.

@@ -1,11 +1,11 @@
 """Contacts with static obstacles and of moving bodies, linearised for the solves.
 
 The normal impulse is a function of the new velocity: the spring is evaluated where the
-contact will be, and so is the damping. Each solve takes it as linear about the velocity
-that the solve before it found, which is Newton's method on the implicit law. The law
-falls with the velocity and is convex, so a linear impulse is never above the law. It
-can be a little below zero where a body lifts off; then what is reported, and what
-friction is bounded by, is zero.
+contact will be, and so is the damping. The solves before ``given`` take it as linear
+about the velocity that the solve before them found, which is Newton's method on the
+implicit law. The law falls with the velocity and is convex, so a linear impulse is
+never above the law. It can be below zero where a body lifts off. So the solves from
+``given`` on take the impulse found so far, clipped smoothly at zero, as given.
 
 Each solve takes friction at the slip that the solve before it leads one to expect.
 """

@@ -122,7 +122,6 @@ def unit_effort(m: Model, sc: Scratch, offsets: Offsets, j: int, i: int):
 def rest_answer(m: Model, sc: Scratch, offsets: Offsets, j: int):
     """The world answers to no impulse.
 
-    Reads: .
     Writes: sc.answer_w, sc.answer_v.
     """
     at = answer_body(m, offsets, j, TREE)
