@@ -11,7 +11,7 @@ import ast
 import dataclasses
 import hashlib
 
-from kernel_program import READS, Function, Program
+from kernel_program import READS, WRITES, Function, Program
 
 NOTHING: frozenset[str] = frozenset()
 PACK, LANE = "pack", "lane"
@@ -140,7 +140,7 @@ class Flow:
             return Value(frozenset({PACK}), "tid")
         if name == "sync" and frame.diverged:
             self._report(node=node, frame=frame, text=SYNC)
-        if name in ("store", "write_output"):
+        if name in WRITES:
             self._store(node, given, frame)
         if name in self.program.structs and not node.args:
             return Value(NOTHING, text, {})

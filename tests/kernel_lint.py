@@ -11,7 +11,7 @@ import re
 from collections.abc import Iterator, Mapping
 
 from kernel_flow import Flow
-from kernel_program import PLAIN, STRUCTS, Function, Program
+from kernel_program import ADJOINTS, PLAIN, STRUCTS, Function, Program
 
 # Warp unrolls loops of as many turns; then every turn has its own variables.
 UNROLLED = 16
@@ -119,6 +119,11 @@ def _differentiated(function: Function) -> Iterator[tuple[int, str]]:
     if function.kind == "func" and function.stores():
         text = "stage: it stores, and has no adjoint by hand"
         yield function.node.lineno, text
+    if function.kind == "plain":
+        yield function.node.lineno, "plain: it has no adjoint, and needs one here"
+    for name, call in function.calls():
+        if name in ADJOINTS:
+            yield call.lineno, f"adjoint: {name} is for adjoints by hand"
     known = set(function.parameters)
     yield from _loops(function.body, known, function.body)
 

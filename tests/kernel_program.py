@@ -8,13 +8,16 @@ from __future__ import annotations
 import ast
 import dataclasses
 import functools
+import re
 from collections.abc import Iterator, Mapping
 
 # Files whose kernels are not for packs of worlds and have no adjoint.
 PLAIN = ("episodes", "conventions")
 # Functions of cpp/ that reach memory: which argument is the array, which the index.
-READS = ("load", "constant", "read_input")
-WRITES = ("store", "write_output")
+READS = ("load", "constant", "read_input", "load_adjoint")
+WRITES = ("store", "write_output", "store_adjoint", "add_adjoint")
+# Those that reach the adjoint of an array.
+ADJOINTS = ("load_adjoint", "store_adjoint", "add_adjoint")
 # What a parameter's struct is called in documentation.
 STRUCTS = ("Model", "Scratch", "Offsets", "Pack")
 
@@ -26,7 +29,7 @@ class Function:
     Attributes:
         file: Name of its file, without the ending.
         node: Its syntax tree.
-        kind: ``"stage"``, ``"func"``, ``"grad"`` or ``"kernel"``.
+        kind: ``"stage"``, ``"func"``, ``"plain"``, ``"grad"`` or ``"kernel"``.
         of: What a ``"grad"`` is the adjoint of.
         backward: Whether a kernel has an adjoint.
     """
@@ -155,9 +158,9 @@ class Program:
         """What a function reads and writes.
 
         Scratch arrays and arrays of the caller count where functions that it calls
-        reach them, unless these are stages or have an adjoint by hand; fields of the
-        model only where it names them itself. Of a kernel, its arrays count, however
-        they are reached.
+        reach them, unless these are stages, plain or have an adjoint by hand; fields of
+        the model only where it names them itself. Of a kernel, its arrays count,
+        however they are reached.
 
         Args:
             name: The function.
@@ -207,5 +210,7 @@ def _elements(function: Function) -> tuple[set[str], set[str]]:
     for called, call in function.calls():
         if called in (*READS, *WRITES):
             array = ast.unparse(call.args[0])
+            if called in ADJOINTS:
+                array = re.sub(r"^sc\.", "g.", array)
             (reads if called in READS else writes).add(array)
     return reads, writes

@@ -64,6 +64,20 @@ GOOD = {
             if lane == 0:
                 store(g.v, slot, real())
 
+        @plain
+        def answer(sc: Scratch, slot: int, lane: int):
+            '''Stored twice. Reads: sc.q. Writes: sc.fault.'''
+            if lane == 0:
+                store(sc.fault, slot, load(sc.q, slot))
+                store(sc.fault, slot, load(sc.q, slot))
+
+        @wp.func_grad(answer)
+        def adj_answer(sc: Scratch, slot: int, lane: int):
+            '''Its adjoint. Reads: g.fault. Writes: g.fault, g.q.'''
+            if lane == 0:
+                add_adjoint(sc.q, slot, load_adjoint(sc.fault, slot))
+                store_adjoint(sc.fault, slot, real())
+
         @stage
         def gather(m: Model, sc: Scratch, offsets: Offsets, i: int):
             '''Sum over children. Reads: sc.v, m.child. Writes: sc.total.'''
@@ -90,6 +104,8 @@ GOOD = {
             slot = tid // lanes
             lane = tid - slot * lanes
             load_world(m, sc, g, slot, lane)
+            answer(sc, slot, lane)
+            sync(lane)
             for s in range(m.substeps):
                 offsets = offsets_at(m, slot, s)
                 for i in range(lane, m.nb, lanes):
@@ -239,6 +255,26 @@ BROKEN = {
         "field: Offsets has no bodies",
         "offsets.body +",
         "offsets.bodies +",
+    ),
+    "a plain function that has no adjoint": (
+        "plain: it has no adjoint, and needs one here",
+        "@wp.func_grad(answer)",
+        "@wp.func_grad(load_world)",
+    ),
+    "an adjoint by hand in a stage": (
+        "adjoint: load_adjoint is for adjoints by hand",
+        "load(sc.total, offsets.body + i))",
+        "load_adjoint(sc.total, offsets.body + i))",
+    ),
+    "an adjoint by two lanes": (
+        "race: sc.q is written by every lane of threads at this index",
+        "if lane == 0:\n        add_adjoint",
+        "if lane >= 0:\n        add_adjoint",
+    ),
+    "adjoints that are not said": (
+        "docs: Writes lacks g.q",
+        "Writes: g.fault, g.q.",
+        "Writes: g.fault.",
     ),
     "C++ elsewhere": (
         "native: C++ is written in cpp/ only",

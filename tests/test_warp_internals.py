@@ -159,3 +159,8 @@ def test_functions_are_marked() -> None:
     assert function.skip_replay
     with pytest.raises(UnsupportedWarpError, match="skip_replay"):
         warp_internals.never_replay(functools.partial(print))
+    plain = SimpleNamespace(adj=SimpleNamespace(skip_reverse_codegen=False))
+    assert warp_internals.never_differentiate(plain) is plain
+    assert plain.adj.skip_reverse_codegen
+    with pytest.raises(UnsupportedWarpError, match="skip_reverse_codegen"):
+        warp_internals.never_differentiate(functools.partial(print))

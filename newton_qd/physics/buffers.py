@@ -26,9 +26,16 @@ _PER_MOTION = ("twist_w", "twist_v", "bias_w", "bias_v", "wrench_w", "wrench_v")
 _PER_CONTACT = ("point", "arm", "normal", "velocity", "gap")
 _PER_SOLVE_CONTACT = ("load", "push_n", "push", "weight_n")
 _PER_SOLVE_CONTACT += ("weight_t", "slip")
-_PER_SOLVE_BODY = ("total_ww", "total_wv", "total_vv", "total_w", "total_v")
-_PER_SOLVE_BODY += ("passed_ww", "passed_wv", "passed_vv", "passed_w", "passed_v")
-_PER_SOLVE_BODY += ("lever_w", "lever_v", "effort", "share")
+_PER_SOLVE_BODY = ("change_w", "change_v")
+_PER_SOLVE_DOF = ("dv", "joint_push", "joint_weight")
+# Arrays of the linear solves. Their adjoint is written by hand and needs no memory.
+_FACTORS = ("lever_w", "lever_v", "share")
+_ROOT_FACTORS = ("root_ww", "root_wv", "root_vv")
+_ANSWERS = ("answer_w", "answer_v", "answer_dv")
+_PAIRED = ("pair_weight", "pair_impulse", "pair_adjoint", "pair_coupling")
+_PASSED = ("passed_ww", "passed_wv", "passed_vv", "passed_w", "passed_v", "effort")
+_PASSED += ("multiplier_w", "multiplier_v")
+_WITHOUT_ADJOINT = (*_FACTORS, *_ROOT_FACTORS, *_ANSWERS, *_PAIRED, *_PASSED)
 _PER_READING = ("body_impulse", "body_angular_impulse", "body_normal_impulse")
 _PER_READING += ("position", "com", "com_velocity")
 _REPORTED = ("impulse", "angular_impulse", "normal_impulse")
@@ -88,7 +95,6 @@ def build_model(system: System, device: wp.Device, parametric: bool = False) -> 
     model.nu, model.nc = system.nu, len(system.contact_body)
     model.substeps = robot.substeps
     model.pairs = len(system.contact_pairs)
-    model.changes = 2 if model.pairs else 1
     solves = substep_solves(system)
     model.iterations, model.solves = solves.iterations, solves.solves
     model.given = solves.given
@@ -243,7 +249,7 @@ def _entries(system: System, adjoint: bool) -> dict[str, int]:
     motions = turns + 1 if adjoint else 1
     solves = turns * chosen.solves if adjoint else 1
     pairs = len(system.contact_pairs)
-    changes, coupled = (2 if pairs else 1), solves * pairs
+    coupled = solves * pairs
     return {
         "fault": 1,
         "lost": 1,
@@ -258,12 +264,14 @@ def _entries(system: System, adjoint: bool) -> dict[str, int]:
         **dict.fromkeys(_REPORTED, n * nc),
         **dict.fromkeys(_PER_SOLVE_CONTACT, solves * nc),
         **dict.fromkeys(_PER_SOLVE_BODY, solves * (system.nb + 1)),
-        **dict.fromkeys(("change_w", "change_v"), solves * changes * (system.nb + 1)),
-        "dv": solves * changes * system.nv,
-        **dict.fromkeys(("answer_w", "answer_v"), 3 * coupled * (system.nb + 1)),
-        "answer_dv": 3 * coupled * system.nv,
-        **dict.fromkeys(("pair_weight", "pair_impulse"), coupled),
+        **dict.fromkeys(_PER_SOLVE_DOF, solves * system.nv),
+        **dict.fromkeys(_FACTORS, solves * (system.nb + 1)),
+        **dict.fromkeys(_ROOT_FACTORS, solves),
+        **dict.fromkeys(_ANSWERS[:2], coupled * (system.nb + 1)),
+        "answer_dv": coupled * system.nv,
+        **dict.fromkeys(_PAIRED[:3], coupled),
         "pair_coupling": coupled * pairs,
+        **dict.fromkeys(_PASSED, system.nb + 1),
         **dict.fromkeys(_PER_READING, system.nb + 1),
         "torso_xy": 2,
         **dict.fromkeys(("foot_contact", "smooth_foot_contact"), max(nf, 1)),
@@ -277,7 +285,7 @@ class Memory:
     Attributes:
         values: ``Scratch`` struct of the values.
         adjoints: ``Scratch`` struct of their adjoints. Without adjoints it is
-            ``values`` itself.
+            ``values`` itself. An array that needs no adjoint is in both.
     """
 
     values: Any
@@ -309,10 +317,8 @@ def build_scratch(
     values, adjoints = space.structs.Scratch(), space.structs.Scratch()
     for name, count in _entries(system, adjoint).items():
         dtype = field_dtype(space.structs.Scratch, name)
-        array = wp.zeros(
-            slots * count, dtype=dtype, device=device, requires_grad=adjoint
-        )
+        both = adjoint and name not in _WITHOUT_ADJOINT
+        array = wp.zeros(slots * count, dtype=dtype, device=device, requires_grad=both)
         setattr(values, name, array)
-        if adjoint:
-            setattr(adjoints, name, array.grad)
+        setattr(adjoints, name, array.grad if both else array)
     return Memory(values, adjoints if adjoint else values)

@@ -146,3 +146,22 @@ def never_replay(function: FunctionT) -> FunctionT:
     marked: Any = function
     marked.skip_replay = True
     return function
+
+
+def never_differentiate(function: FunctionT) -> FunctionT:
+    """Mark a function so that no adjoint is generated for it.
+
+    Args:
+        function: Function from ``wp.func``. It is changed in place.
+
+    Returns:
+        ``function``.
+
+    Raises:
+        UnsupportedWarpError: The installed Warp has no such mark.
+    """
+    if not _has(function, "adj.skip_reverse_codegen"):
+        raise _unsupported("adj.skip_reverse_codegen", (type(function).__qualname__,))
+    marked: Any = function
+    marked.adj.skip_reverse_codegen = True
+    return function

@@ -9,7 +9,10 @@ neighbours.
 
 **Where to read first.** :mod:`.simulate` has the order of the stages. They are in
 :mod:`.kinematics`, :mod:`.contact` (with :mod:`.nearest`, :mod:`.box`, :mod:`.pair`),
-:mod:`.inertia`, :mod:`.articulation`, :mod:`.integration` and :mod:`.readings`.
+:mod:`.inertia`, :mod:`.joints`, :mod:`.solve`, :mod:`.integration` and
+:mod:`.readings`.
+The solve is in :mod:`.articulation` and, for pairs, :mod:`.coupling`; its adjoint is by
+hand, in :mod:`.multipliers` and :mod:`.parts`.
 :mod:`.structs` declares what they read (``Model``), their intermediates (``Scratch``)
 and where these begin (``Offsets``); :mod:`.rows` where the fields of a row of inputs or
 outputs begin. :mod:`.world` moves these rows, with :mod:`.parameters` for parameters
@@ -28,7 +31,9 @@ compiled. docs/physics.md says why the files run again.
    clears it. One substep has entries of its own where the adjoint runs (``keep``).
 2. A function that stores is marked ``stage``, or has an adjoint by hand. Warp does not
    repeat a stage when it replays its caller. So a stage returns nothing: its results
-   travel through the scratch arrays.
+   travel through the scratch arrays. What only a function with an adjoint by hand
+   calls is marked ``plain``: Warp makes no adjoint of it, and rules 1 and 3 do not
+   hold there.
 3. A loop only adds terms to a variable, and nothing in the loop but its own sum reads
    that variable. Warp does not run a loop again before it walks back through what
    follows it.
@@ -45,7 +50,7 @@ Each function says what it reads and writes: ``sc`` is the scratch, ``g`` its ad
 import warp as wp
 
 from newton_qd.physics.precision import variant_of
-from newton_qd.physics.warp_internals import never_replay
+from newton_qd.physics.warp_internals import never_differentiate, never_replay
 
 # What this copy of the package is for.
 _variant = variant_of(__name__)
@@ -61,6 +66,8 @@ vec3 = wp.types.matrix(shape=(3, width), dtype=scalar)
 quat = wp.types.matrix(shape=(4, width), dtype=scalar)
 transform = wp.types.matrix(shape=(7, width), dtype=scalar)
 mat33 = wp.types.matrix(shape=(9, width), dtype=scalar)
+# xx, xy, xz, yy, yz, zz of a symmetric matrix
+sym33 = wp.types.matrix(shape=(6, width), dtype=scalar)
 
 _SYNC = """
 #if defined(__CUDA_ARCH__)
@@ -82,3 +89,12 @@ def sync(lane: int):
 def stage(function):
     """Declare a Warp function that stores its results and is never replayed."""
     return never_replay(wp.func(function))
+
+
+def plain(function):
+    """Declare a Warp function that only functions with an adjoint by hand call.
+
+    Warp makes no adjoint of it and does not replay it, so its loops and stores are
+    those of any program. It may have an adjoint by hand itself.
+    """
+    return never_replay(never_differentiate(wp.func(function)))

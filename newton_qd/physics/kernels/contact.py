@@ -18,13 +18,13 @@ from .cpp.memory import constant, load, store
 from .cpp.numbers import sqrt, uniform
 from .cpp.operators import add, div, mul, neg, sub  # noqa: F401
 from .cpp.smooth import gate, penetration
+from .joints import DISSIPATION_WIDTH
 from .nearest import touch_obstacle
 from .pair import touch_partner
 from .parameters import contact_stiffness, friction, total_mass
 from .structs import Model, Offsets, Scratch
 
-# Hunt-Crossley factor and clipping switch over these fractions of their natural scale.
-DISSIPATION_WIDTH = wp.constant(scalar(0.25))
+# Clipping switches over this fraction of its natural scale.
 CLIP_WIDTH = wp.constant(scalar(0.5))
 # Steps of Newton's method for a friction weight: from its bound, 3 % off at most.
 WEIGHT_STEPS = wp.constant(2)
@@ -107,12 +107,12 @@ def contact_slip(m: Model, sc: Scratch, offsets: Offsets, c: int):
     Reads: m.contact_body, m.contact_partner, sc.point, sc.change_w, sc.change_v.
     Writes: sc.slip.
     """
-    at = offsets.change + load(m.contact_body, c)
+    at = offsets.solve_body + load(m.contact_body, c)
     r = load(sc.point, offsets.contact + c)
     dv = load(sc.change_v, at) + cross(load(sc.change_w, at), r)
     partner = load(m.contact_partner, c)
     if partner >= 0:
-        other = offsets.change + load(m.contact_body, partner)
+        other = offsets.solve_body + load(m.contact_body, partner)
         dv = dv - (load(sc.change_v, other) + cross(load(sc.change_w, other), r))
     store(sc.slip, offsets.solve_contact + c, dv)
 

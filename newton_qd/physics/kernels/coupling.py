@@ -17,20 +17,9 @@ A contact with a fixed obstacle needs none of this: its weight is an added inert
 
 import warp as wp
 
-from newton_qd.physics.kinds import JointKind
-
-from . import mat33, pairs, real, scalar, stage, sync, width
-from .articulation import point_weight
-from .cpp.algebra import (
-    add_diagonal,
-    dot,
-    inverse,
-    outer,
-    skew,
-    translation,
-    transpose,
-    vector,
-)
+from . import pairs, plain, real, scalar, sync, vec3, width
+from .answers import answer, answer_between, answer_body, answer_dof
+from .cpp.algebra import add_diagonal, cross, dot, inverse, outer
 from .cpp.memory import load, store
 from .cpp.numbers import occurs, uniform
 from .cpp.operators import add, mul, neg, sub  # noqa: F401
@@ -40,31 +29,9 @@ PAIRS = wp.constant(pairs)
 # A CPU skips pairs that no world of a pack needs. A GPU does not: worlds of one warp
 # wait for each other.
 SKIPS = wp.constant(width > 1)
-# blocks of a pair's answers
-UNIT = wp.constant(0)
-TREE = wp.constant(1)
-PAIRED = wp.constant(2)
 
 
-@wp.func
-def answer_body(m: Model, offsets: Offsets, j: int, block: int):
-    """Where the bodies of a block of pair ``j`` begin.
-
-    Reads: m.nb.
-    """
-    return (3 * (offsets.pair + j) + block) * (m.nb + 1)
-
-
-@wp.func
-def answer_dof(m: Model, offsets: Offsets, j: int, block: int):
-    """Where the degrees of freedom of a block of pair ``j`` begin.
-
-    Reads: m.nv.
-    """
-    return (3 * (offsets.pair + j) + block) * m.nv
-
-
-@wp.func
+@plain
 def coupling_at(m: Model, offsets: Offsets, i: int, j: int):
     """Where the coupling of pair ``j`` with the pair ``i`` before it is.
 
@@ -73,332 +40,194 @@ def coupling_at(m: Model, offsets: Offsets, i: int, j: int):
     return (offsets.pair + j) * m.pairs + i
 
 
-@stage
-def gather_unit(m: Model, sc: Scratch, offsets: Offsets, j: int, i: int):
-    """Wrenches on body ``i`` of pair ``j``'s unit impulses, with what children hand on.
+@plain
+def point_weight(sc: Scratch, offsets: Offsets, c: int):
+    """3 x 3 weight of a contact: impulse per change of the point's velocity [kg].
 
-    A column for each axis of the world.
-
-    Reads: m.pair_lead, m.contact_body, m.contact_partner, m.child_start, m.child,
-        m.v_start, sc.point, sc.lever_w, sc.lever_v, sc.answer_w, sc.answer_v,
-        sc.answer_dv.
-    Writes: sc.answer_w, sc.answer_v.
+    Reads: sc.normal, sc.weight_n, sc.weight_t.
     """
-    lead = load(m.pair_lead, j)
-    side = scalar(0.0)
-    if load(m.contact_body, lead) == i:
-        side = scalar(1.0)
-    if load(m.contact_body, load(m.contact_partner, lead)) == i:
-        side = scalar(-1.0)
-    n = side * skew(load(sc.point, offsets.contact + lead))
-    f = add_diagonal(mat33(), uniform(side))
-    first = answer_body(m, offsets, j, UNIT)
-    dofs = answer_dof(m, offsets, j, UNIT)
-    for c in range(load(m.child_start, i), load(m.child_start, i + 1)):
-        child = load(m.child, c)
-        at = offsets.solve_body + child
-        effort = load(sc.answer_dv, dofs + load(m.v_start, child))
-        n = n + (load(sc.answer_w, first + child) - outer(load(sc.lever_w, at), effort))
-        f = f + (load(sc.answer_v, first + child) - outer(load(sc.lever_v, at), effort))
-    store(sc.answer_w, first + i, n)
-    store(sc.answer_v, first + i, f)
+    n = load(sc.normal, offsets.contact + c)
+    wt = load(sc.weight_t, offsets.solve_contact + c)
+    wn = load(sc.weight_n, offsets.solve_contact + c)
+    return add_diagonal((wn - wt) * outer(n, n), wt)
 
 
-@stage
-def unit_effort(m: Model, sc: Scratch, offsets: Offsets, j: int, i: int):
-    """Efforts of the joint of body ``i`` under pair ``j``'s unit impulses.
-
-    Reads: m.v_start, sc.axis_w, sc.axis_v, sc.answer_w, sc.answer_v.
-    Writes: sc.answer_dv.
-    """
-    k = load(m.v_start, i)
-    at = answer_body(m, offsets, j, UNIT) + i
-    angular = load(sc.axis_w, offsets.dof + k) * load(sc.answer_w, at)
-    linear = load(sc.axis_v, offsets.dof + k) * load(sc.answer_v, at)
-    store(sc.answer_dv, answer_dof(m, offsets, j, UNIT) + k, angular + linear)
-
-
-@stage
-def rest_answer(m: Model, sc: Scratch, offsets: Offsets, j: int):
-    """The world answers to no impulse.
-
-    Writes: sc.answer_w, sc.answer_v.
-    """
-    at = answer_body(m, offsets, j, TREE)
-    store(sc.answer_w, at, mat33())
-    store(sc.answer_v, at, mat33())
-
-
-@stage
-def answer_axis(m: Model, sc: Scratch, offsets: Offsets, j: int, i: int):
-    """What a joint with one dof and body ``i`` answer to pair ``j``'s unit impulses.
-
-    Reads: m.body_parent, m.v_start, sc.axis_w, sc.axis_v, sc.lever_w, sc.lever_v,
-        sc.share, sc.answer_w, sc.answer_v, sc.answer_dv.
-    Writes: sc.answer_w, sc.answer_v, sc.answer_dv.
-    """
-    at = offsets.solve_body + i
-    first = answer_body(m, offsets, j, TREE)
-    up = first + load(m.body_parent, i)
-    k = load(m.v_start, i)
-    w = load(sc.answer_w, up)
-    v = load(sc.answer_v, up)
-    dv = (
-        load(sc.share, at) * load(sc.answer_dv, answer_dof(m, offsets, j, UNIT) + k)
-        - load(sc.lever_w, at) * w
-        - load(sc.lever_v, at) * v
-    )
-    store(sc.answer_dv, answer_dof(m, offsets, j, TREE) + k, dv)
-    store(sc.answer_w, first + i, w + outer(load(sc.axis_w, offsets.dof + k), dv))
-    store(sc.answer_v, first + i, v + outer(load(sc.axis_v, offsets.dof + k), dv))
-
-
-@stage
-def answer_free(m: Model, sc: Scratch, offsets: Offsets, j: int, i: int):
-    """What a free root answers to pair ``j``'s unit impulses.
-
-    Reads: m.v_start, sc.pose, sc.total_ww, sc.total_wv, sc.total_vv, sc.answer_w,
-        sc.answer_v.
-    Writes: sc.answer_w, sc.answer_v, sc.answer_dv.
-    """
-    at = offsets.solve_body + i
-    unit = answer_body(m, offsets, j, UNIT) + i
-    to = answer_body(m, offsets, j, TREE) + i
-    k = answer_dof(m, offsets, j, TREE) + load(m.v_start, i)
-    wv = load(sc.total_wv, at)
-    n = load(sc.answer_w, unit)
-    f = load(sc.answer_v, unit)
-    compliance = inverse(load(sc.total_vv, at))
-    reduced = wv * compliance
-    w = inverse(load(sc.total_ww, at) - reduced * transpose(wv)) * (n - reduced * f)
-    v = compliance * (f - transpose(wv) * w)
-    store(sc.answer_w, to, w)
-    store(sc.answer_v, to, v)
-    origin = v - skew(translation(load(sc.pose, offsets.body + i))) * w
-    one = uniform(scalar(1.0))
-    none = real()
-    x = vector(one, none, none)
-    y = vector(none, one, none)
-    z = vector(none, none, one)
-    store(sc.answer_dv, k, x * origin)
-    store(sc.answer_dv, k + 1, y * origin)
-    store(sc.answer_dv, k + 2, z * origin)
-    store(sc.answer_dv, k + 3, x * w)
-    store(sc.answer_dv, k + 4, y * w)
-    store(sc.answer_dv, k + 5, z * w)
-
-
-@wp.func
-def answer_between(
-    m: Model, sc: Scratch, offsets: Offsets, i: int, j: int, block: int
-) -> mat33:
-    """Relative velocity at pair ``i``'s point for pair ``j``'s unit impulses.
-
-    Reads: m.pair_lead, m.contact_body, m.contact_partner, sc.point, sc.answer_w,
-        sc.answer_v.
-    """
-    lead = load(m.pair_lead, i)
-    first = answer_body(m, offsets, j, block)
-    a = first + load(m.contact_body, lead)
-    b = first + load(m.contact_body, load(m.contact_partner, lead))
-    turned = load(sc.answer_w, a) - load(sc.answer_w, b)
-    moved = load(sc.answer_v, a) - load(sc.answer_v, b)
-    return moved - skew(load(sc.point, offsets.contact + lead)) * turned
-
-
-@stage
+@plain
 def couple(m: Model, sc: Scratch, offsets: Offsets, i: int, j: int):
     """Impulse of pair ``i`` for pair ``j``'s unit impulses; ``i`` is before ``j``.
 
-    Reads: sc.point, sc.answer_w, sc.answer_v, sc.pair_weight, sc.pair_coupling.
+    Reads: sc.pair_weight, sc.pair_coupling.
     Writes: sc.pair_coupling.
     """
     weight = load(sc.pair_weight, offsets.pair + i)
-    impulse = neg(weight * answer_between(m, sc, offsets, i, j, TREE))
+    moved = answer_between(m, sc, offsets, i, j)
     for n in range(i):
-        between = answer_between(m, sc, offsets, i, n, PAIRED)
         before = load(sc.pair_coupling, coupling_at(m, offsets, n, j))
-        impulse = impulse - weight * (between * before)
-    store(sc.pair_coupling, coupling_at(m, offsets, i, j), impulse)
+        moved = moved + answer_between(m, sc, offsets, i, n) * before
+    store(sc.pair_coupling, coupling_at(m, offsets, i, j), neg(weight * moved))
 
 
-@stage
+@plain
 def answer_with_pairs(m: Model, sc: Scratch, offsets: Offsets, j: int, i: int):
     """What body ``i`` answers to pair ``j``, with the pairs before it.
 
     Reads: sc.answer_w, sc.answer_v, sc.pair_coupling.
     Writes: sc.answer_w, sc.answer_v.
     """
-    at = answer_body(m, offsets, j, TREE) + i
+    at = answer_body(m, offsets, j) + i
     w = load(sc.answer_w, at)
     v = load(sc.answer_v, at)
     for n in range(j):
-        before = answer_body(m, offsets, n, PAIRED) + i
+        before = answer_body(m, offsets, n) + i
         impulse = load(sc.pair_coupling, coupling_at(m, offsets, n, j))
         w = w + load(sc.answer_w, before) * impulse
         v = v + load(sc.answer_v, before) * impulse
-    store(sc.answer_w, answer_body(m, offsets, j, PAIRED) + i, w)
-    store(sc.answer_v, answer_body(m, offsets, j, PAIRED) + i, v)
+    store(sc.answer_w, at, w)
+    store(sc.answer_v, at, v)
 
 
-@stage
+@plain
 def dof_answer_with_pairs(m: Model, sc: Scratch, offsets: Offsets, j: int, k: int):
     """What dof ``k`` answers to pair ``j``, with the pairs before it.
 
     Reads: sc.answer_dv, sc.pair_coupling.
     Writes: sc.answer_dv.
     """
-    dv = load(sc.answer_dv, answer_dof(m, offsets, j, TREE) + k)
+    at = answer_dof(m, offsets, j) + k
+    dv = load(sc.answer_dv, at)
     for n in range(j):
-        before = load(sc.answer_dv, answer_dof(m, offsets, n, PAIRED) + k)
+        before = load(sc.answer_dv, answer_dof(m, offsets, n) + k)
         dv = dv + before * load(sc.pair_coupling, coupling_at(m, offsets, n, j))
-    store(sc.answer_dv, answer_dof(m, offsets, j, PAIRED) + k, dv)
+    store(sc.answer_dv, at, dv)
 
 
-@stage
+@plain
+def pair_motion(
+    m: Model,
+    sc: Scratch,
+    offsets: Offsets,
+    turn: wp.array[vec3],
+    move: wp.array[vec3],
+    first: int,
+    impulse: wp.array[vec3],
+    j: int,
+):
+    """Relative velocity at pair ``j``'s point, with the impulses of those before it.
+
+    Reads: m.contact_body, m.contact_partner, m.pair_lead, sc.point, move, turn,
+        impulse.
+
+    Args:
+        m: The model.
+        sc: The scratch.
+        offsets: Offsets of the solve.
+        turn: Angular velocities by the tree alone.
+        move: Velocities by the tree alone.
+        first: Where the bodies begin in both.
+        impulse: Impulses of the pairs before.
+        j: The pair.
+    """
+    lead = load(m.pair_lead, j)
+    a = first + load(m.contact_body, lead)
+    b = first + load(m.contact_body, load(m.contact_partner, lead))
+    r = load(sc.point, offsets.contact + lead)
+    moved = load(move, a) - load(move, b) + cross(load(turn, a) - load(turn, b), r)
+    for n in range(j):
+        before = load(impulse, offsets.pair + n)
+        moved = moved + answer_between(m, sc, offsets, j, n) * before
+    return moved
+
+
+@plain
 def solve_pair(m: Model, sc: Scratch, offsets: Offsets, j: int):
     """Impulse of pair ``j`` on its first body, and its weight in later pairs.
 
-    Reads: m.pair_lead, m.contact_body, m.contact_partner, sc.normal, sc.point,
-        sc.push, sc.weight_n, sc.weight_t, sc.change_w, sc.change_v, sc.answer_w,
-        sc.answer_v, sc.pair_impulse.
+    Reads: m.pair_lead, sc.push.
     Writes: sc.pair_weight, sc.pair_impulse.
     """
     lead = load(m.pair_lead, j)
     weight = point_weight(sc, offsets, lead)
-    own = answer_between(m, sc, offsets, j, j, PAIRED)
+    own = answer_between(m, sc, offsets, j, j)
     solved = inverse(add_diagonal(weight * own, uniform(scalar(1.0))))
-    store(sc.pair_weight, offsets.pair + j, solved * weight)
-    a = offsets.tree + load(m.contact_body, lead)
-    b = offsets.tree + load(m.contact_body, load(m.contact_partner, lead))
-    turned = load(sc.change_w, a) - load(sc.change_w, b)
-    moved = load(sc.change_v, a) - load(sc.change_v, b)
-    moved = moved - skew(load(sc.point, offsets.contact + lead)) * turned
+    moved = pair_motion(
+        m,
+        sc,
+        offsets,
+        sc.change_w,
+        sc.change_v,
+        offsets.solve_body,
+        sc.pair_impulse,
+        j,
+    )
     push = load(sc.push, offsets.solve_contact + lead)
-    impulse = solved * (push - weight * moved)
-    for n in range(j):
-        before = load(sc.pair_impulse, offsets.pair + n)
-        between = answer_between(m, sc, offsets, j, n, PAIRED)
-        impulse = impulse - solved * (weight * (between * before))
-    store(sc.pair_impulse, offsets.pair + j, impulse)
+    store(sc.pair_weight, offsets.pair + j, solved * weight)
+    store(sc.pair_impulse, offsets.pair + j, solved * (push - weight * moved))
 
 
-@stage
-def change_with_pairs(m: Model, sc: Scratch, offsets: Offsets, i: int):
-    """Change of body ``i``'s twist, with the impulses of all pairs.
+@plain
+def with_answers(
+    m: Model,
+    sc: Scratch,
+    offsets: Offsets,
+    impulse: wp.array[vec3],
+    i: int,
+    w: vec3,
+    v: vec3,
+):
+    """The change (w, v) of body ``i``'s twist, with what it answers to all pairs.
 
-    Reads: m.pairs, sc.change_w, sc.change_v, sc.answer_w, sc.answer_v,
-        sc.pair_impulse.
-    Writes: sc.change_w, sc.change_v.
+    Reads: m.pairs, sc.answer_w, sc.answer_v, impulse.
     """
-    w = load(sc.change_w, offsets.tree + i)
-    v = load(sc.change_v, offsets.tree + i)
     for j in range(m.pairs):
-        at = answer_body(m, offsets, j, PAIRED) + i
-        impulse = load(sc.pair_impulse, offsets.pair + j)
-        w = w + load(sc.answer_w, at) * impulse
-        v = v + load(sc.answer_v, at) * impulse
-    store(sc.change_w, offsets.change + i, w)
-    store(sc.change_v, offsets.change + i, v)
+        at = answer_body(m, offsets, j) + i
+        acting = load(impulse, offsets.pair + j)
+        w = w + load(sc.answer_w, at) * acting
+        v = v + load(sc.answer_v, at) * acting
+    return w, v
 
 
-@stage
-def dof_change_with_pairs(m: Model, sc: Scratch, offsets: Offsets, k: int):
-    """Change of the velocity of dof ``k``, with the impulses of all pairs.
+@plain
+def answered(m: Model, sc: Scratch, offsets: Offsets, impulse: wp.array[vec3], k: int):
+    """What dof ``k`` answers to the impulses of all pairs.
 
-    Reads: m.pairs, sc.dv, sc.answer_dv, sc.pair_impulse.
-    Writes: sc.dv.
+    Reads: m.pairs, sc.answer_dv, impulse.
     """
-    dv = load(sc.dv, offsets.tree_dof + k)
+    dv = real()
     for j in range(m.pairs):
-        answer = load(sc.answer_dv, answer_dof(m, offsets, j, PAIRED) + k)
-        dv = dv + dot(answer, load(sc.pair_impulse, offsets.pair + j))
-    store(sc.dv, offsets.change_dof + k, dv)
+        at = answer_dof(m, offsets, j) + k
+        dv = dv + dot(load(sc.answer_dv, at), load(impulse, offsets.pair + j))
+    return dv
 
 
-@stage
-def answer(m: Model, sc: Scratch, offsets: Offsets, j: int, lane: int, lanes: int):
-    """The tree's answer to pair ``j``'s unit impulses: to the root, and back.
-
-    Reads: m.joint_kind, m.body_levels, m.body_level_start, m.body_level.
-    """
-    if lane == 0:
-        rest_answer(m, sc, offsets, j)
-    for n in range(m.body_levels):
-        level = m.body_levels - 1 - n
-        start = load(m.body_level_start, level)
-        for p in range(start + lane, load(m.body_level_start, level + 1), lanes):
-            i = load(m.body_level, p)
-            gather_unit(m, sc, offsets, j, i)
-            if load(m.joint_kind, i) != JointKind.FREE:
-                unit_effort(m, sc, offsets, j, i)
-        sync(lane)
-    for level in range(m.body_levels):
-        start = load(m.body_level_start, level)
-        for p in range(start + lane, load(m.body_level_start, level + 1), lanes):
-            i = load(m.body_level, p)
-            if load(m.joint_kind, i) == JointKind.FREE:
-                answer_free(m, sc, offsets, j, i)
-            else:
-                answer_axis(m, sc, offsets, j, i)
-        sync(lane)
-
-
-@wp.func
-def pairs_touch(m: Model, sc: Scratch, offsets: Offsets) -> int:
-    """Whether a pair acts on some world of the pack: their number, 0 if none does.
+@plain
+def pairs_touch(m: Model, sc: Scratch, offsets: Offsets):
+    """Number of the pairs, 0 where none acts on any world of the pack.
 
     Reads: m.pairs, m.pair_lead, sc.load, sc.push_n, sc.weight_n, sc.weight_t.
     """
     count = int(0)
-    for j in range(m.pairs):
-        at = offsets.solve_contact + load(m.pair_lead, j)
-        count = count + occurs(load(sc.load, at))
-        count = count + occurs(load(sc.push_n, at))
-        count = count + occurs(load(sc.weight_n, at))
-        count = count + occurs(load(sc.weight_t, at))
+    if SKIPS:
+        for j in range(m.pairs):
+            at = offsets.solve_contact + load(m.pair_lead, j)
+            acts = (
+                occurs(load(sc.load, at))
+                + occurs(load(sc.push_n, at))
+                + occurs(load(sc.weight_n, at))
+                + occurs(load(sc.weight_t, at))
+            )
+            if acts > 0:
+                count = m.pairs
+    else:
+        count = m.pairs
     return count
 
 
-@stage
-def change_of_tree(sc: Scratch, offsets: Offsets, i: int):
-    """Change of body ``i``'s twist, where no pair acts.
-
-    Reads: sc.change_w, sc.change_v.
-    Writes: sc.change_w, sc.change_v.
-    """
-    store(sc.change_w, offsets.change + i, load(sc.change_w, offsets.tree + i))
-    store(sc.change_v, offsets.change + i, load(sc.change_v, offsets.tree + i))
-
-
-@stage
-def dof_change_of_tree(sc: Scratch, offsets: Offsets, k: int):
-    """Change of the velocity of dof ``k``, where no pair acts.
-
-    Reads: sc.dv.
-    Writes: sc.dv.
-    """
-    store(sc.dv, offsets.change_dof + k, load(sc.dv, offsets.tree_dof + k))
-
-
-@stage
-def skip_pairs(m: Model, sc: Scratch, offsets: Offsets, lane: int, lanes: int):
-    """The tree's changes of velocity are the final ones.
-
-    Reads: m.nb, m.nv.
-    """
-    for i in range(lane, m.nb + 1, lanes):
-        change_of_tree(sc, offsets, i)
-    for k in range(lane, m.nv, lanes):
-        dof_change_of_tree(sc, offsets, k)
-    sync(lane)
-
-
-@stage
+@plain
 def couple_pairs(m: Model, sc: Scratch, offsets: Offsets, lane: int, lanes: int):
     """Add the pairs to the tree's changes of velocity.
 
-    Reads: m.pairs, m.nb, m.nv.
+    Reads: m.nb, m.nv, m.pairs, sc.change_w, sc.change_v, sc.dv.
+    Writes: sc.change_w, sc.change_v, sc.dv.
     """
     for j in range(m.pairs):
         answer(m, sc, offsets, j, lane, lanes)
@@ -414,8 +243,15 @@ def couple_pairs(m: Model, sc: Scratch, offsets: Offsets, lane: int, lanes: int)
         if lane == 0:
             solve_pair(m, sc, offsets, j)
         sync(lane)
-    for i in range(lane, m.nb + 1, lanes):
-        change_with_pairs(m, sc, offsets, i)
+    for i in range(1 + lane, m.nb + 1, lanes):
+        at = offsets.solve_body + i
+        w = load(sc.change_w, at)
+        v = load(sc.change_v, at)
+        w, v = with_answers(m, sc, offsets, sc.pair_impulse, i, w, v)
+        store(sc.change_w, at, w)
+        store(sc.change_v, at, v)
     for k in range(lane, m.nv, lanes):
-        dof_change_with_pairs(m, sc, offsets, k)
+        at = offsets.solve_dof + k
+        answers = answered(m, sc, offsets, sc.pair_impulse, k)
+        store(sc.dv, at, load(sc.dv, at) + answers)
     sync(lane)

@@ -6,8 +6,9 @@ from .cpp.algebra import (
     cross,
     dot,
     matrix,
-    outer,
+    parallel,
     rotation,
+    symmetric,
     transform_point,
     transpose,
 )
@@ -33,7 +34,8 @@ def rigid_inertia(m: Model, sc: Scratch, offsets: Offsets, i: int):
     if load(m.isotropic, i) == 0:
         r = matrix(rotation(x))
         spin = r * body_inertia(m, sc, offsets, i) * transpose(r)
-    store(sc.inertia, offsets.body + i, add_diagonal(spin - outer(hm, c), dot(hm, c)))
+    about = add_diagonal(symmetric(spin) - parallel(hm, c), dot(hm, c))
+    store(sc.inertia, offsets.body + i, about)
     store(sc.moment, offsets.body + i, hm)
 
 

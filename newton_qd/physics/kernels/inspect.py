@@ -8,7 +8,7 @@ import warp as wp
 
 from newton_qd.physics.kinds import JointKind
 
-from . import mat33, real, scalar, sync, vec3
+from . import real, scalar, sym33, sync, vec3
 from .cpp.algebra import add_diagonal, cross, dot, skew, translation, vector
 from .cpp.memory import constant, load, read_input, store, write_output
 from .cpp.numbers import uniform
@@ -108,28 +108,28 @@ def composite(m: Model, sc: Scratch, offsets: Offsets, i: int):
     """Rigid inertia and bias wrench of body ``i`` and its descendants.
 
     Reads: m.mass, m.child_start, m.child, sc.inertia, sc.moment, sc.wrench_w,
-        sc.wrench_v, sc.total_ww, sc.total_wv, sc.total_vv, sc.total_w, sc.total_v.
-    Writes: sc.total_ww, sc.total_wv, sc.total_vv, sc.total_w, sc.total_v.
+        sc.wrench_v, sc.passed_ww, sc.passed_wv, sc.passed_vv, sc.passed_w, sc.passed_v.
+    Writes: sc.passed_ww, sc.passed_wv, sc.passed_vv, sc.passed_w, sc.passed_v.
     """
-    at = offsets.solve_body + i
+    at = offsets.reading + i
     body = offsets.body + i
     ww = load(sc.inertia, body)
     wv = skew(load(sc.moment, body))
-    vv = add_diagonal(mat33(), constant(m.mass, i))
+    vv = add_diagonal(sym33(), constant(m.mass, i))
     n = load(sc.wrench_w, offsets.motion + i)
     f = load(sc.wrench_v, offsets.motion + i)
     for j in range(load(m.child_start, i), load(m.child_start, i + 1)):
-        child = offsets.solve_body + load(m.child, j)
-        ww = ww + load(sc.total_ww, child)
-        wv = wv + load(sc.total_wv, child)
-        vv = vv + load(sc.total_vv, child)
-        n = n + load(sc.total_w, child)
-        f = f + load(sc.total_v, child)
-    store(sc.total_ww, at, ww)
-    store(sc.total_wv, at, wv)
-    store(sc.total_vv, at, vv)
-    store(sc.total_w, at, n)
-    store(sc.total_v, at, f)
+        child = offsets.reading + load(m.child, j)
+        ww = ww + load(sc.passed_ww, child)
+        wv = wv + load(sc.passed_wv, child)
+        vv = vv + load(sc.passed_vv, child)
+        n = n + load(sc.passed_w, child)
+        f = f + load(sc.passed_v, child)
+    store(sc.passed_ww, at, ww)
+    store(sc.passed_wv, at, wv)
+    store(sc.passed_vv, at, vv)
+    store(sc.passed_w, at, n)
+    store(sc.passed_v, at, f)
 
 
 @wp.func
@@ -176,21 +176,21 @@ def store_body(
     """Rows of joint ``i``: M_kj = S_j . I_c S_k (Featherstone 2008, table 6.2).
 
     Reads: m.nv, m.body_parent, m.v_start, m.armature, m.dynamics, sc.pose,
-        sc.axis_w, sc.axis_v, sc.total_ww, sc.total_wv, sc.total_vv, sc.total_w,
-        sc.total_v.
+        sc.axis_w, sc.axis_v, sc.passed_ww, sc.passed_wv, sc.passed_vv, sc.passed_w,
+        sc.passed_v.
     Writes: y.
     """
     size = m.dynamics.size
     matrix = pack.first * size + m.dynamics.mass_matrix
     forces = pack.first * size + m.dynamics.bias
-    at = offsets.solve_body + i
-    ww = load(sc.total_ww, at)
-    wv = load(sc.total_wv, at)
-    vv = load(sc.total_vv, at)
+    at = offsets.reading + i
+    ww = load(sc.passed_ww, at)
+    wv = load(sc.passed_wv, at)
+    vv = load(sc.passed_vv, at)
     for a in range(dof_count(m, i)):
         k = load(m.v_start, i) + a
         sw, sv = dof_axis(m, sc, offsets, i, a)
-        bias = dot(sw, load(sc.total_w, at)) + dot(sv, load(sc.total_v, at))
+        bias = dot(sw, load(sc.passed_w, at)) + dot(sv, load(sc.passed_v, at))
         write_output(y, forces + k, size, pack.count, bias)
         angular = ww * sw + wv * sv
         linear = sw * wv + vv * sv
@@ -214,9 +214,9 @@ def store_dynamics(
     """Write the mass matrix and the bias forces of a pack.
 
     Reads: m.nb, m.nv, m.dynamics, sc.pose, sc.inertia, sc.moment, sc.wrench_w,
-        sc.wrench_v, sc.axis_w, sc.axis_v, sc.total_ww, sc.total_wv, sc.total_vv,
-        sc.total_w, sc.total_v.
-    Writes: sc.total_ww, sc.total_wv, sc.total_vv, sc.total_w, sc.total_v, y.
+        sc.wrench_v, sc.axis_w, sc.axis_v, sc.passed_ww, sc.passed_wv, sc.passed_vv,
+        sc.passed_w, sc.passed_v.
+    Writes: sc.passed_ww, sc.passed_wv, sc.passed_vv, sc.passed_w, sc.passed_v, y.
     """
     for i in range(1, m.nb + 1):
         rigid_inertia(m, sc, offsets, i)

@@ -17,7 +17,7 @@ def mean_velocity(sc: Scratch, offsets: Offsets, ahead: Offsets, k: int):
     Reads: sc.v, sc.dv.
     Writes: sc.v.
     """
-    change = scalar(0.5) * load(sc.dv, offsets.change_dof + k)
+    change = scalar(0.5) * load(sc.dv, offsets.solve_dof + k)
     store(sc.v, ahead.v_body + k, load(sc.v, offsets.v + k) + change)
 
 
@@ -31,7 +31,7 @@ def new_velocity(sc: Scratch, offsets: Offsets, k: int):
     store(
         sc.v,
         offsets.v_next + k,
-        load(sc.v, offsets.v + k) + load(sc.dv, offsets.change_dof + k),
+        load(sc.v, offsets.v + k) + load(sc.dv, offsets.solve_dof + k),
     )
 
 

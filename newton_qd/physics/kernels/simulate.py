@@ -5,21 +5,12 @@ import warp as wp
 from newton_qd.physics.kinds import JointKind
 
 from . import scalar, stage, sync
-from .articulation import (
-    change_axis,
-    change_free,
-    eliminate_axis,
-    gather_children,
-    rest_world,
-)
 from .contact import (
     contact_corrector,
     contact_given,
     contact_impulse,
     contact_predictor,
-    contact_slip,
 )
-from .coupling import PAIRS, SKIPS, couple_pairs, pairs_touch, skip_pairs
 from .cpp.memory import load
 from .inertia import bias_wrench, rigid_inertia
 from .integration import mean_velocity, new_coordinates, new_velocity
@@ -32,6 +23,7 @@ from .kinematics import (
     world_motion,
 )
 from .readings import body_impulse, body_reading, foot_contact, torso_position
+from .solve import linear_solve
 from .structs import Model, Offsets, Scratch, offsets_after, offsets_at
 from .world import Pack, detect_fault, freeze_faulty
 
@@ -77,46 +69,6 @@ def motions(m: Model, sc: Scratch, offsets: Offsets, lane: int, lanes: int):
             else:
                 axis_motion(m, sc, offsets, i)
         sync(lane)
-
-
-@stage
-def linear_solve(m: Model, sc: Scratch, offsets: Offsets, lane: int, lanes: int):
-    """Eliminate joints, leaves to root; velocity changes, root to leaves.
-
-    Reads: m.nc, m.joint_kind, m.body_levels, m.body_level_start, m.body_level,
-        sc.load, sc.push_n, sc.weight_n, sc.weight_t.
-    """
-    if lane == 0:
-        rest_world(sc, offsets)
-    for n in range(m.body_levels):
-        level = m.body_levels - 1 - n
-        start = load(m.body_level_start, level)
-        for p in range(start + lane, load(m.body_level_start, level + 1), lanes):
-            i = load(m.body_level, p)
-            gather_children(m, sc, offsets, i)
-            if load(m.joint_kind, i) != JointKind.FREE:
-                eliminate_axis(m, sc, offsets, i)
-        sync(lane)
-    for level in range(m.body_levels):
-        start = load(m.body_level_start, level)
-        for p in range(start + lane, load(m.body_level_start, level + 1), lanes):
-            i = load(m.body_level, p)
-            if load(m.joint_kind, i) == JointKind.FREE:
-                change_free(m, sc, offsets, i)
-            else:
-                change_axis(m, sc, offsets, i)
-        sync(lane)
-    if PAIRS:
-        touching = int(1)
-        if SKIPS:
-            touching = pairs_touch(m, sc, offsets)
-        if touching > 0:
-            couple_pairs(m, sc, offsets, lane, lanes)
-        else:
-            skip_pairs(m, sc, offsets, lane, lanes)
-    for c in range(lane, m.nc, lanes):
-        contact_slip(m, sc, offsets, c)
-    sync(lane)
 
 
 @stage

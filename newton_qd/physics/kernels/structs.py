@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from . import mat33, real, scalar, transform, vec3
+from . import mat33, real, scalar, sym33, transform, vec3
 from .cpp.memory import TABLES
 from .rows import Bodies, Coordinates, Dynamics, Inputs, Outputs, Parameters
 
@@ -23,9 +23,6 @@ class Model:
     nu: int
     nc: int
     pairs: int
-    changes: (
-        int  # sets of changes in a solve: the tree's and, with pairs, the final ones
-    )
     substeps: int
     total_mass: scalar  # [kg]
     iterations: int  # times that a substep finds the velocities of its bodies
@@ -128,7 +125,7 @@ class Scratch:
     twist_v: wp.array[vec3]
     bias_w: wp.array[vec3]
     bias_v: wp.array[vec3]
-    inertia: wp.array[mat33]
+    inertia: wp.array[sym33]
     moment: wp.array[vec3]
     wrench_w: wp.array[vec3]
     wrench_v: wp.array[vec3]
@@ -162,34 +159,39 @@ class Scratch:
     weight_n: wp.array[real]
     weight_t: wp.array[real]
     slip: wp.array[vec3]
-    # bodies, per solve: inertia and wrench with contacts and descendants, what of
-    # them a joint passes on to the parent, and the change of twist
-    total_ww: wp.array[mat33]
-    total_wv: wp.array[mat33]
-    total_vv: wp.array[mat33]
-    total_w: wp.array[vec3]
-    total_v: wp.array[vec3]
-    passed_ww: wp.array[mat33]
-    passed_wv: wp.array[mat33]
-    passed_vv: wp.array[mat33]
-    passed_w: wp.array[vec3]
-    passed_v: wp.array[vec3]
-    lever_w: wp.array[vec3]
-    lever_v: wp.array[vec3]
-    effort: wp.array[real]
-    share: wp.array[real]
+    # joints, per solve: impulse at the old velocity, and what resists the change
+    joint_push: wp.array[real]
+    joint_weight: wp.array[real]
+    # what a solve finds: the change of twist of each body, and of each velocity
     change_w: wp.array[vec3]
     change_v: wp.array[vec3]
-    # degrees of freedom, per solve
     dv: wp.array[real]
-    # pairs, per solve, in three blocks: a unit impulse along each axis on its way to
-    # the root, what the tree answers, and what it answers with the pairs before
+    # without adjoints, per solve: the factors of the joints and of a free root, and
+    # what bodies and degrees of freedom answer to a unit impulse of a pair along each
+    # axis, with the pairs before it
+    lever_w: wp.array[vec3]
+    lever_v: wp.array[vec3]
+    share: wp.array[real]
+    root_ww: wp.array[sym33]
+    root_wv: wp.array[mat33]
+    root_vv: wp.array[sym33]
     answer_w: wp.array[mat33]
     answer_v: wp.array[mat33]
     answer_dv: wp.array[vec3]
     pair_weight: wp.array[mat33]  # impulse per velocity, for each pair
     pair_coupling: wp.array[mat33]  # for each pair and each pair before it
     pair_impulse: wp.array[vec3]
+    pair_adjoint: wp.array[vec3]
+    # without adjoints, per slot: what a joint passes on to the parent, the effort that
+    # it takes, and multipliers, the changes of twist in the adjoint of a solve
+    passed_ww: wp.array[sym33]
+    passed_wv: wp.array[mat33]
+    passed_vv: wp.array[sym33]
+    passed_w: wp.array[vec3]
+    passed_v: wp.array[vec3]
+    effort: wp.array[real]
+    multiplier_w: wp.array[vec3]
+    multiplier_v: wp.array[vec3]
 
 
 @wp.struct
@@ -211,12 +213,10 @@ class Offsets:
     before: int  # contacts of the solve before
     before_dof: int  # degrees of freedom of the solve before
     corrects: int  # above 0: limits take the velocity of the solve before
+    solve: int
     solve_body: int
-    tree: int  # bodies in this solve: change by the tree alone
-    tree_dof: int
+    solve_dof: int
     solve_contact: int
-    change: int  # bodies in this solve: change with the pairs
-    change_dof: int
     pair: int
     reading: int  # bodies of the slot
 
@@ -228,8 +228,8 @@ def offsets_at(m: Model, slot: int, keep: int, s: int, p: int):
     ``keep`` is 1 where every substep has entries of its own, as the adjoint needs, and
     0 where a slot's substeps share them.
 
-    Reads: m.nb, m.nq, m.nv, m.nu, m.nc, m.pairs, m.changes, m.substeps,
-        m.iterations, m.solves, m.parameters, m.given.
+    Reads: m.nb, m.nq, m.nv, m.nu, m.nc, m.pairs, m.substeps, m.iterations,
+        m.solves, m.parameters, m.given.
     """
     step = slot
     turn = slot
@@ -264,14 +264,11 @@ def offsets_at(m: Model, slot: int, keep: int, s: int, p: int):
         r.contact = (slot * m.substeps + s) * m.nc
     r.report = (slot * m.substeps + s) * m.nc
     r.before = before * m.nc
-    r.before_dof = ((before + 1) * m.changes - 1) * m.nv
+    r.before_dof = before * m.nv
     r.corrects = wp.min(p, m.given - 1)
+    r.solve = solve
     r.solve_body = solve * (m.nb + 1)
-    # the tree's own changes come first, those with the pairs last
-    r.tree = solve * m.changes * (m.nb + 1)
-    r.tree_dof = solve * m.changes * m.nv
-    r.change = r.tree + (m.changes - 1) * (m.nb + 1)
-    r.change_dof = r.tree_dof + (m.changes - 1) * m.nv
+    r.solve_dof = solve * m.nv
     r.solve_contact = solve * m.nc
     r.pair = solve * m.pairs
     r.reading = slot * (m.nb + 1)

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from .. import mat33, quat, real, transform, vec3
+from .. import mat33, quat, real, sym33, transform, vec3
 from .native import EACH, native
 from .numbers import ROOT
 
@@ -143,6 +143,121 @@ auto inverse = [](const Mat33& m) {
 )
 def inverse(a: mat33) -> mat33:
     """Inverse of a regular matrix."""
+    ...
+
+
+# Symmetric 3 x 3 matrices: six numbers. The adjoint of one that is there twice is that
+# of both.
+
+
+@wp.func_native(
+    *native(
+        "part(A)",
+        """
+adj_A.data[0][0] += adj_RET.xx;
+adj_A.data[0][1] += adj_RET.xy;
+adj_A.data[0][2] += adj_RET.xz;
+adj_A.data[1][1] += adj_RET.yy;
+adj_A.data[1][2] += adj_RET.yz;
+adj_A.data[2][2] += adj_RET.zz;
+""",
+        """
+auto part = [](const Mat33& m) {
+    return Sym33{m.data[0][0], m.data[0][1], m.data[0][2],
+                 m.data[1][1], m.data[1][2], m.data[2][2]};
+};
+""",
+    )
+)
+def symmetric(a: mat33) -> sym33:
+    """Six numbers of a matrix that is symmetric up to rounding."""
+    ...
+
+
+_PARALLEL = """
+auto parallel = [](const Vec3& x, const Vec3& y) {
+    return Sym33{x[0] * y[0], x[0] * y[1], x[0] * y[2],
+                 x[1] * y[1], x[1] * y[2], x[2] * y[2]};
+};
+"""
+
+
+@wp.func_native(
+    *native(
+        "parallel(A, B)",
+        """
+adj_A[0] += adj_RET.xx * B[0] + adj_RET.xy * B[1] + adj_RET.xz * B[2];
+adj_A[1] += adj_RET.yy * B[1] + adj_RET.yz * B[2];
+adj_A[2] += adj_RET.zz * B[2];
+adj_B[0] += adj_RET.xx * A[0];
+adj_B[1] += adj_RET.xy * A[0] + adj_RET.yy * A[1];
+adj_B[2] += adj_RET.xz * A[0] + adj_RET.yz * A[1] + adj_RET.zz * A[2];
+""",
+        _PARALLEL,
+    )
+)
+def parallel(a: vec3, b: vec3) -> sym33:
+    """Product of a column and a row vector that are parallel."""
+    ...
+
+
+@wp.func_native(
+    *native(
+        "Sym33{x.xx, x.xy + y.xy, x.xz + y.xz, x.yy, x.yz + y.yz, x.zz}",
+        before=_PARALLEL + "Sym33 x = parallel(A, B), y = parallel(B, A);",
+    )
+)
+def form_slope(a: vec3, b: vec3) -> sym33:
+    """Derivative of a . S b with respect to a symmetric S; without adjoint."""
+    ...
+
+
+@wp.func_native(
+    *native(
+        "sum(A, B)",
+        """
+adj_A.xx += adj_RET.xx;
+adj_A.xy += adj_RET.xy;
+adj_A.xz += adj_RET.xz;
+adj_A.yy += adj_RET.yy;
+adj_A.yz += adj_RET.yz;
+adj_A.zz += adj_RET.zz;
+adj_B += adj_RET.xx + adj_RET.yy + adj_RET.zz;
+""",
+        """
+auto sum = [](Sym33 x, Real y) {
+    x.xx += y;
+    x.yy += y;
+    x.zz += y;
+    return x;
+};
+""",
+    )
+)
+def add_diagonal(a: sym33, b: real) -> sym33:
+    """``a`` plus ``b`` times the identity."""
+    ...
+
+
+@wp.func_native(
+    *native(
+        "inverse(A)",
+        before="""
+auto inverse = [](const Sym33& m) {
+    Real xx = m.yy * m.zz - m.yz * m.yz;
+    Real xy = m.xz * m.yz - m.xy * m.zz;
+    Real xz = m.xy * m.yz - m.xz * m.yy;
+    Real scale = Real(1) / (m.xx * xx + m.xy * xy + m.xz * xz);
+    return Sym33{scale * xx, scale * xy, scale * xz,
+                 scale * (m.xx * m.zz - m.xz * m.xz),
+                 scale * (m.xy * m.xz - m.xx * m.yz),
+                 scale * (m.xx * m.yy - m.xy * m.xy)};
+};
+""",
+    )
+)
+def inverse(a: sym33) -> sym33:
+    """Inverse of a regular symmetric matrix; without adjoint."""
     ...
 
 

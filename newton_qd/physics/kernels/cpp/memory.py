@@ -4,11 +4,12 @@ Warp's own indexing multiplies by strides that it reads from memory, three times
 a three-dimensional array; the step would spend most of its time there. These compile
 to one address. As with Warp's, a load adds to the element's adjoint, and a store
 hands it over and clears it; a store is not repeated when a function is replayed.
+An adjoint by hand reads and writes the adjoints of elements themselves.
 """
 
 import warp as wp
 
-from .. import mat33, real, scalar, transform, vec3, width
+from .. import mat33, real, scalar, sym33, transform, vec3, width
 from .native import CPP, PRELUDE
 
 _LOAD = PRELUDE + "return Convert::out(Convert::in(a.data[i]));"
@@ -32,7 +33,7 @@ def load(a: wp.array[int], i: int) -> int:
     ...
 
 
-for _type in (real, vec3, transform, mat33):
+for _type in (real, vec3, transform, mat33, sym33):
 
     @wp.func_native(snippet=_LOAD, adj_snippet=_ADJ_LOAD)
     def load(a: wp.array[_type], i: int) -> _type:
@@ -42,6 +43,33 @@ for _type in (real, vec3, transform, mat33):
     @wp.func_native(snippet=_STORE, adj_snippet=_ADJ_STORE, replay_snippet="")
     def store(a: wp.array[_type], i: int, value: _type):
         """Write element ``i`` of ``a``."""
+        ...
+
+    @wp.func_native(
+        snippet=PRELUDE + "return Convert::out(Convert::in(a.grad[i]));",
+        adj_snippet="",
+    )
+    def load_adjoint(a: wp.array[_type], i: int) -> _type:
+        """Adjoint of element ``i`` of ``a``."""
+        ...
+
+    @wp.func_native(
+        snippet=PRELUDE + "Convert::out(Convert::in(value), a.grad[i]);",
+        adj_snippet="",
+        replay_snippet="",
+    )
+    def store_adjoint(a: wp.array[_type], i: int, value: _type):
+        """Write the adjoint of element ``i`` of ``a``."""
+        ...
+
+    # without atomics: one lane owns the entry
+    @wp.func_native(
+        snippet=PRELUDE + "Convert::more(Convert::in(value), a.grad[i]);",
+        adj_snippet="",
+        replay_snippet="",
+    )
+    def add_adjoint(a: wp.array[_type], i: int, value: _type):
+        """Add to the adjoint of element ``i`` of ``a``."""
         ...
 
 

@@ -1,17 +1,17 @@
 """Native functions on packs, written once in the terms of Warp's own C++ templates.
 
 In the C++ text an argument ``a`` is ``A``, of type ``Real``, ``Vec3``, ``Quat``,
-``Transform`` or ``Mat33``; the result is ``RET``; their adjoints are ``adj_A`` and
-``adj_RET``. On a CPU ``Real`` is a vector of Clang's, on a GPU a number, and the others
-are Warp's ``vec_t<3, Real>`` and so on: Warp's functions and their adjoints compute
-all worlds of a pack at once.
+``Transform``, ``Mat33`` or ``Sym33``; the result is ``RET``; their adjoints are
+``adj_A`` and ``adj_RET``. On a CPU ``Real`` is a vector of Clang's, on a GPU a number,
+and all others but ``Sym33`` are Warp's ``vec_t<3, Real>`` and so on: Warp's functions
+and their adjoints compute all worlds of a pack at once.
 """
 
 import re
 
 import warp as wp
 
-from .. import mat33, quat, real, scalar, transform, vec3, width
+from .. import mat33, quat, real, scalar, sym33, transform, vec3, width
 
 _NUMBER = {wp.float32: "float", wp.float64: "double"}[scalar]
 _ARGUMENT = re.compile(r"\b(?:adj_)?([A-Z]+)\b")
@@ -31,6 +31,7 @@ typedef wp::vec_t<3, Real> Vec3;
 typedef wp::quat_t<Real> Quat;
 typedef wp::transform_t<Real> Transform;
 typedef wp::mat_t<3, 3, Real> Mat33;
+struct Sym33 {{ Real xx, xy, xz, yy, yz, zz; }};
 """
 # Warp type: its name in the C++ text, its C++ type, its elements
 CPP = {real: ("Real", f"wp::vec_t<{width}, {_NUMBER}>", 1)} | {
@@ -40,6 +41,7 @@ CPP = {real: ("Real", f"wp::vec_t<{width}, {_NUMBER}>", 1)} | {
         (quat, "Quat", 4),
         (transform, "Transform", 7),
         (mat33, "Mat33", 9),
+        (sym33, "Sym33", 6),
     )
 }
 

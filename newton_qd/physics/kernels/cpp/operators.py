@@ -6,10 +6,10 @@ that imports them, and its own where none of these fits.
 
 import warp as wp
 
-from .. import mat33, quat, real, scalar, transform, vec3
+from .. import mat33, quat, real, scalar, sym33, transform, vec3
 from .native import EACH, native
 
-for _type in (real, vec3, mat33):
+for _type in (real, vec3, mat33, sym33):
 
     @wp.func_native(
         *native(
@@ -58,7 +58,7 @@ for _type in (real, vec3, mat33):
         ...
 
 
-for _type in (vec3, mat33):
+for _type in (vec3, mat33, sym33):
 
     @wp.func_native(
         *native(
@@ -124,6 +124,45 @@ def mul(a: mat33, b: mat33) -> mat33:
 @wp.func_native(*native("wp::mul(A, B)", "wp::adj_mul(A, B, adj_A, adj_B, adj_RET);"))
 def mul(a: vec3, b: mat33) -> vec3:
     """Product of a row vector and a matrix: of its transpose and the vector."""
+    ...
+
+
+_SYMMETRIC = """
+auto full = [](const Sym33& s) {
+    return Mat33(s.xx, s.xy, s.xz, s.xy, s.yy, s.yz, s.xz, s.yz, s.zz);
+};
+"""
+
+
+@wp.func_native(
+    *native(
+        "wp::mul(full(A), B)",
+        """
+adj_B = wp::add(adj_B, wp::mul(full(A), adj_RET));
+adj_A.xx += adj_RET[0] * B[0];
+adj_A.yy += adj_RET[1] * B[1];
+adj_A.zz += adj_RET[2] * B[2];
+adj_A.xy += adj_RET[0] * B[1] + adj_RET[1] * B[0];
+adj_A.xz += adj_RET[0] * B[2] + adj_RET[2] * B[0];
+adj_A.yz += adj_RET[1] * B[2] + adj_RET[2] * B[1];
+""",
+        _SYMMETRIC,
+    )
+)
+def mul(a: sym33, b: vec3) -> vec3:
+    """Product of a symmetric matrix and a vector."""
+    ...
+
+
+@wp.func_native(*native("wp::mul(full(A), B)", before=_SYMMETRIC))
+def mul(a: sym33, b: mat33) -> mat33:
+    """Product of a symmetric matrix and a matrix; without adjoint."""
+    ...
+
+
+@wp.func_native(*native("wp::mul(A, full(B))", before=_SYMMETRIC))
+def mul(a: mat33, b: sym33) -> mat33:
+    """Product of a matrix and a symmetric one; without adjoint."""
     ...
 
 

@@ -1,0 +1,149 @@
+"""The multipliers of a linear solve's adjoint: :mod:`.solve` has the derivation.
+
+They are the changes that the adjoints of changes would cause, were they impulses.
+"""
+
+from newton_qd.physics.kinds import JointKind
+
+from . import plain, sync, vec3
+from .coupling import answered, pair_motion, with_answers
+from .cpp.algebra import cross, dot, translation, vector
+from .cpp.memory import load, load_adjoint, store
+from .cpp.operators import add, mul, neg, sub  # noqa: F401
+from .structs import Model, Offsets, Scratch
+
+
+@plain
+def adjoint_wrench(m: Model, sc: Scratch, offsets: Offsets, i: int):
+    """Adjoint of body ``i``'s change of twist, with what its children hand on.
+
+    Reads: m.child_start, m.child, sc.passed_w, sc.passed_v, g.change_w, g.change_v.
+    """
+    n = load_adjoint(sc.change_w, offsets.solve_body + i)
+    f = load_adjoint(sc.change_v, offsets.solve_body + i)
+    for j in range(load(m.child_start, i), load(m.child_start, i + 1)):
+        child = offsets.reading + load(m.child, j)
+        n = n + load(sc.passed_w, child)
+        f = f + load(sc.passed_v, child)
+    return n, f
+
+
+@plain
+def hand_back_axis(m: Model, sc: Scratch, offsets: Offsets, i: int):
+    """The adjoint's effort of a joint with one dof, and what the joint passes on.
+
+    Reads: m.v_start, sc.axis_w, sc.axis_v, sc.lever_w, sc.lever_v, sc.share, g.dv.
+    Writes: sc.passed_w, sc.passed_v, sc.effort.
+    """
+    n, f = adjoint_wrench(m, sc, offsets, i)
+    at = offsets.solve_body + i
+    here = offsets.reading + i
+    k = load(m.v_start, i)
+    effort = (
+        load_adjoint(sc.dv, offsets.solve_dof + k)
+        + dot(load(sc.axis_w, offsets.dof + k), n)
+        + dot(load(sc.axis_v, offsets.dof + k), f)
+    )
+    store(sc.effort, here, load(sc.share, at) * effort)
+    store(sc.passed_w, here, n - effort * load(sc.lever_w, at))
+    store(sc.passed_v, here, f - effort * load(sc.lever_v, at))
+
+
+@plain
+def multiplier_free(m: Model, sc: Scratch, offsets: Offsets, i: int):
+    """Multipliers of a free root.
+
+    Reads: m.v_start, sc.pose, sc.root_ww, sc.root_wv, sc.root_vv, g.dv.
+    Writes: sc.multiplier_w, sc.multiplier_v.
+    """
+    n, f = adjoint_wrench(m, sc, offsets, i)
+    k = offsets.solve_dof + load(m.v_start, i)
+    p = translation(load(sc.pose, offsets.body + i))
+    origin = vector(
+        load_adjoint(sc.dv, k),
+        load_adjoint(sc.dv, k + 1),
+        load_adjoint(sc.dv, k + 2),
+    )
+    turn = vector(
+        load_adjoint(sc.dv, k + 3),
+        load_adjoint(sc.dv, k + 4),
+        load_adjoint(sc.dv, k + 5),
+    )
+    n = n + turn + cross(p, origin)
+    f = f + origin
+    reduced = load(sc.root_wv, offsets.solve)
+    w = load(sc.root_ww, offsets.solve) * (n - reduced * f)
+    v = load(sc.root_vv, offsets.solve) * f - w * reduced
+    store(sc.multiplier_w, offsets.reading + i, w)
+    store(sc.multiplier_v, offsets.reading + i, v)
+
+
+@plain
+def rest_multiplier(sc: Scratch, offsets: Offsets):
+    """The world does not move.
+
+    Writes: sc.multiplier_w, sc.multiplier_v.
+    """
+    store(sc.multiplier_w, offsets.reading, vec3())
+    store(sc.multiplier_v, offsets.reading, vec3())
+
+
+@plain
+def multiplier_axis(m: Model, sc: Scratch, offsets: Offsets, i: int):
+    """Multipliers of a joint with one dof, in the place of its effort, and its body.
+
+    Reads: m.body_parent, m.v_start, sc.axis_w, sc.axis_v, sc.lever_w, sc.lever_v,
+        sc.effort, sc.multiplier_w, sc.multiplier_v.
+    Writes: sc.effort, sc.multiplier_w, sc.multiplier_v.
+    """
+    at = offsets.solve_body + i
+    up = offsets.reading + load(m.body_parent, i)
+    here = offsets.reading + i
+    k = load(m.v_start, i)
+    w = load(sc.multiplier_w, up)
+    v = load(sc.multiplier_v, up)
+    dv = (
+        load(sc.effort, here)
+        - dot(load(sc.lever_w, at), w)
+        - dot(load(sc.lever_v, at), v)
+    )
+    store(sc.effort, here, dv)
+    store(sc.multiplier_w, here, w + dv * load(sc.axis_w, offsets.dof + k))
+    store(sc.multiplier_v, here, v + dv * load(sc.axis_v, offsets.dof + k))
+
+
+@plain
+def couple_multipliers(m: Model, sc: Scratch, offsets: Offsets, lane: int, lanes: int):
+    """Add the pairs to the tree's multipliers: as to its changes, without a push.
+
+    Reads: m.nb, m.pairs, m.joint_kind, m.v_start, sc.pair_weight, sc.effort,
+        sc.multiplier_w, sc.multiplier_v.
+    Writes: sc.pair_adjoint, sc.effort, sc.multiplier_w, sc.multiplier_v.
+    """
+    if lane == 0:
+        for j in range(m.pairs):
+            weight = load(sc.pair_weight, offsets.pair + j)
+            moved = pair_motion(
+                m,
+                sc,
+                offsets,
+                sc.multiplier_w,
+                sc.multiplier_v,
+                offsets.reading,
+                sc.pair_adjoint,
+                j,
+            )
+            store(sc.pair_adjoint, offsets.pair + j, neg(weight * moved))
+    sync(lane)
+    for i in range(1 + lane, m.nb + 1, lanes):
+        here = offsets.reading + i
+        w = load(sc.multiplier_w, here)
+        v = load(sc.multiplier_v, here)
+        w, v = with_answers(m, sc, offsets, sc.pair_adjoint, i, w, v)
+        store(sc.multiplier_w, here, w)
+        store(sc.multiplier_v, here, v)
+        if load(m.joint_kind, i) != JointKind.FREE:
+            k = load(m.v_start, i)
+            dv = load(sc.effort, here)
+            store(sc.effort, here, dv + answered(m, sc, offsets, sc.pair_adjoint, k))
+    sync(lane)

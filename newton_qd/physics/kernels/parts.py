@@ -1,0 +1,221 @@
+"""What each quantity takes of the adjoint of a linear solve; see :mod:`.solve`.
+
+An adjoint is added to where one lane owns the entry, so without atomics. Those of the
+changes are 0 in the end, as before.
+"""
+
+from . import plain, quat, real, vec3
+from .cpp.algebra import component, cross, dot, form_slope, rigid, translation, vector
+from .cpp.memory import add_adjoint, load, load_adjoint, store, store_adjoint
+from .cpp.operators import add, mul, neg, sub  # noqa: F401
+from .parameters import PARAMETRIC, body_mass
+from .structs import Model, Offsets, Scratch
+
+
+@plain
+def contact_part(
+    sc: Scratch, offsets: Offsets, c: int, xw: vec3, xv: vec3, lw: vec3, lv: vec3
+):
+    """Parts of contact ``c``; returns its impulse, and its weight times multiplier.
+
+    Reads: sc.point, sc.normal, sc.push, sc.weight_n, sc.weight_t.
+    Writes: g.point, g.normal, g.push, g.weight_n, g.weight_t.
+
+    Args:
+        sc: The scratch.
+        offsets: Offsets of the solve.
+        c: The contact.
+        xw: Change of angular velocity of its body, of a pair relative.
+        xv: Change of velocity, likewise.
+        lw: Multiplier of the angular velocity, likewise.
+        lv: Multiplier of the velocity, likewise.
+    """
+    at = offsets.solve_contact + c
+    r = load(sc.point, offsets.contact + c)
+    n = load(sc.normal, offsets.contact + c)
+    wt = load(sc.weight_t, at)
+    more = load(sc.weight_n, at) - wt
+    moved = xv + cross(xw, r)
+    multiplier = lv + cross(lw, r)
+    un = dot(n, moved)
+    ln = dot(n, multiplier)
+    both = un * ln
+    impulse = load(sc.push, at) - wt * moved - (more * un) * n
+    weighted = wt * multiplier + (more * ln) * n
+    add_adjoint(sc.push, at, multiplier)
+    add_adjoint(sc.weight_n, at, neg(both))
+    add_adjoint(sc.weight_t, at, both - dot(multiplier, moved))
+    turned = (more * ln) * moved + (more * un) * multiplier
+    add_adjoint(sc.normal, offsets.contact + c, neg(turned))
+    add_adjoint(sc.point, offsets.contact + c, cross(impulse, lw) - cross(weighted, xw))
+    return impulse, weighted
+
+
+@plain
+def pair_part(m: Model, sc: Scratch, offsets: Offsets, j: int):
+    """Parts of pair ``j``; keeps its impulse, and its weight times multiplier.
+
+    Reads: m.contact_body, m.contact_partner, m.pair_lead, sc.change_w, sc.change_v,
+        sc.multiplier_w, sc.multiplier_v.
+    Writes: sc.pair_impulse, sc.pair_adjoint.
+    """
+    c = load(m.pair_lead, j)
+    a = load(m.contact_body, c)
+    b = load(m.contact_body, load(m.contact_partner, c))
+    x = offsets.solve_body
+    at = offsets.reading
+    impulse, weighted = contact_part(
+        sc,
+        offsets,
+        c,
+        load(sc.change_w, x + a) - load(sc.change_w, x + b),
+        load(sc.change_v, x + a) - load(sc.change_v, x + b),
+        load(sc.multiplier_w, at + a) - load(sc.multiplier_w, at + b),
+        load(sc.multiplier_v, at + a) - load(sc.multiplier_v, at + b),
+    )
+    store(sc.pair_impulse, offsets.pair + j, impulse)
+    store(sc.pair_adjoint, offsets.pair + j, weighted)
+
+
+@plain
+def rigid_part(m: Model, sc: Scratch, offsets: Offsets, i: int):
+    """Parts of body ``i``'s inertia and wrench; returns its residual wrenches.
+
+    Reads: m.h, m.parameters, sc.parameter, sc.inertia, sc.moment, sc.wrench_w,
+        sc.wrench_v, sc.change_w, sc.change_v, sc.multiplier_w, sc.multiplier_v,
+        g.change_w, g.change_v.
+    Writes: g.parameter, g.inertia, g.moment, g.wrench_w, g.wrench_v.
+    """
+    body = offsets.body + i
+    motion = offsets.motion + i
+    xw = load(sc.change_w, offsets.solve_body + i)
+    xv = load(sc.change_v, offsets.solve_body + i)
+    lw = load(sc.multiplier_w, offsets.reading + i)
+    lv = load(sc.multiplier_v, offsets.reading + i)
+    io = load(sc.inertia, body)
+    hm = load(sc.moment, body)
+    mass = body_mass(m, sc, offsets, i)
+    rw = neg(m.h * load(sc.wrench_w, motion) + io * xw + cross(hm, xv))
+    rv = cross(hm, xw) - mass * xv - m.h * load(sc.wrench_v, motion)
+    qw = load_adjoint(sc.change_w, offsets.solve_body + i) - io * lw - cross(hm, lv)
+    qv = load_adjoint(sc.change_v, offsets.solve_body + i) + cross(hm, lw) - mass * lv
+    add_adjoint(sc.wrench_w, motion, neg(m.h * lw))
+    add_adjoint(sc.wrench_v, motion, neg(m.h * lv))
+    add_adjoint(sc.inertia, body, neg(form_slope(lw, xw)))
+    add_adjoint(sc.moment, body, cross(lw, xv) + cross(xw, lv))
+    if PARAMETRIC:
+        at = offsets.parameter + m.parameters.mass + i - 1
+        add_adjoint(sc.parameter, at, neg(dot(lv, xv)))
+    return rw, rv, qw, qv
+
+
+@plain
+def body_part(m: Model, sc: Scratch, offsets: Offsets, i: int, touching: int):
+    """Parts of body ``i`` and its contacts; returns its subtree's residual wrenches.
+
+    The first is of the solve, the second of its adjoint. Children have left the first
+    where joints pass wrenches on, and the second in the adjoint of their change.
+
+    Reads: m.child_start, m.child, m.contact_start, m.contact_stop, m.contact_body,
+        m.contact_partner, m.pair_lead, sc.point, sc.change_w, sc.change_v,
+        sc.pair_impulse, sc.pair_adjoint, sc.passed_w, sc.passed_v, sc.multiplier_w,
+        sc.multiplier_v, g.change_w, g.change_v.
+    Writes: g.change_w, g.change_v.
+    """
+    rw, rv, qw, qv = rigid_part(m, sc, offsets, i)
+    xw = load(sc.change_w, offsets.solve_body + i)
+    xv = load(sc.change_v, offsets.solve_body + i)
+    lw = load(sc.multiplier_w, offsets.reading + i)
+    lv = load(sc.multiplier_v, offsets.reading + i)
+    for c in range(load(m.contact_start, i), load(m.contact_stop, i)):
+        r = load(sc.point, offsets.contact + c)
+        impulse, weighted = contact_part(sc, offsets, c, xw, xv, lw, lv)
+        rw = rw + cross(r, impulse)
+        rv = rv + impulse
+        qw = qw - cross(r, weighted)
+        qv = qv - weighted
+    for j in range(touching):
+        lead = load(m.pair_lead, j)
+        first = load(m.contact_body, lead) == i
+        if first or load(m.contact_body, load(m.contact_partner, lead)) == i:
+            r = load(sc.point, offsets.contact + lead)
+            impulse = load(sc.pair_impulse, offsets.pair + j)
+            weighted = load(sc.pair_adjoint, offsets.pair + j)
+            if not first:
+                impulse = neg(impulse)
+                weighted = neg(weighted)
+            rw = rw + cross(r, impulse)
+            rv = rv + impulse
+            qw = qw - cross(r, weighted)
+            qv = qv - weighted
+    for j in range(load(m.child_start, i), load(m.child_start, i + 1)):
+        child = load(m.child, j)
+        below = offsets.solve_body + child
+        rw = rw + load(sc.passed_w, offsets.reading + child)
+        rv = rv + load(sc.passed_v, offsets.reading + child)
+        qw = qw + load_adjoint(sc.change_w, below)
+        qv = qv + load_adjoint(sc.change_v, below)
+        store_adjoint(sc.change_w, below, vec3())
+        store_adjoint(sc.change_v, below, vec3())
+    return rw, rv, qw, qv
+
+
+@plain
+def axis_part(m: Model, sc: Scratch, offsets: Offsets, i: int, touching: int):
+    """Parts of body ``i`` and of its joint, which has one dof.
+
+    Reads: m.body_parent, m.v_start, sc.dv, sc.effort.
+    Writes: sc.passed_w, sc.passed_v, g.axis_w, g.axis_v, g.joint_push, g.joint_weight,
+        g.change_w, g.change_v, g.dv.
+    """
+    rw, rv, qw, qv = body_part(m, sc, offsets, i, touching)
+    here = offsets.reading + i
+    k = load(m.v_start, i)
+    dof = offsets.solve_dof + k
+    dv = load(sc.dv, dof)
+    multiplier = load(sc.effort, here)
+    add_adjoint(sc.axis_w, offsets.dof + k, multiplier * rw + dv * qw)
+    add_adjoint(sc.axis_v, offsets.dof + k, multiplier * rv + dv * qv)
+    add_adjoint(sc.joint_push, dof, multiplier)
+    add_adjoint(sc.joint_weight, dof, neg(multiplier * dv))
+    store_adjoint(sc.dv, dof, real())
+    if load(m.body_parent, i) == 0:
+        qw = vec3()
+        qv = vec3()
+    store(sc.passed_w, here, rw)
+    store(sc.passed_v, here, rv)
+    store_adjoint(sc.change_w, offsets.solve_body + i, qw)
+    store_adjoint(sc.change_v, offsets.solve_body + i, qv)
+
+
+@plain
+def free_part(m: Model, sc: Scratch, offsets: Offsets, i: int, touching: int):
+    """Parts of a free root, whose place is also where its forces act.
+
+    Reads: m.v_start, sc.pose, sc.joint_push, sc.change_w, sc.multiplier_w,
+        sc.multiplier_v, g.dv.
+    Writes: g.pose, g.joint_push, g.change_w, g.change_v, g.dv.
+    """
+    body_part(m, sc, offsets, i, touching)
+    k = offsets.solve_dof + load(m.v_start, i)
+    p = translation(load(sc.pose, offsets.body + i))
+    xw = load(sc.change_w, offsets.solve_body + i)
+    lw = load(sc.multiplier_w, offsets.reading + i)
+    origin = load(sc.multiplier_v, offsets.reading + i) + cross(lw, p)
+    asked = vector(
+        load_adjoint(sc.dv, k),
+        load_adjoint(sc.dv, k + 1),
+        load_adjoint(sc.dv, k + 2),
+    )
+    force = vector(
+        load(sc.joint_push, k), load(sc.joint_push, k + 1), load(sc.joint_push, k + 2)
+    )
+    place = cross(asked, xw) + cross(force, lw)
+    add_adjoint(sc.pose, offsets.body + i, rigid(place, quat()))
+    for j in range(3):
+        add_adjoint(sc.joint_push, k + j, component(origin, j))
+        add_adjoint(sc.joint_push, k + 3 + j, component(lw, j))
+        store_adjoint(sc.dv, k + j, real())
+        store_adjoint(sc.dv, k + 3 + j, real())
+    store_adjoint(sc.change_w, offsets.solve_body + i, vec3())
+    store_adjoint(sc.change_v, offsets.solve_body + i, vec3())

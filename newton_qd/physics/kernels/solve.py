@@ -1,0 +1,122 @@
+"""The linear solve of a tree with pairs, and its adjoint, which is a solve as well.
+
+A solve finds the changes of all velocities x of H x = b: H is the mass matrix with the
+joints' diagonal D and the weights W of the contacts, b the impulses. With the motion
+J_i of body i for unit changes, X_i = J_i x, and the same for contacts,
+
+    H = D + sum J_i^T I_i J_i + sum J_c^T W_c J_c,
+    b = t + sum J_i^T w_i + sum J_c^T p_c.
+
+Let y be the adjoint of x, with that of X_i carried to it, y + sum J_i^T Y_i. Then
+(Giles 2008, "Collected matrix derivative results", section 2.2.3)
+
+    H l = y,    b_bar = l,    H_bar = -l x^T,
+
+because H is symmetric. So the adjoint is one more solve, with vectors only: the factors
+of the joints are those of the forward pass (:mod:`.articulation`), and pairs are added
+by the same low-rank update (:mod:`.coupling`). The l are the multipliers; those of
+bodies and contacts are L_i = J_i l and m_c = J_c l. Of l^T (b - H x) each part takes
+its own:
+
+    impulse and diagonal of a joint     l_k,               -l_k x_k
+    wrench and inertia of a body        L_i,               -L_i X_i^T
+    push and weight of a contact        m_c,               -m_c u_c^T     (u_c = J_c x)
+    its point r, with p = p_c - W u_c   p x L_w - (W m_c) x X_w
+
+An axis S of joint k moves all bodies of its subtree: X_j and L_j change by dS x_k and
+dS l_k. That gives it the two residual wrenches of the subtree,
+
+    S_bar = l_k sum (w_j - I_j X_j) + x_k sum (Y_j - I_j L_j),
+
+with the impulses of contacts among the wrenches. A sweep to the root and one back find
+the multipliers (:mod:`.multipliers`); a last one to the root hands out the parts and
+adds up the residuals (:mod:`.parts`).
+"""
+
+import warp as wp
+
+from newton_qd.physics.kinds import JointKind
+
+from . import plain, stage, sync
+from .articulation import solve_tree
+from .contact import contact_slip
+from .coupling import PAIRS, couple_pairs, pairs_touch
+from .cpp.memory import load
+from .joints import joint_laws
+from .multipliers import (
+    couple_multipliers,
+    hand_back_axis,
+    multiplier_axis,
+    multiplier_free,
+    rest_multiplier,
+)
+from .parts import axis_part, free_part, pair_part
+from .structs import Model, Offsets, Scratch
+
+
+@plain
+def solve(m: Model, sc: Scratch, offsets: Offsets, lane: int, lanes: int):
+    """Changes of all velocities and twists."""
+    solve_tree(m, sc, offsets, lane, lanes)
+    if PAIRS:
+        if pairs_touch(m, sc, offsets) > 0:
+            couple_pairs(m, sc, offsets, lane, lanes)
+
+
+@wp.func_grad(solve)
+def adj_solve(m: Model, sc: Scratch, offsets: Offsets, lane: int, lanes: int):
+    """Multipliers, then what inertias, contacts, joints and axes take of them.
+
+    Reads: m.pairs, m.joint_kind, m.body_levels, m.body_level_start, m.body_level.
+    """
+    sync(lane)
+    if lane == 0:
+        rest_multiplier(sc, offsets)
+    for n in range(m.body_levels):
+        level = m.body_levels - 1 - n
+        start = load(m.body_level_start, level)
+        for p in range(start + lane, load(m.body_level_start, level + 1), lanes):
+            i = load(m.body_level, p)
+            if load(m.joint_kind, i) == JointKind.FREE:
+                multiplier_free(m, sc, offsets, i)
+            else:
+                hand_back_axis(m, sc, offsets, i)
+        sync(lane)
+    for level in range(m.body_levels):
+        start = load(m.body_level_start, level)
+        for p in range(start + lane, load(m.body_level_start, level + 1), lanes):
+            i = load(m.body_level, p)
+            if load(m.joint_kind, i) != JointKind.FREE:
+                multiplier_axis(m, sc, offsets, i)
+        sync(lane)
+    touching = int(0)
+    if PAIRS:
+        touching = pairs_touch(m, sc, offsets)
+        if touching > 0:
+            couple_multipliers(m, sc, offsets, lane, lanes)
+            for j in range(lane, m.pairs, lanes):
+                pair_part(m, sc, offsets, j)
+            sync(lane)
+    for n in range(m.body_levels):
+        level = m.body_levels - 1 - n
+        start = load(m.body_level_start, level)
+        for p in range(start + lane, load(m.body_level_start, level + 1), lanes):
+            i = load(m.body_level, p)
+            if load(m.joint_kind, i) == JointKind.FREE:
+                free_part(m, sc, offsets, i, touching)
+            else:
+                axis_part(m, sc, offsets, i, touching)
+        sync(lane)
+
+
+@stage
+def linear_solve(m: Model, sc: Scratch, offsets: Offsets, lane: int, lanes: int):
+    """What joints add, changes of all velocities, and of those of contact points.
+
+    Reads: m.nc.
+    """
+    joint_laws(m, sc, offsets, lane, lanes)
+    solve(m, sc, offsets, lane, lanes)
+    for c in range(lane, m.nc, lanes):
+        contact_slip(m, sc, offsets, c)
+    sync(lane)
