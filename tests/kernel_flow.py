@@ -165,7 +165,8 @@ class Flow:
     def _store(self, node: ast.Call, given: list[Value], frame: Frame) -> None:
         array, index = given[0], given[1]
         threads = {PACK, LANE}
-        for loop in sorted(frame.loops - index.varies):
+        # the arrays of the scratch begin in the pack's own memory
+        for loop in sorted(frame.loops - index.varies - (array.varies & {PACK})):
             if loop in threads:
                 self._report(frame, node, RACE.format(ast.unparse(node.args[0]), loop))
             elif frame.exact:

@@ -24,12 +24,13 @@ from newton_qd.physics.system import System
 
 KERNEL = """
 import warp as wp
+from {package}.cpp.place import place
 from {package}.solve import solve
 from {package}.structs import Model, Scratch, offsets_at
 
 @wp.kernel
 def solve_once(m: Model, sc: Scratch):
-    solve(m, sc, offsets_at(m, wp.tid(), 1, 0, 0), 0, 1)
+    solve(m, place(sc, wp.tid()), offsets_at(m, 0, 1, 0, 0), 0, 1)
 """
 FOUND = ("change_w", "change_v", "dv")
 # what the changes are linear in: differences have no other error than rounding
@@ -67,8 +68,7 @@ class Solve:
 
     def array(self, name: str) -> np.ndarray:
         """Values (n, components, worlds) of an array, to be changed."""
-        held = getattr(self.memory.values, name).numpy()
-        return held.reshape(len(held), -1, held.shape[-1])
+        return self.memory.array(name)
 
     def used(self, name: str) -> slice:
         """Entries of an array that the solve may reach."""
@@ -140,18 +140,16 @@ def test_every_input_of_a_solve(x64: None, tmp_path: Path, name: str) -> None:
     rng = np.random.default_rng(1)
     weights = {}
     for part in FOUND:
-        adjoint = getattr(solve.memory.adjoints, part).numpy()
-        adjoint = adjoint.reshape(len(adjoint), -1, adjoint.shape[-1])[solve.used(part)]
+        adjoint = solve.memory.array(part, adjoint=True)[solve.used(part)]
         weights[part] = adjoint[:] = rng.normal(size=adjoint.shape)
     # the adjoint of a plain function does not repeat it
     solve.launch()
     solve.launch(adjoint=True)
     for part in FOUND:
-        assert not getattr(solve.memory.adjoints, part).numpy().any()
+        assert not solve.memory.array(part, adjoint=True).any()
     worst = {}
     for part in (*LINEAR, *OTHERS):
-        found = getattr(solve.memory.adjoints, part).numpy().copy()
-        found = found.reshape(len(found), -1, found.shape[-1])
+        found = solve.memory.array(part, adjoint=True).copy()
         values, used = solve.array(part), solve.used(part)
         step = 1.0 if part in LINEAR else STEP
         expected = np.zeros(found.shape)

@@ -18,7 +18,7 @@ from newton_qd.physics.precision import Kernels, Variant, build_kernels, pack_wi
 from newton_qd.physics.stepping import substep_solves
 from newton_qd.physics.system import CONTACT_FRACTION, STANDARD_GRAVITY, System
 from newton_qd.physics.tree import Tree, build_tree
-from newton_qd.physics.warp_internals import field_dtype
+from newton_qd.physics.warp_internals import field_dtype, field_type
 
 # Names of the scratch arrays, grouped by what one entry belongs to.
 _PER_BODY = ("pose", "inertia", "moment")
@@ -40,6 +40,10 @@ _PER_READING = ("body_impulse", "body_angular_impulse", "body_normal_impulse")
 _PER_READING += ("position", "com", "com_velocity")
 _REPORTED = ("impulse", "angular_impulse", "normal_impulse")
 
+
+# The scratch begins at a multiple of this: a line is in as few cache lines as it can be
+# [bytes].
+_ALIGNMENT = 128
 
 # Copies a table to the model's array of this name.
 Put = Callable[[str, ArrayLike], None]
@@ -86,10 +90,10 @@ def build_model(system: System, device: wp.Device, parametric: bool = False) -> 
     tree = build_tree(system)
     model = space.structs.Model()
     robot, material = system.robot, system.robot.material
+    tables: dict[str, np.ndarray] = {}
 
     def put(name: str, values: ArrayLike) -> None:
-        dtype = field_dtype(space.structs.Model, name)
-        setattr(model, name, wp.array(np.asarray(values), dtype=dtype, device=device))
+        tables[name] = np.asarray(values)
 
     model.nb, model.nq, model.nv = system.nb, system.nq, system.nv
     model.nu, model.nc = system.nu, len(system.contact_body)
@@ -127,7 +131,37 @@ def build_model(system: System, device: wp.Device, parametric: bool = False) -> 
     model.foot_width = system.feet_width
     model.foot_tail = Tail[system.feet_tail.upper()]
     _put_rows(model, space.structs, system, parametric)
+    _copy_tables(model, space, tables, device)
     return model
+
+
+def _copy_tables(
+    model: Any, space: Kernels, tables: dict[str, np.ndarray], device: wp.Device
+) -> None:
+    """Copy the tables to a device: one array of the numbers, and one of the integers.
+
+    The model keeps both arrays, and the address of each table.
+    """
+    kinds = {name: field_type(space.structs.Model, name) for name in tables}
+    for memory, integer in (("numbers", False), ("integers", True)):
+        parts = {
+            name: values.ravel()
+            for name, values in tables.items()
+            if (kinds[name] is space.memory.IntTable) == integer
+        }
+        array = wp.array(
+            np.concatenate(list(parts.values())),
+            dtype=field_dtype(space.structs.Model, memory),
+            device=device,
+        )
+        setattr(model, memory, array)
+        address = array.ptr
+        assert address is not None  # the array is not empty
+        for name, part in parts.items():
+            handle = kinds[name]()
+            handle.data = address
+            setattr(model, name, handle)
+            address += part.size * wp.types.type_size_in_bytes(array.dtype)
 
 
 def fill_row(struct: Row, fields: Layout, names: Iterable[str] | None = None) -> Row:
@@ -286,10 +320,27 @@ class Memory:
         values: ``Scratch`` struct of the values.
         adjoints: ``Scratch`` struct of their adjoints. Without adjoints it is
             ``values`` itself. An array that needs no adjoint is in both.
+        shapes: Shape of each array of a group of worlds: entries, numbers of an entry,
+            worlds.
     """
 
     values: Any
     adjoints: Any
+    shapes: dict[str, tuple[int, int, int]]
+
+    def array(self, name: str, adjoint: bool = False) -> np.ndarray:
+        """Returns a view of an array on a CPU, for the first group of worlds.
+
+        Args:
+            name: Field of ``Scratch``.
+            adjoint: Whether to return the adjoints of the array.
+        """
+        struct = self.adjoints if adjoint else self.values
+        entries, numbers, side = self.shapes[name]
+        lines = struct.memory.numpy().reshape(-1, side)
+        first = getattr(struct, name).first
+        found = lines[first : first + entries * numbers]
+        return found.reshape(self.shapes[name])
 
 
 def build_scratch(
@@ -314,11 +365,27 @@ def build_scratch(
         The structs that the kernels take as arguments.
     """
     space = kernels_of(system, device, parametric)
-    values, adjoints = space.structs.Scratch(), space.structs.Scratch()
+    kind, memory = space.structs.Scratch, space.memory
+    values, adjoints = kind(), kind()
+    shapes, lines = {}, 0
     for name, count in _entries(system, adjoint).items():
-        dtype = field_dtype(space.structs.Scratch, name)
+        array = field_type(kind, name)
+        shapes[name] = (count, memory.COUNTS[array], memory.SIDE)
+        own = count * memory.COUNTS[array]
         both = adjoint and name not in _WITHOUT_ADJOINT
-        array = wp.zeros(slots * count, dtype=dtype, device=device, requires_grad=both)
-        setattr(values, name, array)
-        setattr(adjoints, name, array.grad if both else array)
-    return Memory(values, adjoints if adjoint else values)
+        first, second = lines, lines + own if both else lines
+        lines = second + own
+        for struct, line in ((values, first), (adjoints, second)):
+            handle = array()
+            handle.first, handle.adjoint = line, second
+            setattr(struct, name, handle)
+    width = pack_width(system.dtype, device)
+    size = -(-slots * width // memory.SIDE) * memory.SIDE * lines
+    whole = wp.zeros(
+        size + _ALIGNMENT, dtype=field_dtype(kind, "memory"), device=device
+    )
+    assert whole.ptr is not None  # the array is not empty
+    start = -whole.ptr % _ALIGNMENT // wp.types.type_size_in_bytes(whole.dtype)
+    for struct in (values, adjoints):
+        struct.memory, struct.lines = whole[start : start + size], lines
+    return Memory(values, adjoints if adjoint else values, shapes)

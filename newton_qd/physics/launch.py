@@ -24,13 +24,18 @@ _MODULES = {
     "contact_gaps": "gaps",
     "contact_impulses": "impulses",
 }
-# The fastest numbers of lanes for 4,096 and 16,384 worlds of the ant on an H200.
-_LANES = {"step_forward": 16, "step_backward": 8}
+# The fastest numbers of lanes on an H200, up to a number of worlds and beyond: a small
+# batch needs more lanes to fill the GPU. docs/verification.md has the measurements.
+_MANY_WORLDS = 8192
+_LANES = {"step_forward": (8, 8), "step_backward": (8, 4)}
 # Minimum number of packs per thread, without and with adjoint. For fewer packs, waking
 # another thread from Python takes longer than the work that it saves.
 _PACKS_PER_THREAD = {False: 16, True: 4}
+# Threads of a block at most, and worlds of a warp, as in ``kernels.world``.
 _GPU_BLOCK = 256
-_RESIDENT_WORLDS = 16384
+_WARP = 32
+# Worlds of a launch at most, without and with adjoint: each has its own scratch memory.
+_RESIDENT_WORLDS = {False: 65536, True: 16384}
 
 
 def thread_count() -> int:
@@ -51,7 +56,7 @@ def thread_count() -> int:
     return int(text)
 
 
-def lane_count(kernel: str) -> int:
+def lane_count(kernel: str, worlds: int = 1) -> int:
     """Returns the number of lanes per world of a GPU launch.
 
     It is ``NEWTON_QD_LANES``, or by default the number that was measured as fastest.
@@ -59,6 +64,7 @@ def lane_count(kernel: str) -> int:
     Args:
         kernel: Name of the kernel. Only the kernels of the step support several lanes;
             the result for all others is 1.
+        worlds: Number of worlds of the launch.
 
     Raises:
         ValueError: The environment variable is not one of ``LANES``.
@@ -67,10 +73,15 @@ def lane_count(kernel: str) -> int:
         return 1
     text = os.environ.get("NEWTON_QD_LANES")
     if text is None:
-        return _LANES[kernel]
+        return _LANES[kernel][worlds > _MANY_WORLDS]
     if not text.isdecimal() or int(text) not in LANES:
         raise ValueError(message("NEWTON_QD_LANES", text, listed(LANES)))
     return int(text)
+
+
+def worlds_side_by_side(lanes: int) -> int:
+    """Returns how many worlds a block of a GPU computes with this number of lanes."""
+    return min(_WARP, _GPU_BLOCK // lanes)
 
 
 def output_size(system: System) -> int:
@@ -93,8 +104,11 @@ class _Command:
         threads: int,
         slot_stride: int,
         lanes: int,
+        block: int,
     ) -> None:
         """Launch the kernel on ``worlds`` worlds, starting with world ``first``."""
+        # The block of a recorded launch needs no compilation of its own.
+        self.launch.block_dim = block
         self.launch.set_dim(threads)
         for index, value in enumerate((first, slot_stride, worlds, lanes), 1):
             self.launch.set_param_at_index(index, value)
@@ -181,13 +195,15 @@ class Launcher:
             with self._lock:
                 self._launch_threads(kernel, worlds, arrays, adjoint)
             return
-        lanes = lane_count(name)
-        resident = min(worlds, _RESIDENT_WORLDS)
+        lanes = lane_count(name, worlds)
+        side = worlds_side_by_side(lanes)
+        resident = min(-(-worlds // side) * side, _RESIDENT_WORLDS[adjoint])
         owner = wp.get_stream(self.device).cuda_stream
+        command = self._command(kernel, owner, resident, arrays, adjoint)
         for first in range(0, worlds, resident):
             count = min(resident, worlds - first)
-            command = self._command(kernel, owner, resident, arrays, adjoint)
-            command.send(arrays, first, count, count * lanes, 1, lanes)
+            threads = -(-count // side) * side * lanes
+            command.send(arrays, first, count, threads, 1, lanes, side * lanes)
 
     def _kernel(self, name: str) -> wp.Kernel:
         return getattr(getattr(self.kernels, _MODULES.get(name, "inspect")), name)
@@ -223,7 +239,7 @@ class Launcher:
         self, command: _Command, arrays: Arrays, first: int, end: int
     ) -> None:
         worlds = end - first
-        command.send(arrays, first, worlds, -(-worlds // self.width), 0, 1)
+        command.send(arrays, first, worlds, -(-worlds // self.width), 0, 1, 1)
 
     def _command(
         self,

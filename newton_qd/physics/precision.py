@@ -24,6 +24,8 @@ _VECTOR_BYTES = 32
 # Warp's default for CPUs. Its default for CUDA is 3. Level 3 doubles the compile time
 # and makes the kernels 3 % faster (docs/verification.md).
 _OPTIMIZATION = 2
+# Modules in a folder of the package.
+_FILES = {"memory": "cpp.memory"}
 SCALARS = {"float32": wp.float32, "float64": wp.float64}
 
 
@@ -65,6 +67,7 @@ class Kernels:
     Attributes:
         package: The scalar and vector types.
         structs: The structs that kernels take as arguments.
+        memory: What the arrays and tables of these structs are.
         world: Functions that read inputs and write outputs.
         forward: Kernel ``step_forward``.
         backward: Kernel ``step_backward``.
@@ -76,6 +79,7 @@ class Kernels:
 
     package: ModuleType
     structs: ModuleType
+    memory: ModuleType
     world: ModuleType
     forward: ModuleType
     backward: ModuleType
@@ -120,7 +124,8 @@ def build_kernels(variant: Variant) -> Kernels:
     package = _run_template(variant.package)
     names = [field.name for field in dataclasses.fields(Kernels)[1:]]
     modules = {
-        name: importlib.import_module(f"{variant.package}.{name}") for name in names
+        name: importlib.import_module(f"{variant.package}.{_FILES.get(name, name)}")
+        for name in names
     }
     level = wp.config.optimization_level
     level = _OPTIMIZATION if level is None else level

@@ -110,6 +110,24 @@ def tape_is_recording() -> bool:
     return module.runtime.tape is not None
 
 
+def field_type(struct: Any, name: str) -> Any:
+    """Returns the type of a field of a struct.
+
+    Args:
+        struct: Class from ``wp.struct``.
+        name: Name of a field.
+
+    Returns:
+        The Warp type; of a struct in the struct, its class.
+
+    Raises:
+        UnsupportedWarpError: Structs of the installed Warp do not expose their types.
+    """
+    if not _has(struct, "vars"):
+        raise _unsupported("vars", (type(struct).__qualname__,))
+    return struct.vars[name].type
+
+
 def field_dtype(struct: Any, name: str) -> type:
     """Returns the type of the elements of an array in a struct.
 
@@ -123,9 +141,7 @@ def field_dtype(struct: Any, name: str) -> type:
     Raises:
         UnsupportedWarpError: Structs of the installed Warp do not expose their types.
     """
-    if not _has(struct, "vars"):
-        raise _unsupported("vars", (type(struct).__qualname__,))
-    return struct.vars[name].type.dtype
+    return field_type(struct, name).dtype
 
 
 def never_replay(function: FunctionT) -> FunctionT:

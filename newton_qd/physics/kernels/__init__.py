@@ -71,14 +71,14 @@ sym33 = wp.types.matrix(shape=(6, width), dtype=scalar)
 
 _SYNC = """
 #if defined(__CUDA_ARCH__)
-__syncwarp();
+__syncthreads();
 #endif
 """
 
 
 @wp.func_native(snippet=_SYNC, adj_snippet=_SYNC, replay_snippet="")
 def sync(lane: int):
-    """Wait for the other lanes of a warp; nothing on a CPU.
+    """Wait for the other lanes, which are in one block; nothing on a CPU.
 
     Takes an argument because Warp (1.19) leaves out the adjoint of a function that has
     none: without it the reverse pass would run unsynchronised.

@@ -3,6 +3,7 @@
 import warp as wp
 
 from . import scalar
+from .cpp.place import place
 from .simulate import simulate
 from .structs import Model, Scratch, offsets_after, offsets_at
 from .world import load_world, pack_at, seed_world
@@ -16,8 +17,8 @@ def step_backward(
     slot_stride: int,
     worlds: int,
     lanes: int,
-    sc: Scratch,
-    g: Scratch,
+    scratch: Scratch,
+    adjoints: Scratch,
     # in
     x: wp.array[scalar],
     y_bar: wp.array[scalar],
@@ -26,15 +27,15 @@ def step_backward(
 ):
     """Launched with ``adjoint=True``: its forward part fills the scratch again.
 
-    ``g`` is the adjoint of ``sc``, all zero before and after.
+    ``adjoints`` are those of the scratch, all zero before and after.
 
     Reads: x, y_bar.
     Writes: x_bar.
     """
-    tid = wp.tid()
-    n = tid // lanes
-    lane = tid - n * lanes
-    pack = pack_at(n, first, worlds, slot_stride)
+    pack = pack_at(wp.tid(), first, worlds, slot_stride, lanes)
+    lane = pack.lane
+    sc = place(scratch, pack.column)
+    g = place(adjoints, pack.column)
     load_world(m, sc, g, offsets_at(m, pack.slot, 1, 0, 0), pack, x, x_bar, lane, lanes)
     simulate(m, sc, pack, x, 1, lane, lanes)
     offsets = offsets_after(m, pack.slot, 1)

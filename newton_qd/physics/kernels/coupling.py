@@ -20,7 +20,7 @@ import warp as wp
 from . import pairs, plain, real, scalar, sync, vec3, width
 from .answers import answer, answer_between, answer_body, answer_dof
 from .cpp.algebra import add_diagonal, cross, dot, inverse, outer
-from .cpp.memory import load, store
+from .cpp.memory import Vectors, load, store
 from .cpp.numbers import occurs, uniform
 from .cpp.operators import add, mul, neg, sub  # noqa: F401
 from .structs import Model, Offsets, Scratch
@@ -106,10 +106,10 @@ def pair_motion(
     m: Model,
     sc: Scratch,
     offsets: Offsets,
-    turn: wp.array[vec3],
-    move: wp.array[vec3],
+    turn: Vectors,
+    move: Vectors,
     first: int,
-    impulse: wp.array[vec3],
+    impulse: Vectors,
     j: int,
 ):
     """Relative velocity at pair ``j``'s point, with the impulses of those before it.
@@ -169,7 +169,7 @@ def with_answers(
     m: Model,
     sc: Scratch,
     offsets: Offsets,
-    impulse: wp.array[vec3],
+    impulse: Vectors,
     i: int,
     w: vec3,
     v: vec3,
@@ -187,7 +187,7 @@ def with_answers(
 
 
 @plain
-def answered(m: Model, sc: Scratch, offsets: Offsets, impulse: wp.array[vec3], k: int):
+def answered(m: Model, sc: Scratch, offsets: Offsets, impulse: Vectors, k: int):
     """What dof ``k`` answers to the impulses of all pairs.
 
     Reads: m.pairs, sc.answer_dv, impulse.

@@ -3,6 +3,7 @@
 import warp as wp
 
 from . import scalar
+from .cpp.place import place
 from .simulate import simulate
 from .structs import Model, Scratch, offsets_after, offsets_at
 from .world import load_world, pack_at, store_world
@@ -18,21 +19,20 @@ def step_forward(
     slot_stride: int,
     worlds: int,
     lanes: int,
-    sc: Scratch,
+    scratch: Scratch,
     # in
     x: wp.array[scalar],
     # out
     y: wp.array[scalar],
 ):
-    """One control step of worlds from ``first`` on; thread = pack * lanes + lane.
+    """One control step of worlds from ``first`` on.
 
     Reads: x.
     Writes: y.
     """
-    tid = wp.tid()
-    n = tid // lanes
-    lane = tid - n * lanes
-    pack = pack_at(n, first, worlds, slot_stride)
+    pack = pack_at(wp.tid(), first, worlds, slot_stride, lanes)
+    lane = pack.lane
+    sc = place(scratch, pack.column)
     load_world(m, sc, sc, offsets_at(m, pack.slot, 0, 0, 0), pack, x, x, lane, lanes)
     simulate(m, sc, pack, x, 0, lane, lanes)
     store_world(m, sc, offsets_after(m, pack.slot, 0), pack, y, lane, lanes)

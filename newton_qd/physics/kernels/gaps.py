@@ -7,6 +7,7 @@ import warp as wp
 
 from . import real, scalar, vec3
 from .cpp.memory import load, write_output
+from .cpp.place import place
 from .inspect import load_views
 from .nearest import touch_obstacle
 from .pair import touch_partner
@@ -38,7 +39,7 @@ def contact_gaps(
     slot_stride: int,
     worlds: int,
     lanes: int,
-    sc: Scratch,
+    scratch: Scratch,
     x: wp.array[scalar],
     y: wp.array[scalar],
 ):
@@ -47,7 +48,8 @@ def contact_gaps(
     Reads: x.
     Writes: y.
     """
-    pack = pack_at(wp.tid(), first, worlds, slot_stride)
+    pack = pack_at(wp.tid(), first, worlds, slot_stride, 1)
+    sc = place(scratch, pack.column)
     offsets = offsets_at(m, pack.slot, 0, 0, 0)
     load_views(m, sc, sc, offsets, x, x, pack)
     kinematics(m, sc, offsets, 0, 1)

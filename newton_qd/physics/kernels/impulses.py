@@ -9,6 +9,7 @@ import warp as wp
 from . import scalar
 from .cpp.algebra import component
 from .cpp.memory import load, write_output
+from .cpp.place import place
 from .simulate import simulate
 from .structs import Model, Scratch, offsets_at
 from .world import Pack, load_world, pack_at
@@ -42,7 +43,7 @@ def contact_impulses(
     slot_stride: int,
     worlds: int,
     lanes: int,
-    sc: Scratch,
+    scratch: Scratch,
     x: wp.array[scalar],
     y: wp.array[scalar],
 ):
@@ -51,7 +52,8 @@ def contact_impulses(
     Reads: x.
     Writes: y.
     """
-    pack = pack_at(wp.tid(), first, worlds, slot_stride)
+    pack = pack_at(wp.tid(), first, worlds, slot_stride, 1)
+    sc = place(scratch, pack.column)
     load_world(m, sc, sc, offsets_at(m, pack.slot, 0, 0, 0), pack, x, x, 0, 1)
     simulate(m, sc, pack, x, 0, 0, 1)
     store_impulses(m, sc, pack, y)

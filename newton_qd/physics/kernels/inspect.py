@@ -13,6 +13,7 @@ from .cpp.algebra import add_diagonal, cross, dot, skew, translation, vector
 from .cpp.memory import constant, load, read_input, store, write_output
 from .cpp.numbers import uniform
 from .cpp.operators import add, mul  # noqa: F401
+from .cpp.place import place
 from .inertia import bias_wrench, rigid_inertia
 from .readings import body_reading, seed_bodies, store_bodies
 from .simulate import kinematics
@@ -239,7 +240,7 @@ def dynamics_forward(
     slot_stride: int,
     worlds: int,
     lanes: int,
-    sc: Scratch,
+    scratch: Scratch,
     x: wp.array[scalar],
     y: wp.array[scalar],
 ):
@@ -248,7 +249,8 @@ def dynamics_forward(
     Reads: x.
     Writes: y.
     """
-    pack = pack_at(wp.tid(), first, worlds, slot_stride)
+    pack = pack_at(wp.tid(), first, worlds, slot_stride, 1)
+    sc = place(scratch, pack.column)
     offsets = offsets_at(m, pack.slot, 0, 0, 0)
     load_views(m, sc, sc, offsets, x, x, pack)
     kinematics(m, sc, offsets, 0, 1)
@@ -262,7 +264,7 @@ def kinematics_forward(
     slot_stride: int,
     worlds: int,
     lanes: int,
-    sc: Scratch,
+    scratch: Scratch,
     x: wp.array[scalar],
     y: wp.array[scalar],
 ):
@@ -271,7 +273,8 @@ def kinematics_forward(
     Reads: x.
     Writes: y.
     """
-    pack = pack_at(wp.tid(), first, worlds, slot_stride)
+    pack = pack_at(wp.tid(), first, worlds, slot_stride, 1)
+    sc = place(scratch, pack.column)
     offsets = offsets_at(m, pack.slot, 0, 0, 0)
     load_views(m, sc, sc, offsets, x, x, pack)
     read_bodies(m, sc, offsets)
@@ -287,8 +290,8 @@ def kinematics_backward(
     slot_stride: int,
     worlds: int,
     lanes: int,
-    sc: Scratch,
-    g: Scratch,
+    scratch: Scratch,
+    adjoints: Scratch,
     x: wp.array[scalar],
     y_bar: wp.array[scalar],
     x_bar: wp.array[scalar],
@@ -298,7 +301,9 @@ def kinematics_backward(
     Reads: x, y_bar.
     Writes: x_bar.
     """
-    pack = pack_at(wp.tid(), first, worlds, slot_stride)
+    pack = pack_at(wp.tid(), first, worlds, slot_stride, 1)
+    sc = place(scratch, pack.column)
+    g = place(adjoints, pack.column)
     offsets = offsets_at(m, pack.slot, 1, 0, 0)
     load_views(m, sc, g, offsets, x, x_bar, pack)
     read_bodies(m, sc, offsets)

@@ -2,11 +2,20 @@
 
 import warp as wp
 
-from . import mat33, real, scalar, sym33, transform, vec3
-from .cpp.memory import TABLES
+from . import scalar
+from .cpp.memory import (
+    IntTable,
+    Matrices,
+    MatrixTable,
+    Reals,
+    RealTable,
+    Symmetrics,
+    Transforms,
+    TransformTable,
+    Vectors,
+    VectorTable,
+)
 from .rows import Bodies, Coordinates, Dynamics, Inputs, Outputs, Parameters
-
-_vec3, _mat33, _transform = TABLES[vec3], TABLES[mat33], TABLES[transform]
 
 
 @wp.struct
@@ -31,52 +40,55 @@ class Model:
     solves: int  # solves of an iteration: predictor and correctors
     h: scalar  # [s]
     gravity: scalar  # [m/s^2]
-    rest_q: wp.array[scalar]  # (nq,)
-    origin_axis: wp.array[_vec3]  # (3,) what a coordinate adds to the origin O
+    # the numbers and the integers of all tables
+    numbers: wp.array[scalar]
+    integers: wp.array[int]
+    rest_q: RealTable  # (nq,)
+    origin_axis: VectorTable  # (3,) what a coordinate adds to the origin O
     # bodies, (nb + 1)
-    body_parent: wp.array[int]
-    joint_kind: wp.array[int]
-    q_start: wp.array[int]
-    v_start: wp.array[int]
-    joint_axis: wp.array[_vec3]
-    parent_frame: wp.array[_transform]
-    child_frame_inverse: wp.array[_transform]
-    child_moved: wp.array[int]  # 0: the child frame is the identity
-    mass: wp.array[scalar]
-    com: wp.array[_vec3]
-    inertia: wp.array[_mat33]
-    isotropic: wp.array[int]  # 1: the inertia does not depend on the rotation
+    body_parent: IntTable
+    joint_kind: IntTable
+    q_start: IntTable
+    v_start: IntTable
+    joint_axis: VectorTable
+    parent_frame: TransformTable
+    child_frame_inverse: TransformTable
+    child_moved: IntTable  # 0: the child frame is the identity
+    mass: RealTable
+    com: VectorTable
+    inertia: MatrixTable
+    isotropic: IntTable  # 1: the inertia does not depend on the rotation
     body_levels: int
-    body_level_start: wp.array[int]
-    body_level: wp.array[int]
-    child_start: wp.array[int]
-    child: wp.array[int]
+    body_level_start: IntTable
+    body_level: IntTable
+    child_start: IntTable
+    child: IntTable
     # degrees of freedom, (nv)
-    dof_control: wp.array[int]  # index in ctrl, -1 if not driven
-    gear: wp.array[scalar]
-    armature: wp.array[scalar]
-    damping: wp.array[scalar]
-    stiffness: wp.array[scalar]
-    spring_rest: wp.array[scalar]
-    limit_lower: wp.array[scalar]
-    limit_upper: wp.array[scalar]
-    limit_stiffness: wp.array[scalar]
+    dof_control: IntTable  # index in ctrl, -1 if not driven
+    gear: RealTable
+    armature: RealTable
+    damping: RealTable
+    stiffness: RealTable
+    spring_rest: RealTable
+    limit_lower: RealTable
+    limit_upper: RealTable
+    limit_stiffness: RealTable
     limit_smoothing: scalar
     limit_dissipation: scalar  # [s/rad or s/m]
     # contacts, (nc)
-    contact_start: wp.array[int]  # (nb + 2)
-    contact_stop: wp.array[int]  # (nb + 1), where the body's rows of pairs begin
-    contact_body: wp.array[int]
-    contact_position: wp.array[_vec3]
-    contact_segment: wp.array[_vec3]
-    contact_radius: wp.array[scalar]
-    contact_obstacle: wp.array[int]
-    contact_partner: wp.array[int]  # row of the other side of a pair, else -1
-    contact_lead: wp.array[int]  # row of the side that a pair is measured from
-    pair_lead: wp.array[int]  # (pairs,)
-    obstacle_kind: wp.array[int]
-    obstacle_frame: wp.array[_transform]
-    obstacle_size: wp.array[_vec3]
+    contact_start: IntTable  # (nb + 2)
+    contact_stop: IntTable  # (nb + 1), where the body's rows of pairs begin
+    contact_body: IntTable
+    contact_position: VectorTable
+    contact_segment: VectorTable
+    contact_radius: RealTable
+    contact_obstacle: IntTable
+    contact_partner: IntTable  # row of the other side of a pair, else -1
+    contact_lead: IntTable  # row of the side that a pair is measured from
+    pair_lead: IntTable  # (pairs,)
+    obstacle_kind: IntTable
+    obstacle_frame: TransformTable
+    obstacle_size: VectorTable
     contact_stiffness: scalar
     contact_smoothing: scalar
     friction: scalar
@@ -88,7 +100,7 @@ class Model:
     torso_q: int  # its first coordinate where it moves freely, else -1
     # feet, (nf)
     nf: int
-    foot: wp.array[int]  # body
+    foot: IntTable  # body
     foot_weight: scalar  # impulse of the robot's weight over a control step [N s]
     foot_fraction: scalar  # share of it above which a foot touches the ground
     foot_width: scalar  # share of it over which the smooth contact rises
@@ -108,90 +120,93 @@ class Model:
 class Scratch:
     """Intermediates of one control step; also the layout of their adjoints.
 
-    Contiguous, one-dimensional; a slot holds one pack of worlds, and :class:`Offsets`
-    says where a substep's entries begin.
+    :mod:`.cpp.memory` says how they lie in the memory, and :class:`Offsets` where a
+    substep's entries begin.
     """
 
-    q: wp.array[real]
-    v: wp.array[real]
-    ctrl: wp.array[real]
-    parameter: wp.array[real]  # as Parameters says
+    memory: wp.array[scalar]
+    lines: int  # of a group of worlds, with adjoints
+
+    q: Reals
+    v: Reals
+    ctrl: Reals
+    parameter: Reals  # as Parameters says
     # (slots,), 0 or 1: the step failed; its inputs were not finite
-    fault: wp.array[real]
-    lost: wp.array[real]
+    fault: Reals
+    lost: Reals
     # bodies; world axes, spatial vectors about O
-    pose: wp.array[transform]
-    twist_w: wp.array[vec3]
-    twist_v: wp.array[vec3]
-    bias_w: wp.array[vec3]
-    bias_v: wp.array[vec3]
-    inertia: wp.array[sym33]
-    moment: wp.array[vec3]
-    wrench_w: wp.array[vec3]
-    wrench_v: wp.array[vec3]
+    pose: Transforms
+    twist_w: Vectors
+    twist_v: Vectors
+    bias_w: Vectors
+    bias_v: Vectors
+    inertia: Symmetrics
+    moment: Vectors
+    wrench_w: Vectors
+    wrench_v: Vectors
     # bodies over the control step, and in the returned state in the world
-    body_impulse: wp.array[vec3]
-    body_angular_impulse: wp.array[vec3]
-    body_normal_impulse: wp.array[real]
-    position: wp.array[vec3]
-    com: wp.array[vec3]
-    com_velocity: wp.array[vec3]
+    body_impulse: Vectors
+    body_angular_impulse: Vectors
+    body_normal_impulse: Reals
+    position: Vectors
+    com: Vectors
+    com_velocity: Vectors
     # readings
-    torso_xy: wp.array[real]  # (2 slots,)
-    foot_contact: wp.array[real]
-    smooth_foot_contact: wp.array[real]
+    torso_xy: Reals  # (2 slots,)
+    foot_contact: Reals
+    smooth_foot_contact: Reals
     # degrees of freedom
-    axis_w: wp.array[vec3]
-    axis_v: wp.array[vec3]
+    axis_w: Vectors
+    axis_v: Vectors
     # contacts
-    point: wp.array[vec3]
-    arm: wp.array[vec3]
-    normal: wp.array[vec3]
-    velocity: wp.array[vec3]
-    gap: wp.array[real]
-    impulse: wp.array[vec3]
-    angular_impulse: wp.array[vec3]
-    normal_impulse: wp.array[real]
+    point: Vectors
+    arm: Vectors
+    normal: Vectors
+    velocity: Vectors
+    gap: Reals
+    impulse: Vectors
+    angular_impulse: Vectors
+    normal_impulse: Reals
     # contacts, per solve: the law at the velocity expected, and linearised about it
-    load: wp.array[real]
-    push_n: wp.array[real]
-    push: wp.array[vec3]
-    weight_n: wp.array[real]
-    weight_t: wp.array[real]
-    slip: wp.array[vec3]
+    load: Reals
+    push_n: Reals
+    push: Vectors
+    weight_n: Reals
+    weight_t: Reals
+    slip: Vectors
     # joints, per solve: impulse at the old velocity, and what resists the change
-    joint_push: wp.array[real]
-    joint_weight: wp.array[real]
+    joint_push: Reals
+    joint_weight: Reals
     # what a solve finds: the change of twist of each body, and of each velocity
-    change_w: wp.array[vec3]
-    change_v: wp.array[vec3]
-    dv: wp.array[real]
+    change_w: Vectors
+    change_v: Vectors
+    dv: Reals
     # without adjoints, per solve: the factors of the joints and of a free root, and
     # what bodies and degrees of freedom answer to a unit impulse of a pair along each
     # axis, with the pairs before it
-    lever_w: wp.array[vec3]
-    lever_v: wp.array[vec3]
-    share: wp.array[real]
-    root_ww: wp.array[sym33]
-    root_wv: wp.array[mat33]
-    root_vv: wp.array[sym33]
-    answer_w: wp.array[mat33]
-    answer_v: wp.array[mat33]
-    answer_dv: wp.array[vec3]
-    pair_weight: wp.array[mat33]  # impulse per velocity, for each pair
-    pair_coupling: wp.array[mat33]  # for each pair and each pair before it
-    pair_impulse: wp.array[vec3]
-    pair_adjoint: wp.array[vec3]
+    lever_w: Vectors
+    lever_v: Vectors
+    share: Reals
+    root_ww: Symmetrics
+    root_wv: Matrices
+    root_vv: Symmetrics
+    answer_w: Matrices
+    answer_v: Matrices
+    answer_dv: Vectors
+    pair_weight: Matrices  # impulse per velocity, for each pair
+    pair_coupling: Matrices  # for each pair and each pair before it
+    pair_impulse: Vectors
+    pair_adjoint: Vectors
     # without adjoints, per slot: what a joint passes on to the parent, the effort that
     # it takes, and multipliers, the changes of twist in the adjoint of a solve
-    passed_ww: wp.array[sym33]
-    passed_wv: wp.array[mat33]
-    passed_vv: wp.array[sym33]
-    passed_w: wp.array[vec3]
-    passed_v: wp.array[vec3]
-    effort: wp.array[real]
-    multiplier_w: wp.array[vec3]
-    multiplier_v: wp.array[vec3]
+    passed_ww: Symmetrics
+    passed_wv: Matrices
+    passed_vv: Symmetrics
+    passed_w: Vectors
+    passed_v: Vectors
+    effort: Reals
+    multiplier_w: Vectors
+    multiplier_v: Vectors
 
 
 @wp.struct

@@ -19,22 +19,44 @@ WIDTH = wp.constant(width)
 MAX_SPEED = wp.constant(scalar(1000.0))
 
 
+# Threads of a GPU's block at most, and worlds of a warp: all its threads have one lane.
+BLOCK = wp.constant(256)
+WARP = wp.constant(32)
+
+
 @wp.struct
 class Pack:
-    """The worlds that one thread computes, side by side."""
+    """The worlds that one thread computes, side by side, and its share of them."""
 
     first: int
-    count: int  # at most WIDTH
+    count: int  # at most WIDTH; 0 where a thread only keeps step with others
     slot: int
+    column: int  # of the scratch
+    lane: int
 
 
 @wp.func
-def pack_at(n: int, first: int, worlds: int, slot_stride: int):
-    """Pack ``n`` of a launch on ``worlds`` worlds from ``first`` on."""
+def pack_at(tid: int, first: int, worlds: int, slot_stride: int, lanes: int):
+    """Pack and lane of a thread, in a launch on ``worlds`` worlds from ``first`` on.
+
+    On a GPU the threads of a block are its worlds by lanes. A block is full: threads
+    beyond the last world repeat it, and write nothing.
+    """
     pack = Pack()
-    pack.first = first + n * WIDTH
-    pack.count = wp.min(WIDTH, worlds - n * WIDTH)
-    pack.slot = n * slot_stride
+    pack.slot = 0
+    n = tid
+    if WIDTH == 1:
+        side = wp.min(WARP, BLOCK // lanes)
+        block = tid // (side * lanes)
+        thread = tid - block * side * lanes
+        pack.lane = thread // side
+        n = block * side + thread - pack.lane * side
+        pack.first = first + wp.min(n, worlds - 1)
+    else:
+        pack.lane = 0
+        pack.first = first + n * WIDTH
+    pack.count = wp.min(WIDTH, wp.max(worlds - n * WIDTH, 0))
+    pack.column = n * WIDTH * slot_stride
     return pack
 
 
