@@ -88,7 +88,17 @@ def body_equation(m: Model, sc: Scratch, offsets: Offsets, i: int):
 
 
 @plain
-def eliminate_axis(m: Model, sc: Scratch, offsets: Offsets, i: int):
+def eliminate_axis(
+    m: Model,
+    sc: Scratch,
+    offsets: Offsets,
+    i: int,
+    ww: sym33,
+    wv: mat33,
+    vv: sym33,
+    n: vec3,
+    f: vec3,
+):
     """Take the joint's dof out of body ``i``'s equation; pass the rest on.
 
     Reads: m.body_parent, m.v_start, sc.axis_w, sc.axis_v, sc.joint_push,
@@ -96,7 +106,6 @@ def eliminate_axis(m: Model, sc: Scratch, offsets: Offsets, i: int):
     Writes: sc.lever_w, sc.lever_v, sc.share, sc.passed_ww, sc.passed_wv, sc.passed_vv,
         sc.passed_w, sc.passed_v, sc.effort.
     """
-    ww, wv, vv, n, f = body_equation(m, sc, offsets, i)
     at = offsets.solve_body + i
     here = offsets.reading + i
     k = load(m.v_start, i)
@@ -156,7 +165,17 @@ def change_axis(m: Model, sc: Scratch, offsets: Offsets, i: int):
 
 
 @plain
-def solve_free(m: Model, sc: Scratch, offsets: Offsets, i: int):
+def solve_free(
+    m: Model,
+    sc: Scratch,
+    offsets: Offsets,
+    i: int,
+    ww: sym33,
+    wv: mat33,
+    vv: sym33,
+    n: vec3,
+    f: vec3,
+):
     """Solve a free root's own equation: 6 x 6, by blocks.
 
     With C = vv^-1 and Y = (ww - wv C wv^T)^-1, w = Y (n - wv C f) and
@@ -165,7 +184,6 @@ def solve_free(m: Model, sc: Scratch, offsets: Offsets, i: int):
     Reads: m.v_start, sc.pose, sc.joint_push.
     Writes: sc.change_w, sc.change_v, sc.dv, sc.root_ww, sc.root_wv, sc.root_vv.
     """
-    ww, wv, vv, n, f = body_equation(m, sc, offsets, i)
     k = load(m.v_start, i)
     p = translation(load(sc.pose, offsets.body + i))
     push = offsets.solve_dof + k
@@ -206,15 +224,16 @@ def solve_tree(m: Model, sc: Scratch, offsets: Offsets, lane: int, lanes: int):
     """
     if lane == 0:
         rest_world(sc, offsets)
-    for n in range(m.body_levels):
-        level = m.body_levels - 1 - n
+    for turn in range(m.body_levels):
+        level = m.body_levels - 1 - turn
         start = load(m.body_level_start, level)
         for p in range(start + lane, load(m.body_level_start, level + 1), lanes):
             i = load(m.body_level, p)
+            ww, wv, vv, n, f = body_equation(m, sc, offsets, i)
             if load(m.joint_kind, i) == JointKind.FREE:
-                solve_free(m, sc, offsets, i)
+                solve_free(m, sc, offsets, i, ww, wv, vv, n, f)
             else:
-                eliminate_axis(m, sc, offsets, i)
+                eliminate_axis(m, sc, offsets, i, ww, wv, vv, n, f)
         sync(lane)
     for level in range(m.body_levels):
         start = load(m.body_level_start, level)

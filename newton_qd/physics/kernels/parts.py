@@ -161,14 +161,22 @@ def body_part(m: Model, sc: Scratch, offsets: Offsets, i: int, touching: int):
 
 
 @plain
-def axis_part(m: Model, sc: Scratch, offsets: Offsets, i: int, touching: int):
+def axis_part(
+    m: Model,
+    sc: Scratch,
+    offsets: Offsets,
+    i: int,
+    rw: vec3,
+    rv: vec3,
+    qw: vec3,
+    qv: vec3,
+):
     """Parts of body ``i`` and of its joint, which has one dof.
 
     Reads: m.body_parent, m.v_start, sc.dv, sc.effort.
     Writes: sc.passed_w, sc.passed_v, g.axis_w, g.axis_v, g.joint_push, g.joint_weight,
         g.change_w, g.change_v, g.dv.
     """
-    rw, rv, qw, qv = body_part(m, sc, offsets, i, touching)
     here = offsets.reading + i
     k = load(m.v_start, i)
     dof = offsets.solve_dof + k
@@ -189,14 +197,18 @@ def axis_part(m: Model, sc: Scratch, offsets: Offsets, i: int, touching: int):
 
 
 @plain
-def free_part(m: Model, sc: Scratch, offsets: Offsets, i: int, touching: int):
+def free_part(
+    m: Model,
+    sc: Scratch,
+    offsets: Offsets,
+    i: int,
+):
     """Parts of a free root, whose place is also where its forces act.
 
     Reads: m.v_start, sc.pose, sc.joint_push, sc.change_w, sc.multiplier_w,
         sc.multiplier_v, g.dv.
     Writes: g.pose, g.joint_push, g.change_w, g.change_v, g.dv.
     """
-    body_part(m, sc, offsets, i, touching)
     k = offsets.solve_dof + load(m.v_start, i)
     p = translation(load(sc.pose, offsets.body + i))
     xw = load(sc.change_w, offsets.solve_body + i)

@@ -50,7 +50,7 @@ from .multipliers import (
     multiplier_free,
     rest_multiplier,
 )
-from .parts import axis_part, free_part, pair_part
+from .parts import axis_part, body_part, free_part, pair_part
 from .structs import Model, Offsets, Scratch
 
 
@@ -102,10 +102,11 @@ def adj_solve(m: Model, sc: Scratch, offsets: Offsets, lane: int, lanes: int):
         start = load(m.body_level_start, level)
         for p in range(start + lane, load(m.body_level_start, level + 1), lanes):
             i = load(m.body_level, p)
+            rw, rv, qw, qv = body_part(m, sc, offsets, i, touching)
             if load(m.joint_kind, i) == JointKind.FREE:
-                free_part(m, sc, offsets, i, touching)
+                free_part(m, sc, offsets, i)
             else:
-                axis_part(m, sc, offsets, i, touching)
+                axis_part(m, sc, offsets, i, rw, rv, qw, qv)
         sync(lane)
 
 
