@@ -32,7 +32,7 @@ from {package}.structs import Model, Scratch, offsets_at
 def solve_once(m: Model, sc: Scratch):
     solve(m, place(sc, wp.tid()), offsets_at(m, 0, 1, 0, 0), 0, 1)
 """
-FOUND = ("change_w", "change_v", "dv")
+FOUND = ("slip", "dv")
 # what the changes are linear in: differences have no other error than rounding
 LINEAR = ("push", "joint_push", "wrench_w", "wrench_v")
 OTHERS = ("inertia", "moment", "parameter", "joint_weight", "axis_w", "axis_v", "pose")
@@ -76,7 +76,7 @@ class Solve:
         bodies, dofs, contacts = slice(1, nb + 1), slice(nv), slice(nc)
         if name in ("axis_w", "axis_v", "dv", "joint_push", "joint_weight"):
             return dofs
-        if name in ("push", "point", "normal", "weight_n", "weight_t"):
+        if name in ("slip", "push", "point", "normal", "weight_n", "weight_t"):
             return contacts
         if name == "parameter":
             start = self.model.parameters.mass

@@ -26,16 +26,16 @@ _PER_MOTION = ("twist_w", "twist_v", "bias_w", "bias_v", "wrench_w", "wrench_v")
 _PER_CONTACT = ("point", "arm", "normal", "velocity", "gap")
 _PER_SOLVE_CONTACT = ("load", "push_n", "push", "weight_n")
 _PER_SOLVE_CONTACT += ("weight_t", "slip")
-_PER_SOLVE_BODY = ("change_w", "change_v")
 _PER_SOLVE_DOF = ("dv", "joint_push", "joint_weight")
 # Arrays of the linear solves. Their adjoint is written by hand and needs no memory.
-_FACTORS = ("lever_w", "lever_v", "share")
+_PER_SOLVE_BODY = ("change_w", "change_v", "lever_w", "lever_v", "share")
 _ROOT_FACTORS = ("root_ww", "root_wv", "root_vv")
 _ANSWERS = ("answer_w", "answer_v", "answer_dv")
-_PAIRED = ("pair_weight", "pair_impulse", "pair_adjoint", "pair_coupling")
+_PAIRED = ("pair_weight", "pair_impulse", "pair_adjoint", "pair_w", "pair_v")
 _PASSED = ("passed_ww", "passed_wv", "passed_vv", "passed_w", "passed_v", "effort")
 _PASSED += ("multiplier_w", "multiplier_v")
-_WITHOUT_ADJOINT = (*_FACTORS, *_ROOT_FACTORS, *_ANSWERS, *_PAIRED, *_PASSED)
+_WITHOUT_ADJOINT = (*_PER_SOLVE_BODY, *_ROOT_FACTORS, *_ANSWERS, *_PAIRED)
+_WITHOUT_ADJOINT += ("pair_coupling", *_PASSED)
 _PER_READING = ("body_impulse", "body_angular_impulse", "body_normal_impulse")
 _PER_READING += ("position", "com", "com_velocity")
 _REPORTED = ("impulse", "angular_impulse", "normal_impulse")
@@ -299,11 +299,10 @@ def _entries(system: System, adjoint: bool) -> dict[str, int]:
         **dict.fromkeys(_PER_SOLVE_CONTACT, solves * nc),
         **dict.fromkeys(_PER_SOLVE_BODY, solves * (system.nb + 1)),
         **dict.fromkeys(_PER_SOLVE_DOF, solves * system.nv),
-        **dict.fromkeys(_FACTORS, solves * (system.nb + 1)),
         **dict.fromkeys(_ROOT_FACTORS, solves),
         **dict.fromkeys(_ANSWERS[:2], coupled * (system.nb + 1)),
         "answer_dv": coupled * system.nv,
-        **dict.fromkeys(_PAIRED[:3], coupled),
+        **dict.fromkeys(_PAIRED, coupled),
         "pair_coupling": coupled * pairs,
         **dict.fromkeys(_PASSED, system.nb + 1),
         **dict.fromkeys(_PER_READING, system.nb + 1),

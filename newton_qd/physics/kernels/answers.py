@@ -32,15 +32,10 @@ def answer_dof(m: Model, offsets: Offsets, j: int):
 
 
 @plain
-def gather_unit(m: Model, sc: Scratch, offsets: Offsets, j: int, i: int):
-    """Wrenches on body ``i`` of pair ``j``'s unit impulses, with what children hand on.
+def pair_side(m: Model, j: int, i: int):
+    """1 for the first body of pair ``j``, -1 for the second, 0 for others.
 
-    A column for each axis of the world. They are where the answers will be.
-
-    Reads: m.v_start, m.child_start, m.child, m.contact_body, m.contact_partner,
-        m.pair_lead, sc.point, sc.lever_w, sc.lever_v, sc.answer_w, sc.answer_v,
-        sc.answer_dv.
-    Writes: sc.answer_w, sc.answer_v.
+    Reads: m.contact_body, m.contact_partner, m.pair_lead.
     """
     lead = load(m.pair_lead, j)
     side = scalar(0.0)
@@ -48,6 +43,21 @@ def gather_unit(m: Model, sc: Scratch, offsets: Offsets, j: int, i: int):
         side = scalar(1.0)
     if load(m.contact_body, load(m.contact_partner, lead)) == i:
         side = scalar(-1.0)
+    return side
+
+
+@plain
+def gather_unit(m: Model, sc: Scratch, offsets: Offsets, j: int, i: int):
+    """Wrenches on body ``i`` of pair ``j``'s unit impulses, with what children hand on.
+
+    A column for each axis of the world. They are where the answers will be.
+
+    Reads: m.v_start, m.child_start, m.child, m.pair_lead, sc.point, sc.lever_w,
+        sc.lever_v, sc.answer_w, sc.answer_v, sc.answer_dv.
+    Writes: sc.answer_w, sc.answer_v.
+    """
+    lead = load(m.pair_lead, j)
+    side = pair_side(m, j, i)
     n = side * skew(load(sc.point, offsets.contact + lead))
     f = add_diagonal(mat33(), uniform(side))
     first = answer_body(m, offsets, j)

@@ -146,7 +146,7 @@ def change_axis(m: Model, sc: Scratch, offsets: Offsets, i: int):
 
     Reads: m.body_parent, m.v_start, sc.axis_w, sc.axis_v, sc.change_w, sc.change_v,
         sc.lever_w, sc.lever_v, sc.effort.
-    Writes: sc.change_w, sc.change_v, sc.dv.
+    Writes: sc.dv, sc.change_w, sc.change_v.
     """
     at = offsets.solve_body + i
     up = offsets.solve_body + load(m.body_parent, i)
@@ -182,7 +182,7 @@ def solve_free(
     v = C f - (wv C)^T w. A system has one free root at most.
 
     Reads: m.v_start, sc.pose, sc.joint_push.
-    Writes: sc.change_w, sc.change_v, sc.dv, sc.root_ww, sc.root_wv, sc.root_vv.
+    Writes: sc.dv, sc.change_w, sc.change_v, sc.root_ww, sc.root_wv, sc.root_vv.
     """
     k = load(m.v_start, i)
     p = translation(load(sc.pose, offsets.body + i))
@@ -242,3 +242,20 @@ def solve_tree(m: Model, sc: Scratch, offsets: Offsets, lane: int, lanes: int):
             if load(m.joint_kind, i) != JointKind.FREE:
                 change_axis(m, sc, offsets, i)
         sync(lane)
+
+
+@plain
+def contact_slip(m: Model, sc: Scratch, offsets: Offsets, c: int):
+    """Change of a contact point's velocity by this solve; of a pair, relative.
+
+    Reads: m.contact_body, m.contact_partner, sc.point, sc.change_w, sc.change_v.
+    Writes: sc.slip.
+    """
+    at = offsets.solve_body + load(m.contact_body, c)
+    r = load(sc.point, offsets.contact + c)
+    dv = load(sc.change_v, at) + cross(load(sc.change_w, at), r)
+    partner = load(m.contact_partner, c)
+    if partner >= 0:
+        other = offsets.solve_body + load(m.contact_body, partner)
+        dv = dv - (load(sc.change_v, other) + cross(load(sc.change_w, other), r))
+    store(sc.slip, offsets.solve_contact + c, dv)

@@ -100,23 +100,6 @@ def contact_predictor(m: Model, sc: Scratch, offsets: Offsets, c: int):
     store(sc.push, offsets.solve_contact + c, push * normal - wt * vt)
 
 
-@stage
-def contact_slip(m: Model, sc: Scratch, offsets: Offsets, c: int):
-    """Change of a contact point's velocity by this solve; of a pair, relative.
-
-    Reads: m.contact_body, m.contact_partner, sc.point, sc.change_w, sc.change_v.
-    Writes: sc.slip.
-    """
-    at = offsets.solve_body + load(m.contact_body, c)
-    r = load(sc.point, offsets.contact + c)
-    dv = load(sc.change_v, at) + cross(load(sc.change_w, at), r)
-    partner = load(m.contact_partner, c)
-    if partner >= 0:
-        other = offsets.solve_body + load(m.contact_body, partner)
-        dv = dv - (load(sc.change_v, other) + cross(load(sc.change_w, other), r))
-    store(sc.slip, offsets.solve_contact + c, dv)
-
-
 @wp.func
 def clipped_impulse(sc: Scratch, offsets: Offsets, c: int):
     """Normal impulse of contact ``c`` in the solve before: linear, clipped at zero.

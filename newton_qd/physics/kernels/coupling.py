@@ -114,7 +114,7 @@ def pair_motion(
 ):
     """Relative velocity at pair ``j``'s point, with the impulses of those before it.
 
-    Reads: m.contact_body, m.contact_partner, m.pair_lead, sc.point, move, turn,
+    Reads: m.contact_body, m.contact_partner, m.pair_lead, sc.point, turn, move,
         impulse.
 
     Args:
@@ -226,8 +226,8 @@ def pairs_touch(m: Model, sc: Scratch, offsets: Offsets):
 def couple_pairs(m: Model, sc: Scratch, offsets: Offsets, lane: int, lanes: int):
     """Add the pairs to the tree's changes of velocity.
 
-    Reads: m.nb, m.nv, m.pairs, sc.change_w, sc.change_v, sc.dv.
-    Writes: sc.change_w, sc.change_v, sc.dv.
+    Reads: m.nb, m.nv, m.pairs, sc.dv, sc.change_w, sc.change_v.
+    Writes: sc.dv, sc.change_w, sc.change_v.
     """
     for j in range(m.pairs):
         answer(m, sc, offsets, j, lane, lanes)

@@ -33,21 +33,25 @@ def limit_law(m: Model, offsets: Offsets, k: int, q: real, rate: real):
     width = uniform(m.limit_smoothing)
     lower = q - constant(m.limit_lower, k)
     upper = constant(m.limit_upper, k) - q
-    # Hunt and Crossley's factor: a limit gives back less than it takes
-    away = m.limit_dissipation * rate
-    inward = neg(away) - scalar(1.0)
-    away = away - scalar(1.0)
-    brake = uniform(DISSIPATION_WIDTH)
     depth_lower = kl * penetration(lower, width)
     depth_upper = kl * penetration(upper, width)
-    damper_lower = penetration(away, brake)
-    damper_upper = penetration(inward, brake)
-    weight = m.h * kl * (
-        damper_lower * gate(lower, width) + damper_upper * gate(upper, width)
-    ) + m.limit_dissipation * (
-        depth_lower * gate(away, brake) + depth_upper * gate(inward, brake)
-    )
-    return depth_lower * damper_lower - depth_upper * damper_upper, weight
+    force = depth_lower - depth_upper
+    weight = m.h * kl * (gate(lower, width) + gate(upper, width))
+    if m.limit_dissipation > scalar(0.0):
+        # Hunt and Crossley's factor: a limit gives back less than it takes
+        away = m.limit_dissipation * rate
+        inward = neg(away) - scalar(1.0)
+        away = away - scalar(1.0)
+        brake = uniform(DISSIPATION_WIDTH)
+        damper_lower = penetration(away, brake)
+        damper_upper = penetration(inward, brake)
+        force = depth_lower * damper_lower - depth_upper * damper_upper
+        weight = m.h * kl * (
+            damper_lower * gate(lower, width) + damper_upper * gate(upper, width)
+        ) + m.limit_dissipation * (
+            depth_lower * gate(away, brake) + depth_upper * gate(inward, brake)
+        )
+    return force, weight
 
 
 @stage

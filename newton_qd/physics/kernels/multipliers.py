@@ -5,22 +5,61 @@ They are the changes that the adjoints of changes would cause, were they impulse
 
 from newton_qd.physics.kinds import JointKind
 
-from . import plain, sync, vec3
-from .coupling import answered, pair_motion, with_answers
+from . import plain, scalar, sync, vec3
+from .answers import pair_side
+from .coupling import PAIRS, answered, pair_motion, with_answers
 from .cpp.algebra import cross, dot, translation, vector
-from .cpp.memory import load, load_adjoint, store
+from .cpp.memory import add_adjoint, load, load_adjoint, store, store_adjoint
 from .cpp.operators import add, mul, neg, sub  # noqa: F401
 from .structs import Model, Offsets, Scratch
 
 
 @plain
-def adjoint_wrench(m: Model, sc: Scratch, offsets: Offsets, i: int):
-    """Adjoint of body ``i``'s change of twist, with what its children hand on.
+def pair_slip(m: Model, sc: Scratch, offsets: Offsets, j: int):
+    """Wrench on pair ``j``'s first body of the adjoints of both its slips; clears them.
 
-    Reads: m.child_start, m.child, sc.passed_w, sc.passed_v, g.change_w, g.change_v.
+    Both sides slip relative to the other, each at its own point.
+
+    Reads: m.contact_body, m.contact_partner, m.pair_lead, sc.point, sc.change_w,
+        g.slip.
+    Writes: sc.pair_w, sc.pair_v, g.point, g.slip.
     """
-    n = load_adjoint(sc.change_w, offsets.solve_body + i)
-    f = load_adjoint(sc.change_v, offsets.solve_body + i)
+    a = load(m.pair_lead, j)
+    b = load(m.contact_partner, a)
+    one = load_adjoint(sc.slip, offsets.solve_contact + a)
+    other = load_adjoint(sc.slip, offsets.solve_contact + b)
+    turned = load(sc.change_w, offsets.solve_body + load(m.contact_body, a)) - load(
+        sc.change_w, offsets.solve_body + load(m.contact_body, b)
+    )
+    r = load(sc.point, offsets.contact + a)
+    there = load(sc.point, offsets.contact + b)
+    store(sc.pair_w, offsets.pair + j, cross(r, one) - cross(there, other))
+    store(sc.pair_v, offsets.pair + j, one - other)
+    add_adjoint(sc.point, offsets.contact + a, cross(one, turned))
+    add_adjoint(sc.point, offsets.contact + b, cross(turned, other))
+    store_adjoint(sc.slip, offsets.solve_contact + a, vec3())
+    store_adjoint(sc.slip, offsets.solve_contact + b, vec3())
+
+
+@plain
+def adjoint_wrench(m: Model, sc: Scratch, offsets: Offsets, i: int):
+    """Wrench on body ``i`` of the adjoints of slips, with what its children hand on.
+
+    Reads: m.pairs, m.child_start, m.child, m.contact_start, m.contact_stop, sc.point,
+        sc.pair_w, sc.pair_v, sc.passed_w, sc.passed_v, g.slip.
+    """
+    n = vec3()
+    f = vec3()
+    for c in range(load(m.contact_start, i), load(m.contact_stop, i)):
+        slip = load_adjoint(sc.slip, offsets.solve_contact + c)
+        n = n + cross(load(sc.point, offsets.contact + c), slip)
+        f = f + slip
+    if PAIRS:
+        for j in range(m.pairs):
+            side = pair_side(m, j, i)
+            if side != scalar(0.0):
+                n = n + side * load(sc.pair_w, offsets.pair + j)
+                f = f + side * load(sc.pair_v, offsets.pair + j)
     for j in range(load(m.child_start, i), load(m.child_start, i + 1)):
         child = offsets.reading + load(m.child, j)
         n = n + load(sc.passed_w, child)

@@ -1,10 +1,12 @@
 """What each quantity takes of the adjoint of a linear solve; see :mod:`.solve`.
 
-An adjoint is added to where one lane owns the entry, so without atomics. Those of the
-changes are 0 in the end, as before.
+An adjoint is added to where one lane owns the entry, so without atomics. Those of what
+the solve found are 0 in the end, as before.
 """
 
-from . import plain, quat, real, vec3
+from . import plain, quat, real, scalar, vec3
+from .answers import pair_side
+from .coupling import PAIRS
 from .cpp.algebra import component, cross, dot, form_slope, rigid, translation, vector
 from .cpp.memory import add_adjoint, load, load_adjoint, store, store_adjoint
 from .cpp.operators import add, mul, neg, sub  # noqa: F401
@@ -16,10 +18,12 @@ from .structs import Model, Offsets, Scratch
 def contact_part(
     sc: Scratch, offsets: Offsets, c: int, xw: vec3, xv: vec3, lw: vec3, lv: vec3
 ):
-    """Parts of contact ``c``; returns its impulse, and its weight times multiplier.
+    """Parts of contact ``c``; returns its impulse, and that of the adjoint.
 
-    Reads: sc.point, sc.normal, sc.push, sc.weight_n, sc.weight_t.
-    Writes: g.point, g.normal, g.push, g.weight_n, g.weight_t.
+    The adjoint's is the adjoint of the slip, less the weight times the multiplier.
+
+    Reads: sc.point, sc.normal, sc.push, sc.weight_n, sc.weight_t, g.slip.
+    Writes: g.point, g.normal, g.push, g.weight_n, g.weight_t, g.slip.
 
     Args:
         sc: The scratch.
@@ -42,29 +46,31 @@ def contact_part(
     both = un * ln
     impulse = load(sc.push, at) - wt * moved - (more * un) * n
     weighted = wt * multiplier + (more * ln) * n
+    back = load_adjoint(sc.slip, at) - weighted
+    store_adjoint(sc.slip, at, vec3())
     add_adjoint(sc.push, at, multiplier)
     add_adjoint(sc.weight_n, at, neg(both))
     add_adjoint(sc.weight_t, at, both - dot(multiplier, moved))
     turned = (more * ln) * moved + (more * un) * multiplier
     add_adjoint(sc.normal, offsets.contact + c, neg(turned))
-    add_adjoint(sc.point, offsets.contact + c, cross(impulse, lw) - cross(weighted, xw))
-    return impulse, weighted
+    add_adjoint(sc.point, offsets.contact + c, cross(impulse, lw) + cross(back, xw))
+    return impulse, back
 
 
 @plain
 def pair_part(m: Model, sc: Scratch, offsets: Offsets, j: int):
     """Parts of pair ``j``; keeps its impulse, and its weight times multiplier.
 
-    Reads: m.contact_body, m.contact_partner, m.pair_lead, sc.change_w, sc.change_v,
-        sc.multiplier_w, sc.multiplier_v.
-    Writes: sc.pair_impulse, sc.pair_adjoint.
+    Reads: m.contact_body, m.contact_partner, m.pair_lead, sc.point, sc.change_w,
+        sc.change_v, sc.pair_w, sc.pair_v, sc.multiplier_w, sc.multiplier_v.
+    Writes: sc.pair_impulse, sc.pair_w, sc.pair_v.
     """
     c = load(m.pair_lead, j)
     a = load(m.contact_body, c)
     b = load(m.contact_body, load(m.contact_partner, c))
     x = offsets.solve_body
     at = offsets.reading
-    impulse, weighted = contact_part(
+    impulse, back = contact_part(
         sc,
         offsets,
         c,
@@ -74,7 +80,10 @@ def pair_part(m: Model, sc: Scratch, offsets: Offsets, j: int):
         load(sc.multiplier_v, at + a) - load(sc.multiplier_v, at + b),
     )
     store(sc.pair_impulse, offsets.pair + j, impulse)
-    store(sc.pair_adjoint, offsets.pair + j, weighted)
+    turned = cross(load(sc.point, offsets.contact + c), back)
+    pair = offsets.pair + j
+    store(sc.pair_w, pair, load(sc.pair_w, pair) + turned)
+    store(sc.pair_v, pair, load(sc.pair_v, pair) + back)
 
 
 @plain
@@ -82,8 +91,7 @@ def rigid_part(m: Model, sc: Scratch, offsets: Offsets, i: int):
     """Parts of body ``i``'s inertia and wrench; returns its residual wrenches.
 
     Reads: m.h, m.parameters, sc.parameter, sc.inertia, sc.moment, sc.wrench_w,
-        sc.wrench_v, sc.change_w, sc.change_v, sc.multiplier_w, sc.multiplier_v,
-        g.change_w, g.change_v.
+        sc.wrench_v, sc.change_w, sc.change_v, sc.multiplier_w, sc.multiplier_v.
     Writes: g.parameter, g.inertia, g.moment, g.wrench_w, g.wrench_v.
     """
     body = offsets.body + i
@@ -97,8 +105,8 @@ def rigid_part(m: Model, sc: Scratch, offsets: Offsets, i: int):
     mass = body_mass(m, sc, offsets, i)
     rw = neg(m.h * load(sc.wrench_w, motion) + io * xw + cross(hm, xv))
     rv = cross(hm, xw) - mass * xv - m.h * load(sc.wrench_v, motion)
-    qw = load_adjoint(sc.change_w, offsets.solve_body + i) - io * lw - cross(hm, lv)
-    qv = load_adjoint(sc.change_v, offsets.solve_body + i) + cross(hm, lw) - mass * lv
+    qw = neg(io * lw + cross(hm, lv))
+    qv = cross(hm, lw) - mass * lv
     add_adjoint(sc.wrench_w, motion, neg(m.h * lw))
     add_adjoint(sc.wrench_v, motion, neg(m.h * lv))
     add_adjoint(sc.inertia, body, neg(form_slope(lw, xw)))
@@ -114,13 +122,11 @@ def body_part(m: Model, sc: Scratch, offsets: Offsets, i: int, touching: int):
     """Parts of body ``i`` and its contacts; returns its subtree's residual wrenches.
 
     The first is of the solve, the second of its adjoint. Children have left the first
-    where joints pass wrenches on, and the second in the adjoint of their change.
+    where joints pass wrenches on, and the second in the place of their multipliers.
 
-    Reads: m.child_start, m.child, m.contact_start, m.contact_stop, m.contact_body,
-        m.contact_partner, m.pair_lead, sc.point, sc.change_w, sc.change_v,
-        sc.pair_impulse, sc.pair_adjoint, sc.passed_w, sc.passed_v, sc.multiplier_w,
-        sc.multiplier_v, g.change_w, g.change_v.
-    Writes: g.change_w, g.change_v.
+    Reads: m.pairs, m.child_start, m.child, m.contact_start, m.contact_stop,
+        m.pair_lead, sc.point, sc.change_w, sc.change_v, sc.pair_impulse, sc.pair_w,
+        sc.pair_v, sc.passed_w, sc.passed_v, sc.multiplier_w, sc.multiplier_v.
     """
     rw, rv, qw, qv = rigid_part(m, sc, offsets, i)
     xw = load(sc.change_w, offsets.solve_body + i)
@@ -129,34 +135,28 @@ def body_part(m: Model, sc: Scratch, offsets: Offsets, i: int, touching: int):
     lv = load(sc.multiplier_v, offsets.reading + i)
     for c in range(load(m.contact_start, i), load(m.contact_stop, i)):
         r = load(sc.point, offsets.contact + c)
-        impulse, weighted = contact_part(sc, offsets, c, xw, xv, lw, lv)
+        impulse, back = contact_part(sc, offsets, c, xw, xv, lw, lv)
         rw = rw + cross(r, impulse)
         rv = rv + impulse
-        qw = qw - cross(r, weighted)
-        qv = qv - weighted
-    for j in range(touching):
-        lead = load(m.pair_lead, j)
-        first = load(m.contact_body, lead) == i
-        if first or load(m.contact_body, load(m.contact_partner, lead)) == i:
-            r = load(sc.point, offsets.contact + lead)
-            impulse = load(sc.pair_impulse, offsets.pair + j)
-            weighted = load(sc.pair_adjoint, offsets.pair + j)
-            if not first:
-                impulse = neg(impulse)
-                weighted = neg(weighted)
-            rw = rw + cross(r, impulse)
-            rv = rv + impulse
-            qw = qw - cross(r, weighted)
-            qv = qv - weighted
+        qw = qw + cross(r, back)
+        qv = qv + back
+    if PAIRS:
+        for j in range(m.pairs):
+            side = pair_side(m, j, i)
+            if side != scalar(0.0):
+                qw = qw + side * load(sc.pair_w, offsets.pair + j)
+                qv = qv + side * load(sc.pair_v, offsets.pair + j)
+                if touching > 0:
+                    lead = offsets.contact + load(m.pair_lead, j)
+                    impulse = side * load(sc.pair_impulse, offsets.pair + j)
+                    rw = rw + cross(load(sc.point, lead), impulse)
+                    rv = rv + impulse
     for j in range(load(m.child_start, i), load(m.child_start, i + 1)):
-        child = load(m.child, j)
-        below = offsets.solve_body + child
-        rw = rw + load(sc.passed_w, offsets.reading + child)
-        rv = rv + load(sc.passed_v, offsets.reading + child)
-        qw = qw + load_adjoint(sc.change_w, below)
-        qv = qv + load_adjoint(sc.change_v, below)
-        store_adjoint(sc.change_w, below, vec3())
-        store_adjoint(sc.change_v, below, vec3())
+        child = offsets.reading + load(m.child, j)
+        rw = rw + load(sc.passed_w, child)
+        rv = rv + load(sc.passed_v, child)
+        qw = qw + load(sc.multiplier_w, child)
+        qv = qv + load(sc.multiplier_v, child)
     return rw, rv, qw, qv
 
 
@@ -173,9 +173,9 @@ def axis_part(
 ):
     """Parts of body ``i`` and of its joint, which has one dof.
 
-    Reads: m.body_parent, m.v_start, sc.dv, sc.effort.
-    Writes: sc.passed_w, sc.passed_v, g.axis_w, g.axis_v, g.joint_push, g.joint_weight,
-        g.change_w, g.change_v, g.dv.
+    Reads: m.v_start, sc.dv, sc.effort.
+    Writes: sc.passed_w, sc.passed_v, sc.multiplier_w, sc.multiplier_v, g.axis_w,
+        g.axis_v, g.joint_push, g.joint_weight, g.dv.
     """
     here = offsets.reading + i
     k = load(m.v_start, i)
@@ -187,13 +187,10 @@ def axis_part(
     add_adjoint(sc.joint_push, dof, multiplier)
     add_adjoint(sc.joint_weight, dof, neg(multiplier * dv))
     store_adjoint(sc.dv, dof, real())
-    if load(m.body_parent, i) == 0:
-        qw = vec3()
-        qv = vec3()
     store(sc.passed_w, here, rw)
     store(sc.passed_v, here, rv)
-    store_adjoint(sc.change_w, offsets.solve_body + i, qw)
-    store_adjoint(sc.change_v, offsets.solve_body + i, qv)
+    store(sc.multiplier_w, here, qw)
+    store(sc.multiplier_v, here, qv)
 
 
 @plain
@@ -207,7 +204,7 @@ def free_part(
 
     Reads: m.v_start, sc.pose, sc.joint_push, sc.change_w, sc.multiplier_w,
         sc.multiplier_v, g.dv.
-    Writes: g.pose, g.joint_push, g.change_w, g.change_v, g.dv.
+    Writes: g.pose, g.joint_push, g.dv.
     """
     k = offsets.solve_dof + load(m.v_start, i)
     p = translation(load(sc.pose, offsets.body + i))
@@ -229,5 +226,3 @@ def free_part(
         add_adjoint(sc.joint_push, k + 3 + j, component(lw, j))
         store_adjoint(sc.dv, k + j, real())
         store_adjoint(sc.dv, k + 3 + j, real())
-    store_adjoint(sc.change_w, offsets.solve_body + i, vec3())
-    store_adjoint(sc.change_v, offsets.solve_body + i, vec3())

@@ -2,15 +2,15 @@
 
 A solve finds the changes of all velocities x of H x = b: H is the mass matrix with the
 joints' diagonal D and the weights W of the contacts, b the impulses. With the motion
-J_i of body i for unit changes, X_i = J_i x, and the same for contacts,
+J_i of body i for unit changes, X_i = J_i x, and the slip u_c = J_c x of a contact,
 
     H = D + sum J_i^T I_i J_i + sum J_c^T W_c J_c,
     b = t + sum J_i^T w_i + sum J_c^T p_c.
 
-Let y be the adjoint of x, with that of X_i carried to it, y + sum J_i^T Y_i. Then
+Let y be the adjoint of x, and s_c those of the slips: y + sum J_c^T s_c in all. Then
 (Giles 2008, "Collected matrix derivative results", section 2.2.3)
 
-    H l = y,    b_bar = l,    H_bar = -l x^T,
+    H l = y + sum J_c^T s_c,    b_bar = l,    H_bar = -l x^T,
 
 because H is symmetric. So the adjoint is one more solve, with vectors only: the factors
 of the joints are those of the forward pass (:mod:`.articulation`), and pairs are added
@@ -20,17 +20,17 @@ its own:
 
     impulse and diagonal of a joint     l_k,               -l_k x_k
     wrench and inertia of a body        L_i,               -L_i X_i^T
-    push and weight of a contact        m_c,               -m_c u_c^T     (u_c = J_c x)
-    its point r, with p = p_c - W u_c   p x L_w - (W m_c) x X_w
+    push and weight of a contact        m_c,               -m_c u_c^T
+    its point r                         (p_c - W u_c) x L_w + (s_c - W m_c) x X_w
 
 An axis S of joint k moves all bodies of its subtree: X_j and L_j change by dS x_k and
 dS l_k. That gives it the two residual wrenches of the subtree,
 
-    S_bar = l_k sum (w_j - I_j X_j) + x_k sum (Y_j - I_j L_j),
+    S_bar = l_k sum (w_j - I_j X_j) + x_k sum (-I_j L_j),
 
-with the impulses of contacts among the wrenches. A sweep to the root and one back find
-the multipliers (:mod:`.multipliers`); a last one to the root hands out the parts and
-adds up the residuals (:mod:`.parts`).
+with the impulses p_c - W u_c and s_c - W m_c of the contacts among the wrenches. A
+sweep to the root and one back find the multipliers (:mod:`.multipliers`); a last one to
+the root hands out the parts and adds up the residuals (:mod:`.parts`).
 """
 
 import warp as wp
@@ -38,8 +38,7 @@ import warp as wp
 from newton_qd.physics.kinds import JointKind
 
 from . import plain, stage, sync
-from .articulation import solve_tree
-from .contact import contact_slip
+from .articulation import contact_slip, solve_tree
 from .coupling import PAIRS, couple_pairs, pairs_touch
 from .cpp.memory import load
 from .joints import joint_laws
@@ -48,6 +47,7 @@ from .multipliers import (
     hand_back_axis,
     multiplier_axis,
     multiplier_free,
+    pair_slip,
     rest_multiplier,
 )
 from .parts import axis_part, body_part, free_part, pair_part
@@ -56,11 +56,17 @@ from .structs import Model, Offsets, Scratch
 
 @plain
 def solve(m: Model, sc: Scratch, offsets: Offsets, lane: int, lanes: int):
-    """Changes of all velocities and twists."""
+    """Changes of all velocities, and of those of contact points.
+
+    Reads: m.nc.
+    """
     solve_tree(m, sc, offsets, lane, lanes)
     if PAIRS:
         if pairs_touch(m, sc, offsets) > 0:
             couple_pairs(m, sc, offsets, lane, lanes)
+    for c in range(lane, m.nc, lanes):
+        contact_slip(m, sc, offsets, c)
+    sync(lane)
 
 
 @wp.func_grad(solve)
@@ -72,6 +78,10 @@ def adj_solve(m: Model, sc: Scratch, offsets: Offsets, lane: int, lanes: int):
     sync(lane)
     if lane == 0:
         rest_multiplier(sc, offsets)
+    if PAIRS:
+        for j in range(lane, m.pairs, lanes):
+            pair_slip(m, sc, offsets, j)
+        sync(lane)
     for n in range(m.body_levels):
         level = m.body_levels - 1 - n
         start = load(m.body_level_start, level)
@@ -112,12 +122,6 @@ def adj_solve(m: Model, sc: Scratch, offsets: Offsets, lane: int, lanes: int):
 
 @stage
 def linear_solve(m: Model, sc: Scratch, offsets: Offsets, lane: int, lanes: int):
-    """What joints add, changes of all velocities, and of those of contact points.
-
-    Reads: m.nc.
-    """
+    """What joints add, then changes of all velocities."""
     joint_laws(m, sc, offsets, lane, lanes)
     solve(m, sc, offsets, lane, lanes)
-    for c in range(lane, m.nc, lanes):
-        contact_slip(m, sc, offsets, c)
-    sync(lane)

@@ -177,13 +177,12 @@ class Scratch:
     # joints, per solve: impulse at the old velocity, and what resists the change
     joint_push: Reals
     joint_weight: Reals
-    # what a solve finds: the change of twist of each body, and of each velocity
+    dv: Reals  # what a solve finds
+    # without adjoints, per solve: the changes of the bodies' twists, the factors of
+    # the joints and of a free root, and what bodies and degrees of freedom answer to a
+    # unit impulse of a pair along each axis, with the pairs before it
     change_w: Vectors
     change_v: Vectors
-    dv: Reals
-    # without adjoints, per solve: the factors of the joints and of a free root, and
-    # what bodies and degrees of freedom answer to a unit impulse of a pair along each
-    # axis, with the pairs before it
     lever_w: Vectors
     lever_v: Vectors
     share: Reals
@@ -197,6 +196,8 @@ class Scratch:
     pair_coupling: Matrices  # for each pair and each pair before it
     pair_impulse: Vectors
     pair_adjoint: Vectors
+    pair_w: Vectors  # wrench of the adjoint on the first body
+    pair_v: Vectors
     # without adjoints, per slot: what a joint passes on to the parent, the effort that
     # it takes, and multipliers, the changes of twist in the adjoint of a solve
     passed_ww: Symmetrics

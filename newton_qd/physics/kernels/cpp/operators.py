@@ -79,13 +79,21 @@ def mul(a: real, b: real) -> real:
     ...
 
 
-@wp.func_native(*native("A / B", "Real x = adj_RET / B; adj_A += x; adj_B -= x * RET;"))
+# their adjoints divide once
+@wp.func_native(
+    *native(
+        "A / B",
+        "Real y = Real(1) / B; Real x = adj_RET * y; adj_A += x; adj_B -= x * A * y;",
+    )
+)
 def div(a: real, b: real) -> real:
     """Quotient."""
     ...
 
 
-@wp.func_native(*native("Real(s) / A", "adj_A -= adj_RET / A * RET;"))
+@wp.func_native(
+    *native("Real(s) / A", "Real y = Real(1) / A; adj_A -= adj_RET * Real(s) * y * y;")
+)
 def div(s: scalar, a: real) -> real:
     """Quotient of one number for all worlds."""
     ...
