@@ -17,7 +17,7 @@ from .cpp.algebra import cross, dot, transform_point
 from .cpp.memory import constant, load, store
 from .cpp.numbers import sqrt, uniform
 from .cpp.operators import add, div, mul, neg, sub  # noqa: F401
-from .cpp.smooth import gate, penetration
+from .cpp.smooth import friction_weight, gate, penetration
 from .joints import DISSIPATION_WIDTH
 from .nearest import touch_obstacle
 from .pair import touch_partner
@@ -26,8 +26,6 @@ from .structs import Model, Offsets, Scratch
 
 # Clipping switches over this fraction of its natural scale.
 CLIP_WIDTH = wp.constant(scalar(0.5))
-# Steps of Newton's method for a friction weight: from its bound, 3 % off at most.
-WEIGHT_STEPS = wp.constant(2)
 
 
 @wp.func
@@ -187,45 +185,6 @@ def contact_given(m: Model, sc: Scratch, offsets: Offsets, c: int, p: int):
         before = load(sc.weight_t, offsets.before + c)
         store(sc.weight_t, at, real())
         store(sc.push, at, push - (wt * (mass + before) / (mass + wt)) * slip)
-
-
-@wp.func
-def friction_weight(
-    mass: real, bound: real, before: real, slip_squared: real, width: scalar
-):
-    """Weight w = mu J / sqrt(slip^2 + width^2) at the slip that w itself leads to.
-
-    A contact that moves like a point of ``mass`` and slipped by s with the weight
-    ``before`` slips by s (mass + before) / (mass + w) with w. At w = ``before`` that is
-    s: the mass changes how fast the solves converge, not what they converge to. More
-    than a contact moves damps the change of weight, less lets it overshoot. Newton's
-    method starts from below, where the law has slip + width in the place of the root.
-
-    Args:
-        mass: That of the robot: no less than what the contact moves [kg].
-        bound: mu J, the largest friction impulse [N s].
-        before: Weight in the solve before [kg].
-        slip_squared: Slip after that solve, squared [m^2/s^2].
-        width: Velocity below which friction is viscous [m/s].
-    """
-    e2 = width * width
-    momentum = mass + before
-    momentum2 = slip_squared * momentum * momentum
-    half = (scalar(0.5) * width) * mass
-    b = sqrt(momentum2 + half * half) + width * mass - bound
-    w = (
-        scalar(2.0)
-        * bound
-        * mass
-        / (b + sqrt(b * b + (scalar(4.0) * width) * bound * mass))
-    )
-    for _ in range(WEIGHT_STEPS):
-        inertia = mass + w
-        slip2 = momentum2 / (inertia * inertia)
-        speed = sqrt(e2 + slip2)
-        slope = (e2 + slip2 * mass / inertia) / speed
-        w = w - (w * speed - bound) / slope
-    return w
 
 
 @stage

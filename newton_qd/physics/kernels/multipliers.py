@@ -68,13 +68,12 @@ def adjoint_wrench(m: Model, sc: Scratch, offsets: Offsets, i: int):
 
 
 @plain
-def hand_back_axis(m: Model, sc: Scratch, offsets: Offsets, i: int):
+def hand_back_axis(m: Model, sc: Scratch, offsets: Offsets, i: int, n: vec3, f: vec3):
     """The adjoint's effort of a joint with one dof, and what the joint passes on.
 
     Reads: m.v_start, sc.axis_w, sc.axis_v, sc.lever_w, sc.lever_v, sc.share, g.dv.
     Writes: sc.passed_w, sc.passed_v, sc.effort.
     """
-    n, f = adjoint_wrench(m, sc, offsets, i)
     at = offsets.solve_body + i
     here = offsets.reading + i
     k = load(m.v_start, i)
@@ -89,13 +88,12 @@ def hand_back_axis(m: Model, sc: Scratch, offsets: Offsets, i: int):
 
 
 @plain
-def multiplier_free(m: Model, sc: Scratch, offsets: Offsets, i: int):
+def multiplier_free(m: Model, sc: Scratch, offsets: Offsets, i: int, n: vec3, f: vec3):
     """Multipliers of a free root.
 
     Reads: m.v_start, sc.pose, sc.root_ww, sc.root_wv, sc.root_vv, g.dv.
     Writes: sc.multiplier_w, sc.multiplier_v.
     """
-    n, f = adjoint_wrench(m, sc, offsets, i)
     k = offsets.solve_dof + load(m.v_start, i)
     p = translation(load(sc.pose, offsets.body + i))
     origin = vector(

@@ -43,6 +43,7 @@ from .coupling import PAIRS, couple_pairs, pairs_touch
 from .cpp.memory import load
 from .joints import joint_laws
 from .multipliers import (
+    adjoint_wrench,
     couple_multipliers,
     hand_back_axis,
     multiplier_axis,
@@ -87,10 +88,11 @@ def adj_solve(m: Model, sc: Scratch, offsets: Offsets, lane: int, lanes: int):
         start = load(m.body_level_start, level)
         for p in range(start + lane, load(m.body_level_start, level + 1), lanes):
             i = load(m.body_level, p)
+            w, v = adjoint_wrench(m, sc, offsets, i)
             if load(m.joint_kind, i) == JointKind.FREE:
-                multiplier_free(m, sc, offsets, i)
+                multiplier_free(m, sc, offsets, i, w, v)
             else:
-                hand_back_axis(m, sc, offsets, i)
+                hand_back_axis(m, sc, offsets, i, w, v)
         sync(lane)
     for level in range(m.body_levels):
         start = load(m.body_level_start, level)

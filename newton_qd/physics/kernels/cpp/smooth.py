@@ -71,6 +71,117 @@ def finite_length(a: vec3):
     return sqrt(SHORTEST * SHORTEST + dot(a, a))
 
 
+# Newton's method, of two steps: from the first weight, 3 % off at most.
+_FRICTION = (
+    ROOT
+    + """
+struct Weight {
+    Real e, moved, mass, bound, b, inner, outer, first, w;
+    // of a step
+    Real y, slip, speed, share, slope, excess;
+};
+auto look = [&](Weight& t) {
+    t.y = Real(1) / (t.mass + t.w);
+    t.slip = t.moved * t.y * t.y;
+    t.speed = root(t.e + t.slip);
+    t.share = t.slip * t.mass * t.y;
+    t.slope = (t.e + t.share) / t.speed;
+    t.excess = t.w * t.speed - t.bound;
+};
+auto start = [&]() {
+    Weight t;
+    t.e = Real(width * width);
+    t.mass = MASS;
+    t.bound = BOUND;
+    t.moved = SQUARED * (MASS + BEFORE) * (MASS + BEFORE);
+    Real half = Real(width / 2) * MASS;
+    t.inner = root(t.moved + half * half);
+    t.b = t.inner + Real(width) * MASS - BOUND;
+    t.outer = root(t.b * t.b + Real(4 * width) * BOUND * MASS);
+    t.w = t.first = Real(2) * BOUND * MASS / (t.b + t.outer);
+    return t;
+};
+auto step = [&](Weight& t) {
+    look(t);
+    t.w -= t.excess / t.slope;
+};
+auto weight = [&]() {
+    Weight t = start();
+    step(t);
+    step(t);
+    return t.w;
+};
+"""
+)
+
+
+@wp.func_native(
+    *native(
+        "weight()",
+        """
+Weight t = start();
+Real old[2];
+for (int n = 0; n < 2; ++n) {
+    old[n] = t.w;
+    step(t);
+}
+Real adj_w = adj_RET, adj_moved = Real(0);
+for (int n = 1; n >= 0; --n) {
+    t.w = old[n];
+    look(t);
+    Real flat = Real(1) / t.slope, fast = Real(1) / t.speed;
+    Real adj_excess = -adj_w * flat;
+    Real adj_slope = -adj_excess * t.excess * flat;
+    Real adj_share = adj_slope * fast;
+    Real adj_speed = adj_excess * t.w - adj_share * t.slope;
+    Real adj_slip = adj_share * MASS * t.y + Real(0.5) * adj_speed * fast;
+    Real adj_y = adj_share * t.slip * MASS + Real(2) * adj_slip * t.moved * t.y;
+    Real adj_inertia = -adj_y * t.y * t.y;
+    adj_w += adj_excess * t.speed + adj_inertia;
+    adj_BOUND -= adj_excess;
+    adj_MASS += adj_share * t.slip * t.y + adj_inertia;
+    adj_moved += adj_slip * t.y * t.y;
+}
+Real whole = Real(1) / (t.b + t.outer);
+Real adj_whole = -adj_w * t.first * whole;
+Real adj_under = adj_whole / (t.outer + t.outer);
+Real adj_b = adj_whole + Real(2) * adj_under * t.b;
+Real adj_inner = adj_b / (t.inner + t.inner);
+adj_moved += adj_inner;
+adj_BOUND += Real(2) * adj_w * MASS * whole + Real(4 * width) * adj_under * MASS;
+adj_BOUND -= adj_b;
+adj_MASS += Real(2) * adj_w * BOUND * whole + Real(4 * width) * adj_under * BOUND
+    + Real(width) * adj_b + Real(width * width / 2) * adj_inner * MASS;
+Real momentum = MASS + BEFORE;
+adj_SQUARED += adj_moved * momentum * momentum;
+Real adj_momentum = Real(2) * adj_moved * SQUARED * momentum;
+adj_MASS += adj_momentum;
+adj_BEFORE += adj_momentum;
+""",
+        _FRICTION,
+    )
+)
+def friction_weight(
+    mass: real, bound: real, before: real, squared: real, width: scalar
+) -> real:
+    """Weight w = mu J / sqrt(slip^2 + width^2) at the slip that w itself leads to.
+
+    A contact that moves like a point of ``mass`` and slipped by s with the weight
+    ``before`` slips by s (mass + before) / (mass + w) with w. At w = ``before`` that is
+    s: the mass changes how fast the solves converge, not what they converge to. More
+    than a contact moves damps the change of weight, less lets it overshoot. Newton's
+    method starts from below, where the law has slip + width in the place of the root.
+
+    Args:
+        mass: That of the robot: no less than what the contact moves [kg].
+        bound: mu J, the largest friction impulse [N s].
+        before: Weight in the solve before [kg].
+        squared: Slip after that solve, squared [m^2/s^2].
+        width: Velocity below which friction is viscous [m/s].
+    """
+    ...
+
+
 _EXPONENTIAL = """
 #if defined(__CUDA_ARCH__)
 Real power = wp::exp(-A);
