@@ -73,7 +73,7 @@ def energy(options: argparse.Namespace) -> Iterator[Row]:
             gain, bare = energies.judge(found), energies.judge(found, elastic=False)
             yield {
                 "robot": name,
-                "h [ms]": 1e3 * one.system.robot.dt / one.system.robot.substeps,
+                "h [ms]": 1e3 * one.system.h,
                 "actions": kind,
                 "gain [J]": gain.largest,
                 "of kinetic": gain.share,
@@ -132,7 +132,7 @@ def order(options: argparse.Namespace) -> Iterator[Row]:
             medians = np.median(found, axis=1)
             yield {
                 "robot": name,
-                "h [ms]": 1e3 * one.system.robot.dt / one.system.robot.substeps,
+                "h [ms]": 1e3 * one.system.h,
                 "start": start,
                 "error at h": medians[0],
                 "at h/2": medians[1],

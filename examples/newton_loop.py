@@ -14,7 +14,8 @@ from newton_qd.robots import ANT
 
 WORLDS = 4
 ant = newton_builder(str(find_urdf(ANT.urdf)), floating=True, gravity=ANT.gravity)
-ant.joint_q[:] = load_system(ANT).rest_q.tolist()
+system = load_system(ANT)
+ant.joint_q[:] = system.rest_q.tolist()
 scene = newton.ModelBuilder()
 scene.replicate(ant, WORLDS)
 model = scene.finalize()
@@ -25,5 +26,5 @@ force = np.zeros((WORLDS, model.joint_dof_count // WORLDS), np.float32)
 for step in range(500):
     force[:, 6:] = 60.0 * np.sin(0.1 * step + np.arange(WORLDS))[:, None]
     control.joint_f.assign(force.ravel())
-    solver.step(state, state, control, None, dt=ANT.dt / ANT.substeps)
+    solver.step(state, state, control, None, dt=system.h)
 print("torsos after 5 s [m]:", state.joint_q.numpy().reshape(WORLDS, -1)[:, :3])

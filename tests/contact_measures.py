@@ -89,7 +89,7 @@ def cone(one: Subject) -> Callable[..., jax.Array]:
     """
     system = one.system
     robot = system.robot
-    weight = system.total_mass * (robot.gravity or 9.81) * robot.dt / robot.substeps
+    weight = system.total_mass * (robot.gravity or 9.81) * system.h
 
     def run(q: jax.Array, v: jax.Array, actions: jax.Array) -> jax.Array:
         def step(state: Any, action: jax.Array) -> Any:

@@ -195,7 +195,7 @@ def ledger(system: System, control: Control = undriven) -> Callable[..., Ledger]
             q, v = carry
             u = jax.vmap(lambda q, v, a: control(state_of(q, v), a))(q, v, action)
             return jax.lax.scan(
-                lambda carry, _: several(carry, u), carry, length=system.robot.substeps
+                lambda carry, _: several(carry, u), carry, length=system.substeps
             )
 
         (q, v), found = jax.lax.scan(advance, (q, v), actions)

@@ -19,8 +19,7 @@ from newton_qd.physics.system import PhysicsState, System
 
 def one_substep(system: System) -> System:
     """The same robot, whose control step is what was a substep."""
-    robot = system.robot
-    robot = dataclasses.replace(robot, dt=robot.dt / robot.substeps, substeps=1)
+    robot = dataclasses.replace(system.robot, dt=system.h, substeps=1)
     return dataclasses.replace(system, robot=robot)
 
 
@@ -48,7 +47,7 @@ def all_gaps(system: System, q: jax.Array) -> jax.Array:
 def gaps_of(env: Any) -> Callable[[Inputs], tuple[jax.Array, jax.Array]]:
     """Gaps (steps, substeps, n) in a rollout whose inputs have a plan, and its end."""
     base = env.unwrapped
-    system, substeps = one_substep(base.system), base.system.robot.substeps
+    system, substeps = one_substep(base.system), base.system.substeps
 
     def run(inputs: Inputs) -> tuple[jax.Array, jax.Array]:
         params = physics.PhysicsParams(**{name: inputs[name] for name in FIELDS})

@@ -16,6 +16,7 @@ import newton_qd
 from newton_qd import physics
 from newton_qd.envs.base import PhysicsEnv
 from newton_qd.physics import reference
+from newton_qd.physics.model import build_system
 from newton_qd.physics.model.rest import raising_coordinate
 from newton_qd.physics.system import JointKind, System
 from newton_qd.robots import ROBOTS
@@ -29,15 +30,13 @@ Control = Callable[[physics.PhysicsState, jax.Array], jax.Array]
 
 def one_substep(system: System) -> System:
     """The system with a control step of a single substep."""
-    robot = system.robot
-    short = dataclasses.replace(robot, dt=robot.dt / robot.substeps, substeps=1)
+    short = dataclasses.replace(system.robot, dt=system.h, substeps=1)
     return dataclasses.replace(system, robot=short)
 
 
 def finer(system: System, factor: int) -> System:
     """The system with ``factor`` times the substeps in a control step."""
-    robot = system.robot
-    fine = dataclasses.replace(robot, substeps=factor * robot.substeps)
+    fine = dataclasses.replace(system.robot, substeps=factor * system.substeps)
     return dataclasses.replace(system, robot=fine)
 
 
@@ -107,7 +106,7 @@ def subject(name: str) -> Subject:
         return from_suite(name)
     with tempfile.TemporaryDirectory() as folder:
         row = hexapod(Path(folder), HEXAPODS[name])
-        return from_system(name, physics.load_system(row, "float64"))
+        return from_system(name, build_system(row, "float64"))
 
 
 def ground(system: System, q: np.ndarray, heights: np.ndarray) -> None:

@@ -193,7 +193,7 @@ def struggle(device: jax.Device) -> tuple[System, np.ndarray, np.ndarray]:
         (worlds, substeps, nb), each of one substep of 10 ms [N s].
     """
     del device  # chosen before the arrays are made
-    system = variant(ANT, "float32", dt=ANT.dt / ANT.substeps, substeps=1)
+    system = variant(ANT, "float32", dt=variant(ANT, "float32").h, substeps=1)
     rng = np.random.default_rng(0)
     q, v, _ = (x.astype(np.float32) for x in random_states(system, rng, WORLDS))
     controls = rng.choice([-1.0, 1.0], (WORLDS, SUBSTEPS, system.nu))

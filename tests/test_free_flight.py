@@ -120,7 +120,7 @@ def test_momentum_of_robot_drifts_with_order_one() -> None:
 def test_parabola(tmp_path: Path) -> None:
     """The scheme's own closed form: g t (t + h) / 2 instead of g t^2 / 2."""
     system = free_body(tmp_path, (0.1, 0.2, 0.25), gravity=GRAVITY)
-    h = system.robot.dt / system.robot.substeps
+    h = system.h
     q, v = launched(system)
     path = rollout(system)(q, v, passive(system, 50))
     t = system.robot.dt * np.arange(1, 51)[:, None]

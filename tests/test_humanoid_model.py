@@ -229,7 +229,7 @@ def test_gears_limits_and_damping(humanoid: System) -> None:
     np.testing.assert_allclose(limits[humanoid.control_dof], expected, rtol=1e-12)
     assert humanoid.damping.tolist() == [0.0] * 6 + [30.0] * 17
     assert (HUMANOID.dt, HUMANOID.gravity) == (0.015, 9.81)
-    assert HUMANOID.dt / HUMANOID.substeps <= 7.5e-3
+    assert humanoid.h <= 7.5e-3
 
 
 @pytest.mark.parametrize("name", BODIES)

@@ -51,8 +51,8 @@ def test_what_touches_nothing_has_no_impulses() -> None:
     system = physics.load_system(REACHER)
     state = physics.initial_state(system, jnp.zeros(system.nq), jnp.zeros(system.nv))
     impulse, normal = physics.contact_impulses(system, state, jnp.zeros(system.nu))
-    assert impulse.shape == (system.robot.substeps, 0, 3)
-    assert normal.shape == (system.robot.substeps, 0)
+    assert impulse.shape == (system.substeps, 0, 3)
+    assert normal.shape == (system.substeps, 0)
 
 
 def test_wrong_shape() -> None:

@@ -270,7 +270,7 @@ def test_rows(name: str) -> None:
     dt, gravity, friction, feet = ROWS[name]
     assert (robot.dt, robot.gravity, robot.feet) == (dt, gravity, feet)
     assert robot.material.friction == friction
-    assert robot.dt / robot.substeps <= 0.005
+    assert robot.substeps is not None and robot.dt / robot.substeps <= 0.005
 
 
 SECONDS, WORLDS = 30, 8

@@ -157,8 +157,8 @@ def test_same_trajectory_as_the_step(worlds: int, device: jax.Device) -> None:
         forces[:, system.control_dof] = np.float32(system.gear) * action
         assign(loop.control.joint_f, forces)
         impulse = np.zeros((worlds, system.nb))
-        for _ in range(ANT.substeps):
-            loop.step(ANT.dt / ANT.substeps)
+        for _ in range(system.substeps):
+            loop.step(system.h)
             impulse += loop.solver.normal_impulse.numpy()
         np.testing.assert_allclose(loop.q, state.q, rtol=1e-5, atol=1e-5)
         np.testing.assert_allclose(loop.qd, state.v, rtol=1e-5, atol=1e-4)

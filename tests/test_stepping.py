@@ -109,6 +109,7 @@ def test_rule_switches_at_the_bound(tmp_path: Path) -> None:
             substep_solves(arm(tmp_path, 0.005 * 2.0 / (share * FAST_TURN))) == solves
         )
         robot = hexapod(tmp_path, 1.0)
+        assert robot.substeps is not None
         damping = robot.dt / robot.substeps * GEAR / (share * FAST_TURN)
         system = build_system(hexapod(tmp_path, damping), "float32")
         assert substep_solves(system) == solves

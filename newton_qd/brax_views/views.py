@@ -177,8 +177,8 @@ class SystemView:
     @property
     def config(self) -> Config:
         """Settings of the simulation."""
-        robot = self._system.robot
-        return Config(robot.dt * self._repeat, robot.substeps * self._repeat)
+        system = self._system
+        return Config(system.robot.dt * self._repeat, system.substeps * self._repeat)
 
     def default_angle(self) -> jax.Array:
         """Returns the joint angles (num_joint_dof,) of the default pose [rad].

@@ -17,12 +17,14 @@ from newton_qd.physics.inspection import (
 )
 from newton_qd.physics.model import load_system
 from newton_qd.physics.model.rest import grounding_coordinate, raising_coordinate
+from newton_qd.physics.model.substeps import FewSubstepsWarning, recommended_substeps
 from newton_qd.physics.model.wall_speeds import SoftWallWarning, wall_speeds
 from newton_qd.physics.parameters import PhysicsParams, default_params
 from newton_qd.physics.step import initial_state, step
 from newton_qd.physics.system import Kinematics, PhysicsState, System
 
 __all__ = [
+    "FewSubstepsWarning",
     "Kinematics",
     "PhysicsParams",
     "PhysicsState",
@@ -42,6 +44,7 @@ __all__ = [
     "lowest_contact",
     "mass_matrix",
     "raising_coordinate",
+    "recommended_substeps",
     "seen_bodies",
     "step",
     "to_jax",

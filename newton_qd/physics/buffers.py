@@ -97,13 +97,13 @@ def build_model(system: System, device: wp.Device, parametric: bool = False) -> 
 
     model.nb, model.nq, model.nv = system.nb, system.nq, system.nv
     model.nu, model.nc = system.nu, len(system.contact_body)
-    model.substeps = robot.substeps
+    model.substeps = system.substeps
     model.pairs = len(system.contact_pairs)
     solves = substep_solves(system)
     model.iterations, model.solves = solves.iterations, solves.solves
     model.given = solves.given
     model.follows = 1.0 if solves.given > 1 else 0.0
-    model.h = robot.dt / robot.substeps
+    model.h = system.h
     model.gravity = robot.gravity
     model.total_mass = system.total_mass
     put("rest_q", system.rest_q)
@@ -274,7 +274,7 @@ def _put_contacts(put: Put, system: System, tree: Tree) -> None:
 
 def _entries(system: System, adjoint: bool) -> dict[str, int]:
     """Returns the length of each scratch array for one pack of worlds."""
-    n, nc = system.robot.substeps, max(len(system.contact_body), 1)
+    n, nc = system.substeps, max(len(system.contact_body), 1)
     nf = len(system.feet)
     chosen = substep_solves(system)
     turns = n * chosen.iterations

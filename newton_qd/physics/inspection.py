@@ -147,7 +147,7 @@ def contact_impulses(
     v = _checked(system, "v", state.v, system.nv)
     control = _checked(system, "control", control, system.nu)
     if not len(system.contact_body):
-        empty = jnp.zeros((system.robot.substeps, 0, 4), q.dtype)
+        empty = jnp.zeros((system.substeps, 0, 4), q.dtype)
         return empty[..., :3], empty[..., 3]
     found = bridge.contact_impulses(system, q, v, control)
     return found[..., :3], found[..., 3]

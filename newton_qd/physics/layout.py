@@ -143,7 +143,7 @@ def gaps(system: System) -> Layout:
 
 def impulses(system: System) -> Layout:
     """Returns the row of contact impulses: linear, then its normal part."""
-    shape = (system.robot.substeps, len(system.contact_body), 4)
+    shape = (system.substeps, len(system.contact_body), 4)
     return Layout({"impulse": shape})
 
 

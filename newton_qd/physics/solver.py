@@ -151,7 +151,7 @@ class NewtonQDSolver(SolverBase):
                 ``joint_f`` of the model.
             contacts: Ignored. ``None`` is allowed.
             dt: Duration of the substep [s]. The robot's ``RobotSpec`` was made for
-                substeps of ``RobotSpec.dt / RobotSpec.substeps``.
+                substeps of ``load_system(robot).h``.
             observables: Not supported. It must be ``None`` or empty.
 
         Raises:

@@ -168,6 +168,18 @@ class System:
         return len(self.gear)
 
     @property
+    def substeps(self) -> int:
+        """Physics steps in a control step."""
+        chosen = self.robot.substeps
+        assert chosen is not None  # the robot of a system has a number
+        return chosen
+
+    @property
+    def h(self) -> float:
+        """Duration of a substep [s]."""
+        return self.robot.dt / self.substeps
+
+    @property
     def torso_floats(self) -> bool:
         """Whether the torso has a free joint. Then its position is in ``q``."""
         return self.joint_kind[self.torso] == JointKind.FREE

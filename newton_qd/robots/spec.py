@@ -87,7 +87,8 @@ class RobotSpec:
             [rad or m]. Their gear is the torque per radian of error [N m/rad], or the
             force per metre [N/m].
         dt: Duration of a control step [s].
-        substeps: Physics steps in a control step [-].
+        substeps: Physics steps in a control step [-]; ``None``: as many as
+            :func:`newton_qd.physics.recommended_substeps` says.
         gravity: Downward acceleration [m/s^2].
         material: Softness of contacts and limits.
         fixed_base: Whether the root link is fixed to the world. ``None``: only a root
@@ -106,7 +107,7 @@ class RobotSpec:
     contacts: tuple[Contact, ...] = ()
     rest_pose: tuple[tuple[str, float], ...] = ()
     dt: float = 0.05
-    substeps: int = 5
+    substeps: int | None = 5
     rest_height: float | None = None
     rest_rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)
     servos: tuple[str, ...] = ()

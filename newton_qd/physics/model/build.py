@@ -32,6 +32,11 @@ from newton_qd.physics.model.newton_input import merge_fixed_bodies, newton_text
 from newton_qd.physics.model.rest import rest_coordinates
 from newton_qd.physics.model.robot_checks import check_robot, index_of, refusal
 from newton_qd.physics.model.scene import obstacle_tables, read_scene
+from newton_qd.physics.model.substeps import (
+    FewSubstepsWarning,
+    few_substeps,
+    recommended_substeps,
+)
 from newton_qd.physics.model.verify import BuiltModel, ModelMismatchError, verify
 from newton_qd.physics.model.wall_speeds import SoftWallWarning, soft_walls
 from newton_qd.physics.model.xml_reader import IDENTITY, RobotDescriptionError
@@ -317,6 +322,9 @@ def build_system(robot: RobotSpec, dtype: str, scene: Scene | None = None) -> Sy
     )
     system = dataclasses.replace(system, rest_q=rest_coordinates(system))
     check_inertia(system, description.path)
+    if robot.substeps is None:
+        chosen = dataclasses.replace(robot, substeps=recommended_substeps(system))
+        system = dataclasses.replace(system, robot=chosen)
     return system
 
 
@@ -326,8 +334,9 @@ def _cached_system(robot: RobotSpec, dtype: str, scene: Scene | None) -> System:
 
 
 @functools.cache
-def _cached_warnings(system: System) -> tuple[str, ...]:
-    return soft_walls(system)
+def _cached_warnings(system: System) -> tuple[tuple[str, type[UserWarning]], ...]:
+    found = [(text, SoftWallWarning) for text in soft_walls(system)]
+    return *found, *((text, FewSubstepsWarning) for text in few_substeps(system))
 
 
 @functools.cache
@@ -356,7 +365,8 @@ def load_system(
     """Returns the system of a robot. A process builds it once for the same arguments.
 
     A wall that does not hold the robot at 10 m/s gives a ``SoftWallWarning``:
-    :func:`~newton_qd.physics.wall_speeds`.
+    :func:`~newton_qd.physics.wall_speeds`. Substeps in which a joint can turn too far
+    give a ``FewSubstepsWarning``: :func:`~newton_qd.physics.recommended_substeps`.
 
     Args:
         robot: The robot.
@@ -384,7 +394,7 @@ def load_system(
     checks.choice("feet_tail", feet_tail, TAILS)
     check_robot(robot)  # before the cache computes its hash
     system = _cached_system(robot, dtype, scene)
-    for text in _cached_warnings(system):
-        warnings.warn(text, SoftWallWarning, stacklevel=2)
+    for text, category in _cached_warnings(system):
+        warnings.warn(text, category, stacklevel=2)
     width = system.feet_width if feet_width is None else feet_width
     return _cached_variant(system, width, feet_tail, reports_bodies)

@@ -174,6 +174,7 @@ def check_robot(robot: RobotSpec) -> None:
         f"robot {robot.name!r}, substeps",
         robot.substeps,
         most=None,
+        optional=True,
         error=RobotDescriptionError,
     )
     _check_contacts(robot)
