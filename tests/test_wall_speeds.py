@@ -16,6 +16,7 @@ from urdf_text import joint, row, sphere, write
 from newton_qd import physics, robots
 from newton_qd.physics import reference
 from newton_qd.physics.model import build_system
+from newton_qd.physics.stepping import substep_solves
 from newton_qd.physics.system import System
 from newton_qd.robots import ANT, HUMANOID, Contact, Material
 from newton_qd.scenes import HUMANOID_TRAP, MAZE, TRAP, Scene
@@ -38,6 +39,8 @@ class Shot:
         height: Of the middle of the wall [m].
         glancing: Largest angle to the normal of the wall [rad].
         material: What differs from the default material.
+        rotor: Whether a light undamped rotor is in it, so that its substeps have three
+            iterations.
     """
 
     wall: str
@@ -49,11 +52,18 @@ class Shot:
     height: float = HIGH
     glancing: float = 0.0
     material: tuple[tuple[str, Any], ...] = ()
+    rotor: bool = False
 
     @property
     def rolls(self) -> bool:
         """Whether the body is on the ground, and the wall too."""
         return self.height < HIGH
+
+
+ROTOR = """<link name="rotor"><inertial><mass value="1e-3"/><inertia ixx="1e-5"
+    iyy="1e-5" izz="1e-5" ixy="0" ixz="0" iyz="0"/></inertial></link>
+    <joint name="spin" type="continuous"><parent link="body"/><child link="rotor"/>
+    <axis xyz="0 1 0"/></joint>"""
 
 
 def scene(folder: Path, shot: Shot) -> Scene:
@@ -78,7 +88,8 @@ def system_of(folder: Path, shot: Shot, h: float) -> System:
     text = f"""<robot name="body"><link name="body"><inertial>
     <mass value="{shot.mass}"/><inertia ixx="{inertia}" iyy="{inertia}"
     izz="{inertia}" ixy="0" ixz="0" iyz="0"/></inertial>
-    <collision><geometry>{shape}</geometry></collision></link></robot>"""
+    <collision><geometry>{shape}</geometry></collision></link>
+    {ROTOR if shot.rotor else ""}</robot>"""
     ends = (Contact("body", 1), Contact("body", -1))
     spec = row(
         write(folder, text),
@@ -97,7 +108,7 @@ def passed(system: System, shot: Shot, speed: float) -> float:
     rng = np.random.default_rng(0)
     h = system.robot.dt
     across = np.cos(rng.uniform(-shot.glancing, shot.glancing, SHOTS))
-    q, v = np.zeros((SHOTS, 7)), np.zeros((SHOTS, 6))
+    q, v = np.zeros((SHOTS, system.nq)), np.zeros((SHOTS, system.nv))
     v[:, 0], v[:, 1] = speed * across, speed * np.sqrt(1 - across**2)
     # the first touch is anywhere in a substep
     apart = shot.thick + shot.radius + shot.half + 0.03
@@ -113,7 +124,7 @@ def passed(system: System, shot: Shot, speed: float) -> float:
             turn = np.cross([0.0, 0.0, 1.0], axis)
             size = float(np.linalg.norm(turn))
             angle = np.arctan2(size, axis[2])
-            q[k, 3:] = reference.axis_quaternion(turn / size, angle)
+            q[k, 3:7] = reference.axis_quaternion(turn / size, angle)
     steps = int(max(0.3, 3 * apart / speed) / h)
     return float((path_of(system, q, v, steps)[..., 0] > 0).any(axis=1).mean())
 
@@ -131,6 +142,7 @@ def path_of(system: System, q: np.ndarray, v: np.ndarray, steps: int) -> np.ndar
 
 BOX = Shot("box", 0.1, 0.03)
 CAPSULE = Shot("capsule", 0.1, 0.03)
+SPUN = dataclasses.replace(BOX, rotor=True)
 ROD = Shot("box", 0.05, 0.03, half=0.2)
 SOFT = (("static_penetration", 0.01), ("dissipation", 0.0))
 STIFF = (("static_penetration", 0.001), ("support", 2))
@@ -155,6 +167,15 @@ SHOOT = {
     "ball, under a large capsule": Shot("capsule", 0.5, 0.08, height=0.5),
     "ball, under a smooth capsule": dataclasses.replace(
         CAPSULE, height=0.1, material=(("friction", 0.0),)
+    ),
+    "ball with a rotor, box": SPUN,
+    "ball with a rotor, box, soft": dataclasses.replace(SPUN, material=SOFT),
+    "ball with a rotor, thin box, stiff": dataclasses.replace(
+        SPUN, thick=0.01, material=STIFF
+    ),
+    "ball with a rotor, capsule": dataclasses.replace(CAPSULE, rotor=True),
+    "ball with a rotor, under a capsule": dataclasses.replace(
+        CAPSULE, height=0.1, rotor=True
     ),
 }
 
@@ -213,6 +234,19 @@ def test_heavy_robot_with_a_light_link(tmp_path: Path, ratio: float) -> None:
     )
     report("speed [m/s], how far the ball gets [m]", (limit, far))
     assert far < 0.0
+
+
+@pytest.mark.parametrize("shot", [SPUN, dataclasses.replace(SPUN, glancing=1.4)])
+def test_several_iterations_hold_what_is_promised(tmp_path: Path, shot: Shot) -> None:
+    """The damping factor follows the velocity, so long substeps hold less."""
+    one = system_of(tmp_path, BOX, 0.01)
+    several = system_of(tmp_path, shot, 0.01)
+    assert substep_solves(one).iterations == 1 < substep_solves(several).iterations
+    limits = [float(physics.wall_speeds(s)[-1]) for s in (one, several)]
+    shares = [passed(several, shot, share * limits[1]) for share in (0.5, 0.9, 1.0)]
+    report("speeds that are held, shares that pass", (limits, shares))
+    assert shares == [0.0, 0.0, 0.0]
+    assert limits[1] < 0.8 * limits[0]
 
 
 @pytest.mark.parametrize("speed", [7.5, 10.0])

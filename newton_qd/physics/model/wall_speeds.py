@@ -9,6 +9,7 @@ import numpy as np
 
 from newton_qd.checks import Fact, message
 from newton_qd.physics import reference
+from newton_qd.physics.model.substeps import contact_masses, iterates
 from newton_qd.physics.system import ObstacleKind, System
 from newton_qd.robots import RobotSpec
 
@@ -78,19 +79,19 @@ def wall_speeds(system: System) -> np.ndarray:
         [m/s]. It is infinite for contacts with the ground and of pairs.
     """
     speeds = np.full(len(system.contact_body), np.inf)
-    h = system.robot.dt / system.robot.substeps
     known: dict[_Way, float] = {}
+    follows = iterates(system)
     masses = _moved_masses(system)
     for c in np.flatnonzero(system.contact_obstacle > 0):
         stiffness = system.contact_stiffness / float(masses[c])
         for way in _ways_through(system, int(c), stiffness):
             if way not in known:
-                known[way] = _largest_speed(way, h)
+                known[way] = _largest_speed(way, system.h, follows)
             speeds[c] = min(speeds[c], known[way])
             if system.contact_segment[c].any():
                 # One end of a capsule touches. The other end must not cross the wall
                 # within a substep.
-                speeds[c] = min(speeds[c], way.depth / h)
+                speeds[c] = min(speeds[c], way.depth / system.h)
     return speeds
 
 
@@ -117,18 +118,7 @@ def _moved_masses(system: System) -> np.ndarray:
     It is the mass of the robot. A collider near the hinge of an arm has to stop more.
     """
     masses = np.full(len(system.contact_body), system.total_mass)
-    if system.torso_floats or not len(masses):
-        return masses
-    compliance = np.linalg.inv(reference.mass_matrix(system, system.rest_q))
-    frames = reference.body_frames(system, system.rest_q)
-    linear, angular = reference.jacobians(system, system.rest_q)
-    for c, body in enumerate(system.contact_body):
-        arm = system.contact_position[c] - system.com[body]
-        arm = reference.rotation_matrix(frames[body, 3:]) @ arm
-        moved = linear[body] + np.cross(angular[body].T, arm).T
-        mobility = np.linalg.eigvalsh(moved @ compliance @ moved.T)[-1]
-        masses[c] = max(masses[c], 1.0 / max(mobility, 1e-12))
-    return masses
+    return masses if system.torso_floats else np.maximum(masses, contact_masses(system))
 
 
 def _ways_through(system: System, c: int, stiffness: float) -> list[_Way]:
@@ -189,26 +179,52 @@ def _under(squeezed: float, depth: float, stiffness: float, robot: RobotSpec) ->
     )
 
 
-def _largest_speed(way: _Way, h: float) -> float:
-    """Returns the largest speed below which no point mass gets through [m/s].
+def _slower(
+    x: np.ndarray, v: np.ndarray, way: _Way, h: float, follows: bool
+) -> np.ndarray:
+    """Returns the change of velocity (...) of point masses in a substep [m/s].
 
     The contact law is that of the kernels on a line, without its clip, which adds to
-    the impulse. Substeps begin at all distances from the surface.
+    the impulse. One iteration has the damping factor of the velocity at the start, and
+    gives the impulse that it found. Several are two steps of Newton's method on the law
+    with the damping factor of the new velocity.
+
+    Args:
+        x: (...) depths at the start [m].
+        v: (...) velocities at the start, inwards [m/s].
+        way: The way.
+        h: Substep [s].
+        follows: Whether the damping factor follows the velocity: several iterations.
+    """
+    change = np.zeros(v.shape)
+    for _ in range(2 if follows else 1):
+        new = v + change
+        depth = np.maximum(x + h * new, 0.0)
+        damper = h * way.stiffness * np.maximum(1.0 + way.dissipation * new, 0.0)
+        slope = np.where(depth > 0.0, h * damper, 0.0)
+        if follows:
+            slope += h * way.stiffness * way.dissipation * depth * (damper > 0.0)
+        law = damper * depth
+        change = (h * way.pull - law + slope * change) / (1.0 + slope)
+    return change
+
+
+def _largest_speed(way: _Way, h: float, follows: bool) -> float:
+    """Returns the largest speed below which no point mass gets through [m/s].
+
+    Substeps begin at all distances from the surface.
 
     Args:
         way: The way.
         h: Substep [s].
+        follows: Whether the damping factor follows the velocity.
     """
     v = np.repeat(_SPEEDS[:, None], len(_PHASES), axis=1)
     x = -_PHASES * h * v
     through = np.zeros(v.shape, bool)
     moving = np.ones(v.shape, bool)
     while moving.any():
-        reach = x + h * v
-        damper = way.stiffness * (1.0 + way.dissipation * v)
-        weight = np.where(reach > 0.0, h * h * damper, 0.0)
-        slower = (h * way.pull - weight * reach / h) / (1.0 + weight)
-        v = np.where(moving, v + slower, v)
+        v = np.where(moving, v + _slower(x, v, way, h, follows), v)
         x = np.where(moving, x + h * v, x)
         through |= x >= way.depth
         moving &= (v > _STOPPED) & ~through
