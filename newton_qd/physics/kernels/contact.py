@@ -123,6 +123,7 @@ def expected_weight(
     return friction_weight(
         total_mass(m, sc, offsets),
         friction(m, sc, offsets) * applied,
+        applied,
         load(sc.weight_t, offsets.before + c),
         dot(slip, slip),
         m.slip_velocity,

@@ -114,7 +114,7 @@ def pair_motion(
 ):
     """Relative velocity at pair ``j``'s point, with the impulses of those before it.
 
-    Reads: m.contact_body, m.contact_partner, m.pair_lead, sc.point, turn, move,
+    Reads: m.contact_body, m.contact_partner, m.pair_lead, sc.point, move, turn,
         impulse.
 
     Args:

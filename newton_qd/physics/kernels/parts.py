@@ -4,14 +4,38 @@ An adjoint is added to where one lane owns the entry, so without atomics. Those 
 the solve found are 0 in the end, as before.
 """
 
-from . import plain, quat, real, scalar, vec3
+import warp as wp
+
+from . import parametric, plain, quat, real, scalar, vec3, width
 from .answers import pair_side
 from .coupling import PAIRS
 from .cpp.algebra import component, cross, dot, form_slope, rigid, translation, vector
 from .cpp.memory import add_adjoint, load, load_adjoint, store, store_adjoint
+from .cpp.numbers import occurs
 from .cpp.operators import add, mul, neg, sub  # noqa: F401
 from .parameters import PARAMETRIC, body_mass
 from .structs import Model, Offsets, Scratch
+
+# A CPU skips contacts that act on no world of a pack: the law begins smoothly, so they
+# have no slope, unless the stiffness is a parameter and 0.
+IDLES = wp.constant(width > 1 and not parametric)
+
+
+@plain
+def contact_acts(sc: Scratch, offsets: Offsets, c: int):
+    """Above 0 if a contact acts on some world of the pack, or may have a slope.
+
+    Reads: sc.push_n, sc.weight_n, sc.weight_t.
+    """
+    count = int(1)
+    if IDLES:
+        at = offsets.solve_contact + c
+        count = (
+            occurs(load(sc.push_n, at))
+            + occurs(load(sc.weight_n, at))
+            + occurs(load(sc.weight_t, at))
+        )
+    return count
 
 
 @plain
@@ -36,23 +60,25 @@ def contact_part(
     """
     at = offsets.solve_contact + c
     r = load(sc.point, offsets.contact + c)
-    n = load(sc.normal, offsets.contact + c)
-    wt = load(sc.weight_t, at)
-    more = load(sc.weight_n, at) - wt
-    moved = xv + cross(xw, r)
-    multiplier = lv + cross(lw, r)
-    un = dot(n, moved)
-    ln = dot(n, multiplier)
-    both = un * ln
-    impulse = load(sc.push, at) - wt * moved - (more * un) * n
-    weighted = wt * multiplier + (more * ln) * n
-    back = load_adjoint(sc.slip, at) - weighted
+    impulse = vec3()
+    back = load_adjoint(sc.slip, at)
     store_adjoint(sc.slip, at, vec3())
-    add_adjoint(sc.push, at, multiplier)
-    add_adjoint(sc.weight_n, at, neg(both))
-    add_adjoint(sc.weight_t, at, both - dot(multiplier, moved))
-    turned = (more * ln) * moved + (more * un) * multiplier
-    add_adjoint(sc.normal, offsets.contact + c, neg(turned))
+    if contact_acts(sc, offsets, c) > 0:
+        n = load(sc.normal, offsets.contact + c)
+        wt = load(sc.weight_t, at)
+        more = load(sc.weight_n, at) - wt
+        moved = xv + cross(xw, r)
+        multiplier = lv + cross(lw, r)
+        un = dot(n, moved)
+        ln = dot(n, multiplier)
+        both = un * ln
+        impulse = load(sc.push, at) - wt * moved - (more * un) * n
+        back = back - wt * multiplier - (more * ln) * n
+        add_adjoint(sc.push, at, multiplier)
+        add_adjoint(sc.weight_n, at, neg(both))
+        add_adjoint(sc.weight_t, at, both - dot(multiplier, moved))
+        turned = (more * ln) * moved + (more * un) * multiplier
+        add_adjoint(sc.normal, offsets.contact + c, neg(turned))
     add_adjoint(sc.point, offsets.contact + c, cross(impulse, lw) + cross(back, xw))
     return impulse, back
 

@@ -3,7 +3,7 @@
 import warp as wp
 
 from .. import real, scalar
-from .native import native
+from .native import PRELUDE, native
 
 ROOT = """
 #if defined(__CUDA_ARCH__)
@@ -79,12 +79,17 @@ def choose(c: real, a: real, b: real) -> real:
     ...
 
 
+ANY = """
+#if defined(__CUDA_ARCH__)
+auto any = [](Real x) { return x != Real(0); };
+#else
+auto any = [](Real x) { return __builtin_reduce_or(x != Real(0)) != 0; };
+#endif
+"""
+
+
 @wp.func_native(
-    snippet="""
-for (int i = 0; i < sizeof(a) / sizeof(a[0]); ++i)
-    if (a[i] != 0) return 1;
-return 0;
-""",
+    snippet=f"{PRELUDE}{ANY}return any(Convert::in(a));",
     adj_snippet="",
 )
 def occurs(a: real) -> int:

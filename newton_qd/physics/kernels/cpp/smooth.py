@@ -6,10 +6,10 @@ of its angle squared.
 
 import warp as wp
 
-from .. import quat, real, scalar, vec3
+from .. import parametric, quat, real, scalar, vec3
 from .algebra import dot
 from .native import native
-from .numbers import ROOT, sqrt
+from .numbers import ANY, ROOT, sqrt
 from .operators import add, mul, sub  # noqa: F401
 
 # Distances are of vectors no shorter than this [m]: a direction is always finite.
@@ -71,9 +71,14 @@ def finite_length(a: vec3):
     return sqrt(SHORTEST * SHORTEST + dot(a, a))
 
 
-# Newton's method, of two steps: from the first weight, 3 % off at most.
+# Newton's method, of two steps: from the first weight, 3 % off at most. Where nothing
+# is applied to any world of the pack, the weight is exactly 0, and nothing is computed.
+# Nor is its slope: what is applied has none there, unless its stiffness is a parameter
+# and 0.
+_IDLE = "false" if parametric else "!any(APPLIED)"
 _FRICTION = (
     ROOT
+    + ANY
     + """
 struct Weight {
     Real e, moved, mass, bound, b, inner, outer, first, w;
@@ -106,18 +111,20 @@ auto step = [&](Weight& t) {
     t.w -= t.excess / t.slope;
 };
 auto weight = [&]() {
+    if (IDLE) return Real(0);
     Weight t = start();
     step(t);
     step(t);
     return t.w;
 };
-"""
+""".replace("IDLE", _IDLE)
 )
 
 
 @wp.func_native(
     *native(
         "weight()",
+        f"if ({_IDLE}) return;"
         """
 Weight t = start();
 Real old[2];
@@ -162,7 +169,7 @@ adj_BEFORE += adj_momentum;
     )
 )
 def friction_weight(
-    mass: real, bound: real, before: real, squared: real, width: scalar
+    mass: real, bound: real, applied: real, before: real, squared: real, width: scalar
 ) -> real:
     """Weight w = mu J / sqrt(slip^2 + width^2) at the slip that w itself leads to.
 
@@ -175,6 +182,7 @@ def friction_weight(
     Args:
         mass: That of the robot: no less than what the contact moves [kg].
         bound: mu J, the largest friction impulse [N s].
+        applied: J, the normal impulse, begins smoothly at 0 [N s].
         before: Weight in the solve before [kg].
         squared: Slip after that solve, squared [m^2/s^2].
         width: Velocity below which friction is viscous [m/s].
