@@ -102,6 +102,7 @@ def build_model(system: System, device: wp.Device, parametric: bool = False) -> 
     solves = substep_solves(system)
     model.iterations, model.solves = solves.iterations, solves.solves
     model.given = solves.given
+    model.friction_answers = solves.friction_answers
     model.follows = 1.0 if solves.given > 1 else 0.0
     model.h = system.h
     model.gravity = robot.gravity

@@ -35,6 +35,15 @@ class Solves:
         """
         return 1 if self.iterations == 1 else self.iterations * self.solves - 1
 
+    @property
+    def friction_answers(self) -> float:
+        """Share of friction in the given solves that answers the new velocity.
+
+        The rest is given like the normal impulse, and stays in its cone. An eighth is
+        the least without gains of energy (``benchmarks/contact.py energy friction``).
+        """
+        return 1.0 if self.iterations == 1 else 0.125
+
 
 def substep_solves(system: System) -> Solves:
     """Returns how the substeps of a system are solved.

@@ -37,6 +37,7 @@ class Model:
     iterations: int  # times that a substep finds the velocities of its bodies
     follows: scalar  # 1: the predictor's slope is also that of the dissipation factor
     given: int  # solve from which normal impulses are given
+    friction_answers: scalar  # share of friction in those that answers the velocity
     solves: int  # solves of an iteration: predictor and correctors
     h: scalar  # [s]
     gravity: scalar  # [m/s^2]
