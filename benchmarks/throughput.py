@@ -4,17 +4,20 @@
     python benchmarks/throughput.py --suite [--batches 1024] [--names humanoid antmaze]
                                     [--clock processor]
     python benchmarks/throughput.py --ratios [--batches 128] [--names ant hopper]
+    python benchmarks/throughput.py --lanes [--env ant_uni] [--batches 4096 16384]
 
 A figure counts only if every state stays finite; times are medians after a warm-up,
 with the result waited for. ``--suite`` compares every environment with the ant: both
 take turns, so that what else the machine does matters little, and the speed is counted
 per degree of freedom and contact. On a CPU that others use too, compare processor time.
 ``--ratios`` says how much longer a step with its gradient takes, for every environment.
+``--lanes`` has the speed of a GPU by number of lanes per world, and the default's.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import statistics
 import time
 from collections.abc import Callable
@@ -26,6 +29,7 @@ import numpy as np
 
 import newton_qd
 from newton_qd.envs.base import PhysicsEnv
+from newton_qd.physics.launch import LANES, lane_count
 
 CLOCKS = {"wall": time.perf_counter, "processor": time.process_time}
 
@@ -160,6 +164,27 @@ def ratios(names: list[str], batch: int, options: argparse.Namespace) -> None:
         )
 
 
+def lanes(name: str, options: argparse.Namespace) -> None:
+    """Prints the speed by number of lanes, and by default with the numbers taken."""
+    print(f"{name} on {jax.devices()[0]}, thousand environment steps per second")
+    print("| batch | lanes | forward | forward + backward |\n|---|---|---|---|")
+    kernels = ("step_forward", "step_backward")
+    for batch in options.batches:
+        for count in (None, *LANES):
+            os.environ.pop("NEWTON_QD_LANES", None)
+            chosen = [str(lane_count(kernel, batch)) for kernel in kernels]
+            text = f"default: {' and '.join(chosen)}"
+            if count is not None:
+                os.environ["NEWTON_QD_LANES"] = text = str(count)
+            forward, gradient = measure(
+                name, batch, options.steps, options.horizon, options.repetitions
+            )
+            print(
+                f"| {batch} | {text} | {forward / 1e3:.1f} | {gradient / 1e3:.1f} |",
+                flush=True,
+            )
+
+
 def main() -> None:
     """Print a table of speeds."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -172,7 +197,11 @@ def main() -> None:
     parser.add_argument("--clock", choices=CLOCKS, default="wall")
     parser.add_argument("--names", nargs="+", default=newton_qd.registered_envs())
     parser.add_argument("--ratios", action="store_true")
+    parser.add_argument("--lanes", action="store_true")
     options = parser.parse_args()
+    if options.lanes:
+        lanes(options.env, options)
+        return
     if options.ratios:
         for batch in options.batches:
             ratios(options.names, batch, options)

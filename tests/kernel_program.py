@@ -130,7 +130,8 @@ class Program:
                 self.problems.append((file, node.lineno, f"native: {text}"))
             return
         of = ast.unparse(call.args[0]) if kind == "func_grad" and call else ""
-        kind = "grad" if of else kind
+        # a part is replayed or not; for the rules it is a function as others
+        kind = "grad" if of else "func" if kind == "part" else kind
         if node.name in self.functions:
             text = f"{node.name} is also in {self.functions[node.name].file}"
             self.problems.append((file, node.lineno, f"name: {text}"))

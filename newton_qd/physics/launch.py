@@ -143,7 +143,7 @@ class Launcher:
         self.model = buffers.build_model(system, device, parametric)
         self._block = 1 if device.is_cpu else _GPU_BLOCK
         self._scratch: dict[tuple[bool, int], tuple[int, buffers.Memory]] = {}
-        self._commands: dict[tuple[str, int], _Command] = {}
+        self._commands: dict[tuple[str, int, bool], _Command] = {}
         self._workers: list[Worker] = []
         self._lock = threading.Lock()
 
@@ -195,15 +195,22 @@ class Launcher:
             with self._lock:
                 self._launch_threads(kernel, worlds, arrays, adjoint)
             return
-        lanes = lane_count(name, worlds)
-        side = worlds_side_by_side(lanes)
-        resident = min(-(-worlds // side) * side, _RESIDENT_WORLDS[adjoint])
+        resident = min(-(-worlds // _WARP) * _WARP, _RESIDENT_WORLDS[adjoint])
         owner = wp.get_stream(self.device).cuda_stream
-        command = self._command(kernel, owner, resident, arrays, adjoint)
+        commands = [self._command(kernel, owner, resident, arrays, adjoint)]
+        lanes = [lane_count(name, worlds)]
+        if adjoint:  # a launch of its own runs the parts of the kernel, see `part`
+            forward = self._command(
+                kernel, owner, resident, arrays, adjoint, parts=True
+            )
+            commands.insert(0, forward)
+            lanes.insert(0, lane_count(name.replace("backward", "forward"), worlds))
         for first in range(0, worlds, resident):
             count = min(resident, worlds - first)
-            threads = -(-count // side) * side * lanes
-            command.send(arrays, first, count, threads, 1, lanes, side * lanes)
+            for command, number in zip(commands, lanes, strict=True):
+                side = worlds_side_by_side(number)
+                threads = -(-count // side) * side * number
+                command.send(arrays, first, count, threads, 1, number, side * number)
 
     def _kernel(self, name: str) -> wp.Kernel:
         return getattr(getattr(self.kernels, _MODULES.get(name, "inspect")), name)
@@ -248,10 +255,12 @@ class Launcher:
         slots: int,
         arrays: Arrays,
         adjoint: bool,
+        parts: bool = False,
     ) -> _Command:
         """Returns the recorded launch of ``kernel`` in the owner's scratch memory.
 
-        The owner is a thread (CPU) or a stream (GPU).
+        The owner is a thread (CPU) or a stream (GPU). ``parts`` is for the launch that
+        runs a kernel with adjoint forward.
         """
         held = self._scratch.get((adjoint, owner))
         if held is None or held[0] < slots:
@@ -264,10 +273,10 @@ class Launcher:
             )
             held = self._scratch[adjoint, owner] = (slots, scratch)
             self._commands.clear()
-        command = self._commands.get((kernel.key, owner))
+        command = self._commands.get((kernel.key, owner, parts))
         if command is None:
-            command = self._record(kernel, held[1], arrays, adjoint)
-            self._commands[kernel.key, owner] = command
+            command = self._record(kernel, held[1], arrays, adjoint, parts)
+            self._commands[kernel.key, owner, parts] = command
         return command
 
     def _record(
@@ -276,6 +285,7 @@ class Launcher:
         scratch: buffers.Memory,
         arrays: Arrays,
         adjoint: bool,
+        parts: bool,
     ) -> _Command:
         structs = self.kernels.structs
         held = [scratch.values, *([scratch.adjoints] if adjoint else [])]
@@ -288,8 +298,8 @@ class Launcher:
             kernel,
             dim=1,
             inputs=[*before, *arrays],
-            adj_inputs=unused if adjoint else [],
-            adjoint=adjoint,
+            adj_inputs=[] if parts or not adjoint else unused,
+            adjoint=adjoint and not parts,
             device=self.device,
             block_dim=self._block,
             record_cmd=True,

@@ -18,7 +18,8 @@ and where these begin (``Offsets``); :mod:`.rows` where the fields of a row of i
 outputs begin. :mod:`.world` moves these rows, with :mod:`.parameters` for parameters
 of each world. :mod:`.forward` and :mod:`.backward` are the kernels of a step;
 :mod:`.inspect`, :mod:`.gaps` and :mod:`.impulses` show a system from inside;
-:mod:`.episodes` and :mod:`.conventions` do not use packs.
+:mod:`.episodes` and :mod:`.conventions` do not use packs. :mod:`.cpp.memory` says how
+the intermediates lie in memory.
 
 **Variants.** The package is a template. Its files run once for each
 :class:`~newton_qd.physics.precision.Variant`, as a package of its own name: float32 and
@@ -69,6 +70,14 @@ mat33 = wp.types.matrix(shape=(9, width), dtype=scalar)
 # xx, xy, xz, yy, yz, zz of a symmetric matrix
 sym33 = wp.types.matrix(shape=(6, width), dtype=scalar)
 
+# Threads of a GPU's block at most, and blocks that fit on a multiprocessor, of kernels
+# without and with adjoint. The compiler gives a thread the registers that these leave.
+# With more threads, less of the time passes in waiting for memory.
+block = 256
+_fit = 1 if scalar == wp.float64 else 2
+bounds = (block, 2 * _fit)
+adjoint_bounds = (block, _fit)
+
 _SYNC = """
 #if defined(__CUDA_ARCH__)
 __syncthreads();
@@ -89,6 +98,16 @@ def sync(lane: int):
 def stage(function):
     """Declare a Warp function that stores its results and is never replayed."""
     return never_replay(wp.func(function))
+
+
+def part(function):
+    """Declare a part of a kernel that has an adjoint.
+
+    On a CPU the kernel of the adjoint runs it first: a thread goes forward and back
+    with a pack while the pack is in its caches. On a GPU a launch of the kernel itself
+    runs it before, for all packs: then the kernel of the adjoint does not contain it.
+    """
+    return stage(function) if width == 1 else wp.func(function)
 
 
 def plain(function):

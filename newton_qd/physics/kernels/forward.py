@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from . import scalar
+from . import bounds, scalar
 from .cpp.place import place
 from .simulate import simulate
 from .structs import Model, Scratch, offsets_after, offsets_at
@@ -11,7 +11,7 @@ from .world import load_world, pack_at, store_world
 wp.set_module_options({"enable_backward": False})
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=bounds)
 def step_forward(
     # system
     m: Model,

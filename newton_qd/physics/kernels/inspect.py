@@ -8,7 +8,7 @@ import warp as wp
 
 from newton_qd.physics.kinds import JointKind
 
-from . import real, scalar, sym33, sync, vec3
+from . import part, real, scalar, sym33, sync, vec3
 from .cpp.algebra import add_diagonal, cross, dot, skew, translation, vector
 from .cpp.memory import constant, load, read_input, store, write_output
 from .cpp.numbers import uniform
@@ -21,7 +21,7 @@ from .structs import Model, Offsets, Scratch, offsets_at
 from .world import Pack, pack_at
 
 
-@wp.func
+@part
 def load_views(
     m: Model,
     sc: Scratch,
@@ -71,7 +71,7 @@ def adj_load_views(
         store(g.v, offsets.v + k, real())
 
 
-@wp.func
+@part
 def read_bodies(m: Model, sc: Scratch, offsets: Offsets):
     """Kinematics of substep 0 with one lane; replayed by the adjoint kernel.
 
@@ -82,7 +82,7 @@ def read_bodies(m: Model, sc: Scratch, offsets: Offsets):
         body_reading(m, sc, offsets, i)
 
 
-@wp.func
+@part
 def seed_views(
     m: Model, g: Scratch, offsets: Offsets, y_bar: wp.array[scalar], pack: Pack
 ):

@@ -4,7 +4,7 @@ import warp as wp
 
 from newton_qd.physics.kinds import JointKind
 
-from . import scalar, stage, sync
+from . import part, scalar, stage, sync
 from .contact import (
     contact_corrector,
     contact_given,
@@ -124,7 +124,7 @@ def substep(
         sync(lane)
 
 
-@wp.func
+@part
 def simulate(
     m: Model,
     sc: Scratch,

@@ -5,7 +5,7 @@ The arrays hold one contiguous row per world: its fields are in :mod:`.rows`.
 
 import warp as wp
 
-from . import real, scalar, stage, sync, width
+from . import block, part, plain, real, scalar, stage, sync, width
 from .cpp.algebra import component
 from .cpp.memory import constant, load, read_input, store, write_output
 from .cpp.numbers import beyond, choose
@@ -19,8 +19,8 @@ WIDTH = wp.constant(width)
 MAX_SPEED = wp.constant(scalar(1000.0))
 
 
-# Threads of a GPU's block at most, and worlds of a warp: all its threads have one lane.
-BLOCK = wp.constant(256)
+BLOCK = wp.constant(block)
+# Worlds of a warp: all its threads have one lane.
 WARP = wp.constant(32)
 
 
@@ -47,10 +47,10 @@ def pack_at(tid: int, first: int, worlds: int, slot_stride: int, lanes: int):
     n = tid
     if WIDTH == 1:
         side = wp.min(WARP, BLOCK // lanes)
-        block = tid // (side * lanes)
-        thread = tid - block * side * lanes
+        own = tid // (side * lanes)
+        thread = tid - own * side * lanes
         pack.lane = thread // side
-        n = block * side + thread - pack.lane * side
+        n = own * side + thread - pack.lane * side
         pack.first = first + wp.min(n, worlds - 1)
     else:
         pack.lane = 0
@@ -60,7 +60,7 @@ def pack_at(tid: int, first: int, worlds: int, slot_stride: int, lanes: int):
     return pack
 
 
-@wp.func
+@part
 def load_world(
     m: Model,
     sc: Scratch,
@@ -133,7 +133,7 @@ def adj_load_world(
         store(g.ctrl, offsets.ctrl + k, real())
 
 
-@wp.func
+@plain
 def detect_fault(m: Model, sc: Scratch, pack: Pack, x: wp.array[scalar], lane: int):
     """Record where a number is not finite, or a speed out of bounds.
 
@@ -262,7 +262,7 @@ def store_world(
         store_bodies(m, sc, offsets, y, m.reported, at, size, count, lane, lanes)
 
 
-@wp.func
+@part
 def seed_world(
     m: Model,
     sc: Scratch,
