@@ -17,18 +17,15 @@ A contact with a fixed obstacle needs none of this: its weight is an added inert
 
 import warp as wp
 
-from . import pairs, plain, real, scalar, sync, vec3, width
+from . import pairs, plain, real, scalar, sync, vec3
 from .answers import answer, answer_between, answer_body, answer_dof
 from .cpp.algebra import add_diagonal, cross, dot, inverse, outer
 from .cpp.memory import Vectors, load, store
-from .cpp.numbers import occurs, uniform
+from .cpp.numbers import occurs, occurs_beside, uniform
 from .cpp.operators import add, mul, neg, sub  # noqa: F401
 from .structs import Model, Offsets, Scratch
 
 PAIRS = wp.constant(pairs)
-# A CPU skips pairs that no world of a pack needs. A GPU does not: worlds of one warp
-# wait for each other.
-SKIPS = wp.constant(width > 1)
 
 
 @plain
@@ -201,23 +198,21 @@ def answered(m: Model, sc: Scratch, offsets: Offsets, impulse: Vectors, k: int):
 
 @plain
 def pairs_touch(m: Model, sc: Scratch, offsets: Offsets):
-    """Number of the pairs, 0 where none acts on any world of the pack.
+    """Number of the pairs, 0 where none acts on any world of the pack or the block.
 
     Reads: m.pairs, m.pair_lead, sc.load, sc.push_n, sc.weight_n, sc.weight_t.
     """
+    acts = int(0)
+    for j in range(m.pairs):
+        at = offsets.solve_contact + load(m.pair_lead, j)
+        acts = acts + (
+            occurs(load(sc.load, at))
+            + occurs(load(sc.push_n, at))
+            + occurs(load(sc.weight_n, at))
+            + occurs(load(sc.weight_t, at))
+        )
     count = int(0)
-    if SKIPS:
-        for j in range(m.pairs):
-            at = offsets.solve_contact + load(m.pair_lead, j)
-            acts = (
-                occurs(load(sc.load, at))
-                + occurs(load(sc.push_n, at))
-                + occurs(load(sc.weight_n, at))
-                + occurs(load(sc.weight_t, at))
-            )
-            if acts > 0:
-                count = m.pairs
-    else:
+    if occurs_beside(acts) > 0:
         count = m.pairs
     return count
 

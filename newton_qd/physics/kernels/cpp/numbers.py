@@ -95,3 +95,22 @@ auto any = [](Real x) { return __builtin_reduce_or(x != Real(0)) != 0; };
 def occurs(a: real) -> int:
     """1 if a number is not 0 in some world of the pack, else 0; without adjoint."""
     ...
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+return __syncthreads_or(count);
+#else
+return count;
+#endif
+""",
+    adj_snippet="",
+)
+def occurs_beside(count: int) -> int:
+    """Not 0 if ``count`` is not 0 in some world of the block, or of a CPU's pack.
+
+    All threads of a block call it together, and get the same answer: they may branch on
+    it and wait for each other inside. Without adjoint.
+    """
+    ...
