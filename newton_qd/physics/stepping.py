@@ -39,8 +39,8 @@ class Solves:
     def friction_answers(self) -> float:
         """Share of friction in the given solves that answers the new velocity.
 
-        The rest is given like the normal impulse, and stays in its cone. An eighth is
-        the least without gains of energy (``benchmarks/contact.py energy friction``).
+        The rest is given like the normal impulse, and stays in its cone. With less than
+        an eighth, light feet gain energy (docs/physics.md, "Friction weight").
         """
         return 1.0 if self.iterations == 1 else 0.125
 
