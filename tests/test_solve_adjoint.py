@@ -119,7 +119,7 @@ class Solve:
         """Weighted sum (worlds,) of the changes that the solve finds."""
         self.launch()
         found = [weights[name] * self.array(name)[self.used(name)] for name in FOUND]
-        return sum(part.sum(axis=(0, 1)) for part in found)
+        return np.sum([part.sum(axis=(0, 1)) for part in found], axis=0)
 
     def slope(self, entry: np.ndarray, step: float, weights: Any) -> np.ndarray:
         """Difference quotient (worlds,), of fourth order, for one number."""
