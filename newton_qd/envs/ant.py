@@ -9,7 +9,7 @@ import numpy as np
 from newton_qd.envs.base import PhysicsEnv
 from newton_qd.envs.contacts import angular_changes, linear_changes
 from newton_qd.envs.options import checked_options
-from newton_qd.envs.vectors import length, ordered_sum
+from newton_qd.envs.vectors import length, ordered_sum, rounded
 from newton_qd.physics.system import PhysicsState
 from newton_qd.robots import ANT
 from newton_qd.types import Action, Metrics
@@ -126,8 +126,8 @@ class Ant(PhysicsEnv):
             bonus, done = jnp.full_like(healthy, self._healthy_reward), 1 - healthy
         else:
             bonus, done = self._healthy_reward * healthy, jnp.zeros_like(healthy)
-        control = self._ctrl_cost_weight * ordered_sum(jnp.square(action))
-        contact = self._contact_cost_weight * self._contact_effort(after)
+        control = rounded(self._ctrl_cost_weight * ordered_sum(jnp.square(action)))
+        contact = rounded(self._contact_cost_weight * self._contact_effort(after))
         reward = velocity[0] + bonus - control - contact
         metrics = {
             "reward_forward": velocity[0],
