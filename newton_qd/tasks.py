@@ -181,7 +181,7 @@ ENVIRONMENTS: dict[str, EnvironmentSpec] = {
         Ant, "ant", (39.53, 40.32), ((-5.0, -5.0), (40.0, 40.0)), MazeWrapper
     ),
     "halfcheetah": EnvironmentSpec(HalfCheetah, "halfcheetah"),
-    "halfcheetah_uni": _uni(HalfCheetah, "halfcheetah", (7.59, 9.231)),
+    "halfcheetah_uni": _uni(HalfCheetah, "halfcheetah", (5.51, 9.231)),
     "hopper": EnvironmentSpec(Hopper, "hopper"),
     "hopper_uni": _uni(Hopper, "hopper", (0.9, 0.9)),
     "humanoid": EnvironmentSpec(Humanoid, "humanoid"),
