@@ -143,3 +143,15 @@ def sigint() -> None:
     """
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture
+def no_network(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every request into a network is an error that nobody expects."""
+
+    def refuse(*arguments: object, **options: object) -> None:
+        raise AssertionError(f"a request: {arguments}")
+
+    for name in ("socket.connect", "socket.connect_ex", "socket.sendto"):
+        monkeypatch.setattr(f"socket.{name}", refuse)
+    monkeypatch.setattr("socket.getaddrinfo", refuse)

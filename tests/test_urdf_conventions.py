@@ -246,15 +246,6 @@ def test_the_solver_takes_a_fixed_base(tmp_path: Path) -> None:
 # Files that a URDF file names.
 
 
-@pytest.fixture
-def no_network(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*arguments: object, **options: object) -> None:
-        raise AssertionError(f"a request: {arguments}")
-
-    monkeypatch.setattr("socket.socket.connect", refuse)
-    monkeypatch.setattr("socket.getaddrinfo", refuse)
-
-
 ADDRESS = "http://localhost:9/a.obj"
 
 

@@ -6,6 +6,8 @@ import dataclasses
 import functools
 import math
 import warnings
+from collections.abc import Sequence
+from pathlib import Path
 
 import newton
 import numpy as np
@@ -96,12 +98,18 @@ class NewtonQDSolver(SolverBase):
         normal_impulse: (worlds, nb) normal contact impulses of the last step [N s].
     """
 
-    def __init__(self, model: newton.Model, robot: RobotSpec) -> None:
+    def __init__(
+        self,
+        model: newton.Model,
+        robot: RobotSpec,
+        packages: Sequence[str | Path] = (),
+    ) -> None:
         """Checks the model and allocates the buffers of a step.
 
         Args:
             model: Newton model. Each world is a copy of the robot.
             robot: The robot.
+            packages: Folders of packages that ``newton_builder`` was given.
 
         Raises:
             ValueError: A world of ``model`` is not a copy of the robot. The message
@@ -112,7 +120,7 @@ class NewtonQDSolver(SolverBase):
         """
         super().__init__(model)
         self.robot = robot
-        self._reference = _one_world(robot, model.device)
+        self._reference = _one_world(robot, model.device, packages)
         _check_model(model, self._reference, robot)
         self._system = load_system(robot, "float32")
         self._worlds = model.world_count
@@ -226,11 +234,13 @@ def _launcher(system: System, device: wp.Device, dt: float) -> Launcher:
     return Launcher(dataclasses.replace(system, robot=robot), device)
 
 
-def _one_world(robot: RobotSpec, device: wp.Device) -> newton.Model:
+def _one_world(
+    robot: RobotSpec, device: wp.Device, packages: Sequence[str | Path]
+) -> newton.Model:
     """Returns Newton's model of the robot alone, built as users build it."""
     path = find_urdf(robot.urdf)
     floating = read_description(path, robot.fixed_base).floating
-    builder = newton_builder(str(path), floating, robot.gravity)
+    builder = newton_builder(str(path), floating, robot.gravity, packages=packages)
     with warnings.catch_warnings():
         # Newton has already warned about corrected inertias in the caller's model.
         warnings.simplefilter("ignore", newton.NewtonWarning)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,17 +19,19 @@ import numpy as np
 from newton_qd import checks
 from newton_qd.assets import find_urdf
 from newton_qd.checks import Fact, listed, message
-from newton_qd.physics import reference
+from newton_qd.physics.model.arrays import body_arrays, dof_arrays
 from newton_qd.physics.model.contacts import body_of, contact_tables
 from newton_qd.physics.model.description import (
-    Body,
     Description,
     read_description,
     warn_unbounded,
 )
 from newton_qd.physics.model.elements import UNLIMITED, Shape
 from newton_qd.physics.model.inertia import check_inertia
-from newton_qd.physics.model.newton_input import merge_fixed_bodies, newton_text
+from newton_qd.physics.model.newton_input import (
+    NewtonInput,
+    merge_fixed_bodies,
+)
 from newton_qd.physics.model.rest import rest_coordinates
 from newton_qd.physics.model.robot_checks import check_robot, index_of, refusal
 from newton_qd.physics.model.scene import obstacle_tables, read_scene
@@ -39,7 +42,7 @@ from newton_qd.physics.model.substeps import (
 )
 from newton_qd.physics.model.verify import BuiltModel, ModelMismatchError, verify
 from newton_qd.physics.model.wall_speeds import SoftWallWarning, soft_walls
-from newton_qd.physics.model.xml_reader import IDENTITY, RobotDescriptionError
+from newton_qd.physics.model.xml_reader import RobotDescriptionError
 from newton_qd.physics.system import TAILS, JointKind, System
 from newton_qd.robots import RobotSpec
 from newton_qd.scenes import Scene
@@ -48,34 +51,43 @@ if TYPE_CHECKING:
     import newton
 
 _EARTH_GRAVITY = 9.81  # [m/s^2]
-_DEFAULT_GEAR = 100.0  # [N m]
 
 
 def newton_builder(
-    path: str, floating: bool, gravity: float, meshes: bool = True
+    path: str,
+    floating: bool,
+    gravity: float,
+    meshes: bool = True,
+    packages: Sequence[str | Path] = (),
 ) -> newton.ModelBuilder:
     """Imports a URDF file into a Newton builder, with the settings of this package.
 
-    Nothing is downloaded: a mesh or a texture with an address in the network is left
-    out, with a warning.
+    Nothing is downloaded. Meshes and textures are read only from the folder of the
+    URDF file, from ``packages`` and from the folders below. What is only seen and
+    cannot be read is left out, with a ``RobotDescriptionWarning``.
 
     Args:
         path: The file.
         floating: Whether the root link floats. If false, it is fixed to the world.
         gravity: Downward acceleration [m/s^2].
         meshes: Whether the files of meshes and textures are read.
+        packages: Folders of packages: ``package://NAME/mesh.stl`` is found in a folder
+            NAME, or in a folder that contains a folder NAME.
 
     Raises:
-        RobotDescriptionError: The file is not XML.
+        RobotDescriptionError: The file is not XML, a colour is malformed, or the mesh
+            of a collider cannot be read.
         OSError: The file cannot be read.
     """
     import newton
 
+    given = NewtonInput(Path(path), meshes, packages)
+    given.leave_out_unreadable(newton.ModelBuilder)
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, -gravity))
     # Links without <inertial> have no mass. By default Newton computes a mass from the
     # colliders.
     builder.default_shape_cfg.density = 0.0
-    builder.add_urdf(newton_text(Path(path), meshes=meshes), floating=floating)
+    builder.add_urdf(given.text(), floating=floating)
     fixed = [kind == newton.JointType.FIXED for kind in builder.joint_type]
     merge_fixed_bodies(builder, fixed)
     return builder
@@ -201,51 +213,6 @@ def _control(
     }
 
 
-def _body_arrays(bodies: list[Body]) -> dict[str, np.ndarray]:
-    """Returns the joint frames and the inertias, arrays of shape (nb, ...)."""
-    joints = [body.joint for body in bodies]
-    return {
-        "joint_axis": np.array([j.axis if j else np.zeros(3) for j in joints]),
-        "parent_frame": np.array([j.frame if j else IDENTITY for j in joints]),
-        "child_frame": np.tile(IDENTITY, (len(bodies), 1)),
-        "mass": np.array([body.link.mass for body in bodies]),
-        "com": np.array([body.link.com for body in bodies]),
-        "inertia": np.array([body.link.inertia for body in bodies]),
-    }
-
-
-def _dof_arrays(
-    robot: RobotSpec, built: BuiltModel, bodies: list[Body], control: dict
-) -> dict[str, np.ndarray]:
-    """Returns the joint springs, dampers and limits, arrays of shape (nv,)."""
-    nv = int(sum(6 if kind == JointKind.FREE else 1 for kind in built.joint_kind))
-    lower, upper = np.full(nv, -np.inf), np.full(nv, np.inf)
-    damping = np.zeros(nv)
-    for start, body in zip(built.v_start, bodies, strict=True):
-        if body.joint is not None:
-            lower[start], upper[start] = body.joint.lower, body.joint.upper
-            damping[start] = body.joint.damping
-    gear = np.full(nv, control["gear"].max(initial=0.0) or _DEFAULT_GEAR)
-    gear[control["control_dof"]] = control["gear"]
-    # A servo is a spring towards the angle 0, plus a torque from its target angle. Both
-    # are integrated implicitly.
-    servo = [joint in robot.servos for joint, _ in robot.actuators]
-    stiffness = np.zeros(nv)
-    stiffness[control["control_dof"][servo]] = control["gear"][servo]
-    limited = np.isfinite(lower) | np.isfinite(upper)
-    width, overshoot = robot.material.limit_smoothing, robot.material.limit_overshoot
-    compressed = reference.penetration(width - overshoot, width)
-    return {
-        "armature": np.zeros(nv),
-        "damping": damping,
-        "stiffness": stiffness,
-        "spring_rest": np.zeros(nv),
-        "limit_lower": lower,
-        "limit_upper": upper,
-        "limit_stiffness": np.where(limited, gear / compressed, 0.0),
-    }
-
-
 def _verified(robot: RobotSpec, description: Description) -> BuiltModel:
     """Builds Newton's model, and compares it with the file.
 
@@ -313,8 +280,8 @@ def build_system(robot: RobotSpec, dtype: str, scene: Scene | None = None) -> Sy
         feet_width=0.02,
         feet_tail="exponential",
         reports_bodies=False,
-        **_body_arrays(bodies),
-        **_dof_arrays(robot, built, bodies, control),
+        **body_arrays(bodies),
+        **dof_arrays(robot, built, bodies, control),
         **control,
         **obstacles,
         scene_links=tuple(still),

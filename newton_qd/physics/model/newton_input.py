@@ -7,7 +7,9 @@ links about a wrong point.
 
 from __future__ import annotations
 
+import dataclasses
 import warnings
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -16,57 +18,145 @@ import numpy as np
 
 from newton_qd.checks import Fact, message
 from newton_qd.physics.model.description import merged_inertia
+from newton_qd.physics.model.mesh_files import Folders
 from newton_qd.physics.model.xml_reader import (
     IDENTITY,
     RobotDescriptionWarning,
     XmlReader,
-    asset_file,
 )
 from newton_qd.physics.reference import compose, inverse, rotation_matrix
 
 _READ = ("link", "joint", "material")
 
 
-def newton_text(path: Path, *, meshes: bool) -> str:
-    """Returns a URDF file as Newton should read it.
+@dataclasses.dataclass(frozen=True, eq=False)
+class Asset:
+    """A mesh or a texture that a URDF file names.
+
+    Attributes:
+        element: The element ``<mesh>`` or ``<texture>``.
+        parent: The element around it.
+        collides: Whether it is the mesh of a collider.
+        name: The name of its file in the URDF file.
+    """
+
+    element: ElementTree.Element
+    parent: ElementTree.Element
+    collides: bool
+    name: str
+
+
+class NewtonInput:
+    """A URDF file as Newton should read it.
+
+    A mesh or texture that is only seen, and that may not be read, is left out with a
+    warning. All meshes that remain are below the allowed folders.
 
     Args:
         path: The file.
-        meshes: Whether Newton may read the files of meshes and textures. It never
-            downloads one.
+        meshes: Whether Newton may read the files of meshes and textures.
+        packages: Folders whose files may be read, too.
+
+    Attributes:
+        meshes: The meshes that Newton will read.
 
     Raises:
-        RobotDescriptionError: The file is not XML.
+        RobotDescriptionError: The file is not XML, a colour is malformed, or the mesh
+            of a collider may not be read.
         OSError: The file cannot be read.
     """
-    root = XmlReader(path).root
-    for child in list(root):
-        if child.tag not in _READ:
-            root.remove(child)
-    _drop_prefixed(root)
-    for capsule in root.iter("capsule"):
-        if capsule.get("height") is None and capsule.get("length") is not None:
-            capsule.set("height", capsule.attrib["length"])
-    skipped = []
-    for parent in list(root.iter()):
-        for child in list(parent):
-            name = child.get("filename")
-            if child.tag not in ("mesh", "texture") or name is None:
-                continue
-            if not meshes or name.startswith(("http://", "https://")):
-                parent.remove(child)
-                skipped += [name] if meshes else []
-                continue
-            # Newton has the text only, so it does not know the folder of the file.
-            found = asset_file(path, name)
-            if found is not None:
-                child.set("filename", str(found))
-    if skipped:
-        allowed = "files on this machine; what has another address is not drawn"
-        given = Fact(", ".join(dict.fromkeys(skipped)))
-        text = message(f"{path}: filename", given, allowed)
-        warnings.warn(text, RobotDescriptionWarning, stacklevel=3)
-    return ElementTree.tostring(root, encoding="unicode")
+
+    def __init__(self, path: Path, meshes: bool, packages: Sequence[str | Path]):
+        self.meshes: list[Asset] = []
+        self._reader = XmlReader(path)
+        self._folders = Folders(path, packages)
+        root = self._reader.root
+        for child in list(root):
+            if child.tag not in _READ:
+                root.remove(child)
+        _drop_prefixed(root)
+        for capsule in root.iter("capsule"):
+            if capsule.get("height") is None and capsule.get("length") is not None:
+                capsule.set("height", capsule.attrib["length"])
+        parents = {child: parent for parent in root.iter() for child in parent}
+        for element, parent in parents.items():
+            if not meshes:
+                if element.tag in ("material", "mesh"):
+                    parent.remove(element)
+            elif element.tag == "color" and element.get("rgba"):
+                short = len(element.attrib["rgba"].split()) == 3  # no opacity
+                self._reader.numbers(element, "rgba", 3 if short else 4)
+            elif element.tag in ("mesh", "texture") and "filename" in element.attrib:
+                above = parents.get(parent)
+                collides = above is not None and above.tag == "collision"
+                name = element.attrib["filename"]
+                self._keep(Asset(element, parent, collides, name))
+
+    def text(self) -> str:
+        """Returns the text for Newton."""
+        return ElementTree.tostring(self._reader.root, encoding="unicode")
+
+    def leave_out_unreadable(self, new_builder: Callable[[], Any]) -> None:
+        """Leaves out the meshes that Newton cannot read, with a warning for each.
+
+        Args:
+            new_builder: Makes an empty builder of Newton.
+
+        Raises:
+            RobotDescriptionError: One is the mesh of a collider.
+        """
+        for mesh in self.meshes:
+            why = _mesh_problem(mesh, new_builder)
+            if why:
+                self._leave_out(mesh, why)
+
+    def _leave_out(self, asset: Asset, why: str = "") -> None:
+        """Leaves out a mesh or a texture that is only seen, with a warning.
+
+        Raises:
+            RobotDescriptionError: It is the mesh of a collider.
+        """
+        name, allowed = asset.name, self._folders.allowed
+        if asset.collides:
+            field = "filename of a collider's mesh"
+            text = message(field, name, allowed, why=why)
+            raise self._reader.error(asset.element, text)
+        asset.parent.remove(asset.element)
+        allowed = f"{allowed}; another one is not drawn"
+        text = message("filename", Fact(name), allowed, why=why)
+        error = self._reader.error(asset.element, text)
+        warnings.warn(str(error), RobotDescriptionWarning, stacklevel=4)
+
+    def _keep(self, asset: Asset) -> None:
+        """Keeps a mesh or a texture if it may be read."""
+        found = self._folders.file(asset.name)
+        if found is None:
+            self._leave_out(asset)
+            return
+        why = self._folders.problem(found) if asset.element.tag == "mesh" else ""
+        if why:
+            self._leave_out(asset, why)
+            return
+        # Newton has the text only, so it does not know the folder of the file.
+        asset.element.set("filename", str(found))
+        if asset.element.tag == "mesh":
+            self.meshes.append(asset)
+
+
+def _mesh_problem(mesh: Asset, new_builder: Callable[[], Any]) -> str:
+    """Returns why Newton cannot read a mesh; empty if it can."""
+    element = ElementTree.Element("mesh", mesh.element.attrib)
+    robot = ElementTree.Element("robot", name="mesh")
+    link = ElementTree.SubElement(robot, "link", name="mesh")
+    visual = ElementTree.SubElement(link, "visual")
+    ElementTree.SubElement(visual, "geometry").append(element)
+    text = ElementTree.tostring(robot, encoding="unicode")
+    try:
+        new_builder().add_urdf(text)
+    except Exception as error:  # a reader of meshes may raise anything
+        reason = " ".join(str(error).split())
+        return f"which Newton cannot read ({type(error).__name__}: {reason})"
+    return ""
 
 
 def _drop_prefixed(element: ElementTree.Element) -> None:

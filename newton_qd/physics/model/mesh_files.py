@@ -1,0 +1,113 @@
+"""Which files a URDF file may have read: those below its folder or a given package.
+
+A mesh or a texture is read for Newton's viewers only. A URDF file of somebody else must
+cause no request in a network, and must not read a file elsewhere on this machine. That
+holds for the files that a mesh names, too.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from xml.etree import ElementTree
+
+from newton_qd.checks import listed
+
+READABLE = (".stl", ".obj", ".dae", ".ply")
+"""Kinds of mesh files that are read: all that may name other files in known places."""
+
+_OBJ_FILES = re.compile(
+    rb"^\s*(?:mtllib|map_\w+|bump|disp|decal|refl|norm)[ \t]+([^\r\n]*)", re.MULTILINE
+)
+_PLY_FILES = re.compile(rb"^\s*comment\s+TextureFile\s+([^\r\n]*)", re.MULTILINE)
+_DAE_TAGS = ("init_from", "ref")
+
+
+class Folders:
+    """The folders of which a URDF file may have files read.
+
+    Attributes:
+        allowed: Description of the allowed files, for errors.
+    """
+
+    def __init__(self, urdf: Path, packages: Sequence[str | Path] = ()):
+        self._base = urdf.absolute().parent
+        self._packages = [Path(package).expanduser().absolute() for package in packages]
+        self._roots = [root.resolve() for root in (self._base, *self._packages)]
+        places = listed([self._base, *self._packages])
+        self.allowed = f"files below {places}, or below a folder given as packages=..."
+
+    def file(self, name: str) -> Path | None:
+        """Returns the file that a URDF file names, or ``None`` if it is not allowed.
+
+        Args:
+            name: A path, relative to the URDF file's folder, or ``file:///path``, or
+                ``package://NAME/path``.
+        """
+        scheme, mark, rest = name.partition("://")
+        if not mark:
+            places = [self._base / name]
+        elif scheme.lower() == "file":
+            places = [Path(rest)]
+        elif scheme.lower() in ("package", "model"):
+            package, _, inside = rest.partition("/")
+            above = [self._base, *self._base.parents, *self._packages]
+            places = [folder / inside for folder in above if folder.name == package]
+            places += [folder / rest for folder in self._packages]
+        else:
+            return None
+        return next((place for place in places if self._is_file(place)), None)
+
+    def problem(self, mesh: Path) -> str:
+        """Returns why the file of a mesh may not be read; empty if it may."""
+        if mesh.suffix.lower() not in READABLE:
+            return f"which is none of {listed(READABLE)}"
+        try:
+            outside = self._outside(mesh)
+        except (OSError, ElementTree.ParseError) as error:
+            return f"which cannot be read ({error})"
+        return "" if outside is None else f"which names the file {outside!r}"
+
+    def _outside(self, mesh: Path) -> str | None:
+        """Returns a name in a mesh file of a file that is not allowed."""
+        pending = [mesh]
+        for file in pending:
+            for name in _named(file):
+                # Options may stand before the name of a map: each word may be a name.
+                for part in dict.fromkeys((name, *name.split())):
+                    found = file.parent / part
+                    if "://" in part or not self._is_inside(found):
+                        return part
+                    if found.suffix.lower() == ".mtl" and found not in pending:
+                        pending += [found] if found.is_file() else []
+        return None
+
+    def _is_inside(self, path: Path) -> bool:
+        # Follows links, as a link may lead outside.
+        try:
+            real = path.resolve()
+        except (OSError, RuntimeError, ValueError):  # a loop of links, a zero byte
+            return False
+        return any(real.is_relative_to(root) for root in self._roots)
+
+    def _is_file(self, path: Path) -> bool:
+        return self._is_inside(path) and path.is_file()
+
+
+def _named(file: Path) -> list[str]:
+    """Returns the names of the files that a mesh file or its materials name."""
+    kind = file.suffix.lower()
+    if kind == ".stl":
+        return []
+    data = file.read_bytes()
+    if kind == ".dae":
+        found = [
+            element.text or ""
+            for element in ElementTree.fromstring(data).iter()
+            if element.tag.rpartition("}")[2] in _DAE_TAGS
+        ]
+    else:
+        pattern = _PLY_FILES if kind == ".ply" else _OBJ_FILES
+        found = [name.decode("utf-8", "replace") for name in pattern.findall(data)]
+    return [name.strip() for name in found]
