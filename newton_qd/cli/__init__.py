@@ -1,4 +1,4 @@
-"""The command ``newton-qd``: environments, evolution and the gradient doctor."""
+"""The command ``newton-qd``: environments, evolution, runs, the gradient doctor."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-from newton_qd.cli import algorithms, doctor, envs, evolve
+from newton_qd.cli import algorithms, doctor, envs, evolve, runs
 from newton_qd.cli.arguments import BAD_ARGUMENTS, FAILED, OK, complain
 from newton_qd.errors import FaultError, MissingExtra, UnknownEnvironment
 from newton_qd.qd.config import ConfigError, EvolveConfig
@@ -29,7 +29,7 @@ def main(
     Args:
         argv: Arguments without the name of the program. ``None``: the arguments of the
             process.
-        task_factory: Function that creates the task of ``evolve``. ``None``: the task
+        task_factory: Function that creates the task of a run. ``None``: the task
             of a registered environment.
 
     Returns:
@@ -42,10 +42,11 @@ def main(
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for command in (envs, algorithms, evolve, doctor):
         command.add_parser(commands)
+    runs.add_parsers(commands)
     arguments = parser.parse_args(argv)
     try:
-        if arguments.command == "evolve":
-            return evolve.run(arguments, task_factory)
+        if arguments.command in ("evolve", "eval", "plot"):
+            return arguments.run(arguments, task_factory)
         return arguments.run(arguments)
     except (ConfigError, UnknownEnvironment) as error:
         return complain(arguments, error, BAD_ARGUMENTS)

@@ -6,6 +6,8 @@ import argparse
 import sys
 from typing import TypeAlias
 
+from newton_qd.qd.config import changed_facts, environment_facts
+
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 """The subparsers of ``newton-qd``."""
 
@@ -16,6 +18,20 @@ def complain(arguments: argparse.Namespace, what: object, code: int) -> int:
     """Prints an error of the command to standard error and returns the exit code."""
     print(f"newton-qd {arguments.command}: error: {what}", file=sys.stderr)
     return code
+
+
+def warn_of_changes(facts: dict[str, object], when: str) -> None:
+    """Says on standard error which facts of a machine differ from those of this one.
+
+    Args:
+        facts: Facts from a config; empty: nothing is known.
+        when: When they held.
+    """
+    for name, old, new in changed_facts(facts, environment_facts()) if facts else ():
+        print(
+            f"warning: {name} was {old} {when} and is {new} now; the result may differ",
+            file=sys.stderr,
+        )
 
 
 def widths(text: str) -> tuple[int, ...]:

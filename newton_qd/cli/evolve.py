@@ -5,20 +5,25 @@ from __future__ import annotations
 import argparse
 import ast
 import shlex
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from newton_qd import checks
 from newton_qd.checks import message
-from newton_qd.cli.arguments import FAILED, OK, Commands, complain, integers, widths
+from newton_qd.cli.arguments import (
+    FAILED,
+    OK,
+    Commands,
+    complain,
+    integers,
+    warn_of_changes,
+    widths,
+)
 from newton_qd.qd.algorithms import ALGORITHMS
 from newton_qd.qd.config import (
     ConfigError,
     EvolveConfig,
-    changed_facts,
-    environment_facts,
     read_config,
 )
 from newton_qd.qd.run.interrupt import INTERRUPTED, graceful_stop
@@ -39,6 +44,7 @@ def add_parser(commands: Commands) -> None:
         "archive.npz, archive.png, metrics.csv, corrected.json, config.json and a "
         "checkpoint.",
     )
+    parser.set_defaults(run=run)
     _add_run_arguments(parser)
     _add_setting_arguments(parser)
 
@@ -222,7 +228,7 @@ def _settle(arguments: argparse.Namespace) -> tuple[EvolveConfig, Path]:
     base = None
     if arguments.config is not None:
         base, facts = read_config(arguments.config, given.get("env_name"))
-        _warn_of_changes(facts)
+        warn_of_changes(facts, "when this config was written")
     out = arguments.out
     if out is None:
         named = (base or _DEFAULTS).replace(**given)
@@ -244,15 +250,6 @@ def _settle(arguments: argparse.Namespace) -> tuple[EvolveConfig, Path]:
     if "options" in given:
         given["options"] = {**dict(base.options), **dict(given["options"])}
     return base.replace(**given), out
-
-
-def _warn_of_changes(facts: dict[str, Any]) -> None:
-    for name, old, new in changed_facts(facts, environment_facts()) if facts else ():
-        print(
-            f"warning: {name} was {old} when this config was written and is {new} "
-            "now; the result may differ",
-            file=sys.stderr,
-        )
 
 
 def _report(result: EvolveResult, out: Path) -> None:

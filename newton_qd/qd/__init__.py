@@ -3,7 +3,8 @@
 - ``evolve(EvolveConfig(...), out=...)``: MAP-Elites on a registered environment
 - ``newton_qd.qd.emitters``: emitters for QDax that use exact gradients, and
   ``AnnealedRepertoire`` for one of them
-- ``load_archive(folder)``, ``plot_archive(...)``: the result of a run
+- ``load_run(folder)``: a run with its settings, task, policy, elites and pictures;
+  ``load_archive(folder)``, ``plot_archive(...)``: its archive alone
 - ``make_task``, ``make_policy``, ``make_scoring_function``: parts for other algorithms
   of QDax
 - ``episode_of(task, policy, length)``: the same as a ``newton_qd.Episode``;
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from newton_qd.qd.run.archive import Archive, ArchiveError, load_archive
     from newton_qd.qd.run.checkpoint import CheckpointError
     from newton_qd.qd.run.evolution import EvolveResult, evolve
+    from newton_qd.qd.run.opened import Elite, Evaluation, Run, load_run
     from newton_qd.qd.run.plot import plot_archive
     from newton_qd.qd.run.search import SearchError
     from newton_qd.qd.scoring.gradient_scoring import make_gradient_scoring_function
@@ -46,9 +48,12 @@ __all__ = [
     "ArchiveError",
     "CheckpointError",
     "ConfigError",
+    "Elite",
+    "Evaluation",
     "EvolveConfig",
     "EvolveResult",
     "Policy",
+    "Run",
     "SearchError",
     "Task",
     "device_mesh",
@@ -56,6 +61,7 @@ __all__ = [
     "evolve",
     "from_ribs",
     "load_archive",
+    "load_run",
     "make_gradient_scoring_function",
     "make_policy",
     "make_ribs_evaluation",
@@ -72,9 +78,12 @@ _HOME = {
     "ArchiveError": "run.archive",
     "CheckpointError": "run.checkpoint",
     "ConfigError": "config",
+    "Elite": "run.opened",
+    "Evaluation": "run.opened",
     "EvolveConfig": "config",
     "EvolveResult": "run.evolution",
     "Policy": "scoring.rollout",
+    "Run": "run.opened",
     "SearchError": "run.search",
     "Task": "scoring.task",
     "device_mesh": "scoring.sharding",
@@ -82,6 +91,7 @@ _HOME = {
     "evolve": "run.evolution",
     "from_ribs": "scoring.ribs",
     "load_archive": "run.archive",
+    "load_run": "run.opened",
     "make_gradient_scoring_function": "scoring.gradient_scoring",
     "make_policy": "scoring.rollout",
     "make_ribs_evaluation": "scoring.ribs",

@@ -3,5 +3,6 @@
 - ``generation``: one generation as pure functions; ``search``: the step from one
   generation to the next; ``evolution``: the loop
 - ``archive``, ``checkpoint``, ``folder``: the files of a run
+- ``opened``: a results folder, opened again
 - ``interrupt``, ``progress``, ``plot``, ``tensorboard``: signals, display and pictures
 """

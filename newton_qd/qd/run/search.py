@@ -89,7 +89,7 @@ class Search:
         self._config = config
         self._task = task
         self._mesh = mesh
-        keys = jax.random.split(jax.random.key(config.seed), 4)
+        keys = _keys(config.seed)
         key_centroids, self._key_reset = keys[0], keys[1]
         self._key_initial, self._key_generations = keys[2], keys[3]
         self._key_reevaluations = jax.random.fold_in(self._key_reset, 1)
@@ -297,6 +297,16 @@ class Search:
         if self._mesh is None or not evaluates:
             return jax.jit(function)
         return on_mesh(function, self._mesh)
+
+
+def start_key(seed: int) -> jax.Array:
+    """Returns the key of the reset that all evaluations of a run start with."""
+    return _keys(seed)[1]
+
+
+def _keys(seed: int) -> jax.Array:
+    """Returns keys of centroids, start state, initial population and generations."""
+    return jax.random.split(jax.random.key(seed), 4)
 
 
 def _runnable(config: EvolveConfig) -> AlgorithmSpec[Any]:

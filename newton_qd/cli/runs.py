@@ -1,0 +1,260 @@
+"""``newton-qd eval`` and ``newton-qd plot``: open the results folder of a run."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from newton_qd import checks
+from newton_qd.cli.arguments import (
+    BAD_ARGUMENTS,
+    FAILED,
+    OK,
+    Commands,
+    complain,
+    warn_of_changes,
+)
+from newton_qd.files import write_atomically
+from newton_qd.qd.config import ConfigError, EvolveConfig
+
+if TYPE_CHECKING:
+    from newton_qd.qd.run.opened import Elite, Evaluation, Run
+    from newton_qd.qd.scoring.task import Task
+
+    TaskFactory = Callable[[EvolveConfig], Task] | None
+
+_MOST_SHOWN = 20
+
+
+def add_parsers(commands: Commands) -> None:
+    """Adds both commands to the subparsers of ``newton-qd``."""
+    parser = commands.add_parser(
+        "eval",
+        help="evaluate the elites of a run again",
+        description="Evaluates elites of a results folder from the start state of the "
+        "run, and checks that fitness and descriptor are bitwise those of the archive. "
+        "With --starts, evaluates them from other start states.",
+    )
+    parser.add_argument("folder", type=Path, metavar="DIR", help="results folder")
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument("--cell", type=int, metavar="N", help="the elite of one cell")
+    which.add_argument("--best", type=int, metavar="N", help="the N fittest elites")
+    which.add_argument(
+        "--near",
+        type=_numbers,
+        metavar="X,X",
+        help="the elite with the nearest descriptor; write --near=-3,2 if the first "
+        "number is negative",
+    )
+    parser.add_argument(
+        "--starts",
+        type=int,
+        default=0,
+        metavar="N",
+        help="evaluate from N other start states (default: only from that of the run)",
+    )
+    parser.add_argument(
+        "--seed", type=int, default=0, metavar="N", help="seed of --starts (default: 0)"
+    )
+    parser.set_defaults(run=evaluate)
+
+    parser = commands.add_parser(
+        "plot",
+        help="draw the archive and the learning curves of a run",
+        description="Writes archive.png and curves.png of a results folder.",
+    )
+    parser.add_argument("folder", type=Path, metavar="DIR", help="results folder")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="folder for the pictures (default: the results folder)",
+    )
+    parser.set_defaults(run=plot)
+
+
+def _numbers(text: str) -> tuple[float, ...]:
+    """Parses numbers with commas between them.
+
+    Raises:
+        argparse.ArgumentTypeError: A part is not a number.
+    """
+    try:
+        return tuple(float(part) for part in text.split(","))
+    except ValueError as error:
+        given = f"got {text!r}; allowed: numbers like 0.5,0.25"
+        raise argparse.ArgumentTypeError(given) from error
+
+
+def _opened(folder: Path, task_factory: TaskFactory) -> Run:
+    """Opens a run; says what differs from the machine that made it."""
+    from newton_qd.physics.precision import quiet
+    from newton_qd.qd.run.opened import load_run
+    from newton_qd.qd.scoring.task import make_task
+
+    quiet()
+    run = load_run(
+        folder, task_factory=make_task if task_factory is None else task_factory
+    )
+    warn_of_changes(run.facts, "when the run began")
+    return run
+
+
+def evaluate(arguments: argparse.Namespace, task_factory: TaskFactory = None) -> int:
+    """Evaluates elites and prints a table. Returns the exit code.
+
+    Raises:
+        ConfigError: An argument is not allowed.
+    """
+    checks.integer("--starts", arguments.starts, least=0, error=ConfigError)
+    checks.integer("--seed", arguments.seed, least=0, error=ConfigError)
+    if arguments.best is not None:
+        checks.integer("--best", arguments.best, error=ConfigError)
+    from newton_qd.qd.run.archive import ArchiveError
+
+    try:
+        run = _opened(arguments.folder, task_factory)
+    except ArchiveError as error:
+        return complain(arguments, error, FAILED)
+    try:
+        elites = _chosen(run, arguments)
+    except (LookupError, ValueError) as error:
+        return complain(arguments, error, BAD_ARGUMENTS)
+    if not elites:
+        return complain(arguments, f"the archive in {run.path} is empty", FAILED)
+    cells = [elite.cell for elite in elites]
+    whole = arguments.cell is arguments.best is arguments.near is None
+    if arguments.starts:
+        import jax
+
+        keys = jax.random.split(jax.random.key(arguments.seed), arguments.starts)
+        _print_starts(elites, run.evaluate(cells, keys))
+        return OK
+    return _print_repeated(run, elites, run.evaluate(cells), whole)
+
+
+def _chosen(run: Run, arguments: argparse.Namespace) -> list[Elite]:
+    """Returns the elites that the arguments name."""
+    if arguments.cell is not None:
+        return [run.elite(arguments.cell)]
+    if arguments.near is not None:
+        return run.nearest(arguments.near)
+    count = len(run.cells) if arguments.best is None else arguments.best
+    return run.best(count) if count else []
+
+
+def _print_repeated(
+    run: Run, elites: Sequence[Elite], found: Evaluation, whole: bool
+) -> int:
+    """Prints results from the start state of the run. Returns the exit code."""
+    import numpy as np
+
+    stored = np.asarray([elite.fitness for elite in elites], found.fitnesses.dtype)
+    places = np.asarray([elite.descriptor for elite in elites])
+    same = (stored == found.fitnesses) & (places == found.descriptors).all(axis=1)
+    shown = np.flatnonzero(~same) if whole else np.arange(len(elites))
+    rows: list[tuple[Any, ...]] = [
+        (
+            elites[i].cell,
+            _text(found.descriptors[i]),
+            f"{stored[i]:.6g}",
+            f"{found.fitnesses[i]:.6g}",
+            "yes" if same[i] else "no",
+        )
+        for i in shown[:_MOST_SHOWN]
+    ]
+    if rows:
+        _table(("cell", "descriptor", "in the archive", "fitness", "same bits"), rows)
+    if len(shown) > _MOST_SHOWN:
+        print(f"... and {len(shown) - _MOST_SHOWN} more")
+    count = "1 elite" if len(elites) == 1 else f"{len(elites)} elites"
+    if same.all():
+        print(f"{count} of {run.path}: fitness and descriptor are bitwise the same")
+        return OK
+    print(f"{count} of {run.path}: {len(same) - same.sum()} have other results")
+    return FAILED
+
+
+def _print_starts(elites: Sequence[Elite], found: Evaluation) -> None:
+    """Prints results from several start states."""
+    import numpy as np
+
+    median, spread = np.median(found.fitnesses, axis=1), found.fitnesses.std(axis=1)
+    middle = np.median(found.descriptors, axis=1)
+    rows = [
+        (
+            elite.cell,
+            _text(elite.descriptor),
+            _text(middle[i]),
+            f"{elite.fitness:.6g}",
+            f"{median[i]:.6g}",
+            f"{found.fitnesses[i].min():.6g}",
+            f"{spread[i]:.3g}",
+        )
+        for i, elite in enumerate(elites[:_MOST_SHOWN])
+    ]
+    head = ("cell", "descriptor", "again", "fitness", "again", "worst", "deviation")
+    _table(head, rows)
+    if len(elites) > _MOST_SHOWN:
+        print(f"... and {len(elites) - _MOST_SHOWN} more")
+    starts, lost = found.fitnesses.shape[1], _lost(elites, median)
+    print(
+        f"again: medians over {starts} start states; their median over all elites is "
+        f"{np.median(median):.6g}, {lost:.0%} lost more than a tenth of their fitness"
+    )
+
+
+def _lost(elites: Sequence[Elite], medians: Any) -> float:
+    """Returns the share of elites with a median a tenth below their fitness."""
+    lost = [
+        median < elite.fitness - 0.1 * abs(elite.fitness)
+        for elite, median in zip(elites, medians, strict=True)
+    ]
+    return sum(lost) / len(lost)
+
+
+def _text(descriptor: Any) -> str:
+    return " ".join(f"{value:.4g}" for value in descriptor)
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+    """Prints rows below a head."""
+    lines = [head, *rows]
+    widths = [max(len(str(row[i])) for row in lines) for i in range(len(head))]
+    for row in lines:
+        cells = (
+            str(cell).ljust(width) for cell, width in zip(row, widths, strict=True)
+        )
+        print("  ".join(cells).rstrip())
+
+
+def plot(arguments: argparse.Namespace, task_factory: TaskFactory = None) -> int:
+    """Writes the pictures of a run. Returns the exit code.
+
+    Raises:
+        ConfigError: ``--out`` is a file, or the archive cannot be read.
+    """
+    import io
+
+    from newton_qd.qd.run.archive import ArchiveError
+
+    out = arguments.folder if arguments.out is None else arguments.out
+    if out.exists() and not out.is_dir():
+        refused = f"--out: got {out}, a file; allowed: a folder, or a new name"
+        return complain(arguments, refused, BAD_ARGUMENTS)
+    try:
+        run = _opened(arguments.folder, task_factory)
+    except ArchiveError as error:
+        return complain(arguments, error, FAILED)
+    out.mkdir(parents=True, exist_ok=True)
+    for name, figure in (
+        ("archive.png", run.plot()),
+        ("curves.png", run.plot_curves()),
+    ):
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format="png", dpi=120)
+        write_atomically(out / name, buffer.getvalue())
+        print(f"written: {out / name}")
+    return OK

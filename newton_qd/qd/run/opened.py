@@ -1,0 +1,422 @@
+"""A run that can be opened: its settings, its elites, and their evaluation."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import functools
+import json
+import os
+import warnings
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from newton_qd import checks
+from newton_qd.checks import Fact, message
+from newton_qd.qd.algorithms import algorithm_named
+from newton_qd.qd.config import ConfigError, EvolveConfig, read_config
+from newton_qd.qd.extras import require_extra
+from newton_qd.qd.run.archive import ARCHIVE, Archive, load_archive
+from newton_qd.qd.run.checkpoint import CheckpointError, load_checkpoint
+from newton_qd.qd.run.folder import (
+    CHECKPOINT,
+    COLUMNS,
+    CONFIG,
+    METRICS,
+    REEVALUATED,
+)
+from newton_qd.qd.run.plot import grid_indices
+from newton_qd.qd.run.reevaluation import Reevaluated
+from newton_qd.qd.run.search import start_key
+from newton_qd.qd.scoring.rollout import (
+    Policy,
+    episode_of,
+    make_policy,
+    make_scoring_function,
+)
+from newton_qd.qd.scoring.task import Task, make_task
+from newton_qd.types import Repertoire, RNGKey
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclasses.dataclass(frozen=True)
+class Elite:
+    """An individual of an archive.
+
+    Attributes:
+        cell: Its row in the archive.
+        genotype: (size,) policy weights.
+        fitness: Fitness in the archive.
+        descriptor: (D,) descriptor in the archive.
+    """
+
+    cell: int
+    genotype: np.ndarray
+    fitness: float
+    descriptor: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluation:
+    """Results of elites that were evaluated again.
+
+    N is the number of cells and K the number of keys. A single cell has no axis N, and
+    a single key no axis K.
+
+    Attributes:
+        cells: (N,) rows of the archive.
+        fitnesses: (N, K) fitnesses, ``-inf`` after a fault.
+        descriptors: (N, K, D) descriptors.
+    """
+
+    cells: np.ndarray
+    fitnesses: np.ndarray
+    descriptors: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Run:
+    """The results folder of a run, opened.
+
+    Attributes:
+        path: The folder.
+        config: Settings with a grid or a number of centroids.
+        facts: Facts of the machine that made the run: versions, backend.
+        task: Environment, descriptor, limits and labels.
+        policy: Policy whose weights are the genotypes.
+        archive: The elites as NumPy arrays, one row per cell.
+        metrics: Name of each column of ``metrics.csv`` to its values
+            (iteration + 1,).
+        reevaluated: Metrics of re-evaluated elites; ``None`` if there are none.
+        start_key: Key of the reset that all evaluations of the run start with. It
+            follows from the seed.
+    """
+
+    path: Path
+    config: EvolveConfig
+    facts: dict[str, object]
+    task: Task
+    policy: Policy
+    archive: Archive
+    metrics: dict[str, np.ndarray]
+    reevaluated: Reevaluated | None
+    start_key: RNGKey
+
+    @property
+    def iteration(self) -> int:
+        """Generations that are finished."""
+        return len(self.metrics["iteration"]) - 1
+
+    @functools.cached_property
+    def repertoire(self) -> Repertoire:
+        """The archive as ``MapElitesRepertoire`` of QDax."""
+        from qdax.core.containers.mapelites_repertoire import MapElitesRepertoire
+
+        return MapElitesRepertoire(
+            genotypes=jnp.asarray(self.archive.genotypes),
+            fitnesses=jnp.asarray(self.archive.fitnesses[:, None]),
+            extra_scores={},
+            keys_extra_scores=(),
+            descriptors=jnp.asarray(self.archive.descriptors),
+            centroids=jnp.asarray(self.archive.centroids),
+        )
+
+    @property
+    def cells(self) -> np.ndarray:
+        """(N,) cells that hold an elite, in the order of the archive."""
+        return np.flatnonzero(self.archive.filled)
+
+    def elite(self, cell: int | Sequence[int]) -> Elite:
+        """Returns the elite of a cell.
+
+        Args:
+            cell: Row of the archive, or for a grid the indices along each dimension.
+
+        Raises:
+            IndexError: The cell does not exist.
+            LookupError: The cell is empty.
+        """
+        row = self._row(cell)
+        archive = self.archive
+        if not archive.filled[row]:
+            why = "which is empty"
+            count = f"one of the {archive.filled.sum()} cells in run.cells"
+            raise LookupError(message("cell", cell, count, why=why))
+        return Elite(
+            row,
+            archive.genotypes[row],
+            float(archive.fitnesses[row]),
+            archive.descriptors[row],
+        )
+
+    def best(self, count: int = 1) -> list[Elite]:
+        """Returns the fittest elites, the best first.
+
+        Raises:
+            ValueError: ``count`` is not an integer from 1.
+        """
+        checks.integer("count", count)
+        cells = self.cells
+        order = np.argsort(-self.archive.fitnesses[cells], kind="stable")
+        return [self.elite(int(cell)) for cell in cells[order][:count]]
+
+    def nearest(
+        self, descriptor: Sequence[float] | np.ndarray, count: int = 1
+    ) -> list[Elite]:
+        """Returns the elites whose descriptors are nearest, the nearest first.
+
+        Args:
+            descriptor: (D,) wanted descriptor.
+            count: Number of elites.
+
+        Raises:
+            ValueError: ``descriptor`` has another length, is not finite, or ``count``
+                is not an integer from 1.
+        """
+        checks.integer("count", count)
+        wanted = np.asarray(descriptor, np.float64)
+        length = self.task.descriptor_length
+        if wanted.shape != (length,) or not np.all(np.isfinite(wanted)):
+            allowed = f"{length} finite numbers: {', '.join(self.task.labels)}"
+            raise ValueError(message("descriptor", descriptor, allowed))
+        low, high = self.task.limits
+        cells = self.cells
+        # in units of the limits, so that no component counts more than another
+        gaps = (self.archive.descriptors[cells] - wanted) / (high - low)
+        order = np.argsort(np.linalg.norm(gaps, axis=1), kind="stable")
+        return [self.elite(int(cell)) for cell in cells[order][:count]]
+
+    def evaluate(
+        self,
+        cell: int | Sequence[int] | np.ndarray | None = None,
+        keys: RNGKey | None = None,
+    ) -> Evaluation:
+        """Evaluates elites again.
+
+        Args:
+            cell: Row of the archive, or (N,) rows; ``None``: all elites.
+            keys: Key or (K,) keys of the reset. ``None``: the key of the run. Then
+                fitness and descriptor are bitwise those of the archive, on the same
+                kind of machine with the same versions.
+
+        Raises:
+            IndexError: A cell does not exist.
+            LookupError: A cell is empty.
+        """
+        alone = cell is not None and np.ndim(cell) == 0
+        rows = self.cells if cell is None else np.atleast_1d(np.asarray(cell))
+        genotypes = np.stack([self.elite(int(row)).genotype for row in rows])
+        if keys is None:
+            fitnesses, found = self._chunks(self._score, genotypes)
+        else:
+            fitnesses, found = self._from_keys(genotypes, keys)
+        if alone:
+            return Evaluation(rows[0], fitnesses[0], found[0])
+        return Evaluation(rows, fitnesses, found)
+
+    def plot(self) -> Figure:
+        """Draws the archive.
+
+        Raises:
+            MissingExtra: matplotlib is not installed.
+        """
+        from newton_qd.qd.run.plot import archive_figure
+
+        return archive_figure(self.archive, self.config, self.task, self.iteration)
+
+    def plot_curves(self) -> Figure:
+        """Draws QD score, coverage and best fitness over the generations.
+
+        Raises:
+            MissingExtra: matplotlib is not installed.
+        """
+        from newton_qd.qd.run.plot_curves import curves_figure
+
+        return curves_figure(self.metrics, self.config, self.reevaluated)
+
+    def _row(self, cell: int | Sequence[int]) -> int:
+        """Returns the row of a cell.
+
+        Raises:
+            IndexError: The cell does not exist.
+        """
+        count, grid = len(self.archive.centroids), self.config.grid
+        if isinstance(cell, Sequence) and grid is not None:
+            table = grid_indices(self.archive.centroids, grid, self.task.limits)
+            if len(cell) == len(grid):
+                rows = np.flatnonzero((table == np.asarray(cell)).all(axis=1))
+                if len(rows) == 1:
+                    return int(rows[0])
+            cells = "x".join(map(str, grid))
+            allowed = f"indices of a grid of {cells} cells"
+            raise IndexError(message("cell", cell, allowed))
+        if not (checks.is_integer(cell) and 0 <= cell < count):
+            raise IndexError(message("cell", cell, f"integers from 0 to {count - 1}"))
+        return int(cell)
+
+    @functools.cached_property
+    def _score(self) -> Callable[[jax.Array, jax.Array], tuple]:
+        """The scoring function of the loop, compiled: genotypes and their keys."""
+        length = self.config.episode_length
+        score = jax.jit(make_scoring_function(self.task, self.policy, length))
+        return lambda genotypes, _: score(genotypes, self.start_key)[:2]
+
+    @functools.cached_property
+    def _pairs(self) -> Callable[[jax.Array, jax.Array], tuple]:
+        """Evaluates genotypes (N, size), each from its own key (N,)."""
+        episode = episode_of(self.task, self.policy, self.config.episode_length)
+
+        def pairs(genotypes: jax.Array, keys: jax.Array) -> tuple:
+            found = jax.vmap(episode)(genotypes, keys)
+            return found.admitted_fitness, found.descriptor
+
+        return jax.jit(pairs)
+
+    def _from_keys(
+        self, genotypes: np.ndarray, keys: RNGKey
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Evaluates each genotype from each key."""
+        # keys of the old kind are integers (2,)
+        old = not jnp.issubdtype(keys.dtype, jax.dtypes.prng_key)
+        shape = keys.shape[:-1] if old else keys.shape
+        flat = keys.reshape((-1, keys.shape[-1]) if old else (-1,))
+        fitnesses, found = self._chunks(
+            self._pairs,
+            np.repeat(genotypes, len(flat), axis=0),
+            jnp.tile(flat, (len(genotypes), 1) if old else len(genotypes)),
+        )
+        leading = (len(genotypes), *shape)
+        return fitnesses.reshape(leading), found.reshape(*leading, -1)
+
+    def _chunks(
+        self,
+        evaluate: Callable[[jax.Array, jax.Array], tuple],
+        genotypes: np.ndarray,
+        keys: jax.Array | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Evaluates in batches of the size of a generation.
+
+        One size is compiled once. It is the size of the run, because sums of a policy
+        could depend on it.
+        """
+        size, count = self.config.batch_size, len(genotypes)
+        fitnesses, descriptors = [], []
+        for begin in range(0, count, size):
+            rows = np.minimum(np.arange(begin, begin + size), count - 1)
+            some = self.start_key if keys is None else keys[rows]
+            fitness, descriptor = evaluate(jnp.asarray(genotypes[rows]), some)
+            fitnesses.append(np.asarray(fitness))
+            descriptors.append(np.asarray(descriptor))
+        return np.concatenate(fitnesses)[:count], np.concatenate(descriptors)[:count]
+
+
+def load_run(
+    folder: str | os.PathLike[str],
+    *,
+    task_factory: Callable[[EvolveConfig], Task] = make_task,
+) -> Run:
+    """Opens the results folder of a run.
+
+    A run that still goes on, or was killed, can be opened after its first checkpoint.
+
+    Args:
+        folder: Results folder of ``evolve``.
+        task_factory: Makes the task; by default from registered environments.
+
+    Raises:
+        ConfigError: The folder holds no run, or its settings do not fit the task.
+        ArchiveError: ``archive.npz`` is damaged, and there is no checkpoint.
+        CheckpointError: The checkpoint is damaged, and there is no ``archive.npz``.
+        FileNotFoundError: The run was stopped before its first checkpoint.
+        MissingExtra: QDax is not installed.
+        UnknownEnvironment: The environment of the run is not registered.
+    """
+    require_extra("qdax", "qd")
+    path = Path(folder)
+    config, facts = read_config(path / CONFIG)
+    algorithm_named(config.algorithm)
+    archive, metrics = _results(path)
+    task = task_factory(config)
+    config = config.resolve(task.descriptor_length)
+    policy = make_policy(task.env, config.hidden)
+    if archive.genotypes.shape[1] != policy.size:
+        given = Fact(f"genotypes of {archive.genotypes.shape[1]} numbers")
+        allowed = f"{policy.size}, the weights of a policy of {config.env_name!r} with "
+        allowed += f"hidden layers {config.hidden}"
+        raise ConfigError(message(str(path), given, allowed))
+    return Run(
+        path=path,
+        config=config,
+        facts=facts,
+        task=task,
+        policy=policy,
+        archive=archive,
+        metrics=metrics,
+        reevaluated=_reevaluated(path / REEVALUATED),
+        start_key=start_key(config.seed),
+    )
+
+
+def _results(path: Path) -> tuple[Archive, dict[str, np.ndarray]]:
+    """Returns archive and metrics, from the newest files.
+
+    Raises:
+        ArchiveError: ``archive.npz`` is damaged, and there is no checkpoint.
+        CheckpointError: The checkpoint is damaged, and there is no ``archive.npz``.
+        FileNotFoundError: The run was stopped before its first checkpoint.
+    """
+    checkpoint = path / CHECKPOINT
+    if checkpoint.is_file():  # never older than the archive
+        try:
+            state = load_checkpoint(checkpoint)
+        except CheckpointError as error:
+            if not (path / ARCHIVE).is_file():
+                raise
+            text = f"{error}; its archive and metrics are read from {ARCHIVE} instead"
+            warnings.warn(text, stacklevel=3)
+        else:
+            arrays = [getattr(state, f.name) for f in dataclasses.fields(Archive)]
+            columns = np.asarray(state.metrics).T
+            return Archive(*arrays), dict(zip(COLUMNS, columns, strict=True))
+    return load_archive(path), _metrics(path / METRICS)
+
+
+def _metrics(path: Path) -> dict[str, np.ndarray]:
+    """Reads ``metrics.csv``.
+
+    Raises:
+        ConfigError: It has other columns, or values that are not numbers.
+    """
+    with path.open(encoding="utf-8", newline="") as file:
+        head, *rows = list(csv.reader(file)) or [[]]
+    try:
+        table = np.asarray([[float(x) for x in row] for row in rows]).T
+        if tuple(head) == COLUMNS and table.shape[:1] == (len(COLUMNS),):
+            return dict(zip(COLUMNS, table, strict=True))
+    except ValueError:
+        pass
+    allowed = f"numbers with the columns {', '.join(COLUMNS)}"
+    raise ConfigError(message(str(path), Fact("other content"), allowed))
+
+
+def _reevaluated(path: Path) -> Reevaluated | None:
+    """Reads ``corrected.json``, if there is one.
+
+    Raises:
+        ConfigError: It has other content.
+    """
+    if not path.is_file():
+        return None
+    try:
+        return Reevaluated(**json.loads(path.read_text(encoding="utf-8")))
+    except (TypeError, ValueError) as error:
+        names = ", ".join(f.name for f in dataclasses.fields(Reevaluated))
+        given = Fact("other content")
+        raise ConfigError(message(str(path), given, f"an object of {names}")) from error

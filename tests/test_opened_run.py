@@ -1,0 +1,308 @@
+"""A run that is opened again: its elites, their evaluation, and its pictures."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from point_runs import SMALL, compile_once, point_task, reference, run
+
+from newton_qd import cli
+from newton_qd.qd import load_run
+from newton_qd.qd.config import ConfigError, EvolveConfig
+from newton_qd.qd.run import plot_curves
+from newton_qd.qd.run.archive import Archive, ArchiveError, load_archive
+from newton_qd.qd.run.checkpoint import CheckpointError
+from newton_qd.qd.run.opened import Run
+from newton_qd.qd.run.plot import plot_archive
+from newton_qd.qd.run.plot_cells import voronoi_cells
+from newton_qd.qd.run.plot_colours import round_ticks
+from newton_qd.qd.run.reevaluation import Reevaluated
+
+__all__ = ["compile_once", "reference"]  # fixtures
+
+
+def opened(folder: Path) -> Run:
+    return load_run(folder, task_factory=point_task)
+
+
+@pytest.fixture(scope="module")
+def found(reference: Path) -> Run:
+    return opened(reference)
+
+
+def call(*arguments: object) -> int:
+    return cli.main([str(a) for a in arguments], task_factory=point_task)
+
+
+def test_a_run_has_everything(found: Run, reference: Path) -> None:
+    archive = load_archive(reference)
+    assert found.config == SMALL and found.iteration == SMALL.iterations
+    assert found.policy.size == archive.genotypes.shape[1]
+    assert found.task.labels == ("left", "right")
+    assert found.facts["backend"] == jax.default_backend()
+    for name in ("genotypes", "fitnesses", "descriptors", "centroids"):
+        stored = getattr(archive, name)
+        assert np.array_equal(getattr(found.archive, name), stored)
+        whole = np.asarray(getattr(found.repertoire, name)).reshape(stored.shape)
+        assert np.array_equal(whole, stored)
+    assert set(found.metrics) >= {"qd_score", "coverage", "max_fitness"}
+    assert found.metrics["coverage"][-1] == np.float32(100 * archive.filled.mean())
+
+
+def test_elites_are_found(found: Run) -> None:
+    archive = found.archive
+    assert found.cells.tolist() == np.flatnonzero(archive.filled).tolist()
+    best = found.best(3)
+    assert best[0].fitness == archive.fitnesses.max()
+    assert [e.fitness for e in best] == sorted((e.fitness for e in best), reverse=True)
+    assert len(found.best(10**6)) == len(found.cells)
+    for cell in found.cells[:3]:
+        elite = found.elite(int(cell))
+        assert np.array_equal(elite.genotype, archive.genotypes[cell])
+        assert np.array_equal(elite.descriptor, archive.descriptors[cell])
+        assert found.nearest(elite.descriptor)[0].cell in found.cells
+        place = (archive.centroids[cell] * 4).astype(int).tolist()
+        assert found.elite(place).cell == cell
+    gaps = np.linalg.norm(archive.descriptors[found.cells] - [0.2, 0.9], axis=1)
+    nearest = found.nearest([0.2, 0.9], count=2)
+    assert nearest[0].cell == found.cells[gaps.argmin()] and len(nearest) == 2
+
+
+def test_wrong_cells_are_named(found: Run) -> None:
+    for cell in (16, -1, 1.0, (4, 0), (0, 0, 0), [9]):
+        with pytest.raises(IndexError, match=r"cell: got .*; allowed: "):
+            found.elite(cell)  # type: ignore[arg-type]
+    empty = np.flatnonzero(~found.archive.filled)
+    if len(empty):
+        with pytest.raises(LookupError, match="which is empty; allowed: one of the"):
+            found.elite(int(empty[0]))
+    for descriptor in ([0.1], [0.1, np.nan], [0.1] * 3):
+        with pytest.raises(ValueError, match="2 finite numbers: left, right"):
+            found.nearest(descriptor)
+    with pytest.raises(ValueError, match="count: got 0"):
+        found.best(0)
+
+
+def test_an_evaluation_repeats_the_archive_bitwise(found: Run) -> None:
+    archive, cells = found.archive, found.cells
+    again = found.evaluate()
+    assert np.array_equal(again.cells, cells)
+    assert np.array_equal(again.fitnesses, archive.fitnesses[cells])
+    assert np.array_equal(again.descriptors, archive.descriptors[cells])
+    alone = found.evaluate(int(cells[1]))
+    assert alone.fitnesses.shape == () and alone.descriptors.shape == (2,)
+    assert alone.fitnesses == archive.fitnesses[cells[1]]
+
+
+@pytest.mark.parametrize("kind", [jax.random.key, jax.random.PRNGKey])
+def test_keys_are_other_start_states(found: Run, kind: type) -> None:
+    cells = found.cells[:2]
+    one = found.evaluate(cells, kind(3))
+    assert one.fitnesses.shape == (2,) and one.descriptors.shape == (2, 2)
+    keys = jax.random.split(kind(3), 20)
+    many = found.evaluate(cells, keys)
+    assert many.fitnesses.shape == (2, 20) and many.descriptors.shape == (2, 20, 2)
+    assert len(np.unique(many.fitnesses[0])) > 1
+    alone = found.evaluate(int(cells[1]), keys[:5])
+    assert np.array_equal(alone.fitnesses, many.fitnesses[1, :5])
+    if kind is jax.random.key:
+        start = found.evaluate(cells, found.start_key)
+        assert np.array_equal(start.fitnesses, found.archive.fitnesses[cells])
+
+
+def test_a_run_without_some_files(reference: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="cannot read"):
+        opened(tmp_path)
+    out = tmp_path / "run"
+    shutil.copytree(reference, out)
+    (out / "archive.npz").unlink()  # as after kill -9
+    whole = opened(out)
+    (out / "archive.npz").write_bytes((reference / "archive.npz").read_bytes())
+    (out / "checkpoint.bin").unlink()
+    again = opened(out)
+    assert np.array_equal(whole.archive.genotypes, again.archive.genotypes)
+    for name, column in whole.metrics.items():
+        assert np.array_equal(np.float32(column), np.float32(again.metrics[name]))
+    (out / "checkpoint.bin").write_bytes(b"damaged")
+    with pytest.warns(UserWarning, match=r"are read from archive\.npz instead"):
+        opened(out)
+    (out / "archive.npz").unlink()
+    with pytest.raises(CheckpointError):
+        opened(out)
+    (out / "checkpoint.bin").unlink()
+    with pytest.raises(FileNotFoundError):
+        opened(out)
+    (out / "archive.npz").write_bytes(b"damaged")
+    with pytest.raises(ArchiveError):
+        opened(out)
+
+
+def test_files_of_another_run_are_refused(reference: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    shutil.copytree(reference, out)
+    text = (out / "config.json").read_text()
+    (out / "config.json").write_text(text.replace('"hidden": [', '"hidden": [7,'))
+    with pytest.raises(ConfigError, match="weights of a policy of 'point' with hidden"):
+        opened(out)
+    (out / "config.json").write_text(text)
+    (out / "checkpoint.bin").unlink()
+    (out / "metrics.csv").write_text("iteration,colour\n0,red\n")
+    with pytest.raises(ConfigError, match="numbers with the columns iteration, eval"):
+        opened(out)
+    (out / "metrics.csv").write_bytes((reference / "metrics.csv").read_bytes())
+    (out / "corrected.json").write_text("[1]")
+    with pytest.raises(ConfigError, match="an object of reevaluations, qd_score"):
+        opened(out)
+
+
+def test_eval_says_that_the_bits_are_the_same(
+    reference: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    count = len(opened(reference).cells)
+    assert call("eval", reference) == cli.OK
+    printed = capsys.readouterr().out
+    assert printed == (
+        f"{count} elites of {reference}: fitness and descriptor are bitwise the same\n"
+    )
+    assert call("eval", reference, "--best", 2) == cli.OK
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].split()[0] == "cell" and len(lines) == 4
+    assert lines[1].endswith("yes") and "2 elites" in lines[3]
+    assert call("eval", reference, "--near", "0.1,0.9", "--starts", 4) == cli.OK
+    printed = capsys.readouterr().out
+    assert "deviation" in printed and "medians over 4 start states" in printed
+    out = tmp_path / "run"
+    shutil.copytree(reference, out)
+    text = (out / "config.json").read_text()
+    (out / "config.json").write_text(text.replace('"seed": 0', '"seed": 1'))
+    assert call("eval", out) == cli.FAILED
+    printed = capsys.readouterr().out
+    assert "have other results" in printed and "same bits" in printed
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--cell", "99"), "cell: got 99; allowed: integers from 0 to 15"),
+        (("--near", "1,2,3"), "2 finite numbers: left, right"),
+        (("--best", "0"), "--best: got 0"),
+        (("--starts", "-1"), "--starts: got -1"),
+    ],
+)
+def test_eval_refuses(
+    reference: Path,
+    capsys: pytest.CaptureFixture[str],
+    arguments: tuple[str, ...],
+    message: str,
+) -> None:
+    assert call("eval", reference, *arguments) == cli.BAD_ARGUMENTS
+    assert message in capsys.readouterr().err
+
+
+def test_eval_of_no_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert call("eval", tmp_path) == cli.BAD_ARGUMENTS
+    assert "cannot read" in capsys.readouterr().err
+
+
+def test_plot_writes_both_pictures(
+    reference: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "pictures"
+    assert call("plot", reference, "--out", out) == cli.OK
+    assert "written: " in capsys.readouterr().out
+    drawn = (out / "archive.png").read_bytes()
+    assert drawn == (reference / "archive.png").read_bytes()
+    assert (out / "curves.png").read_bytes().startswith(b"\x89PNG")
+    assert call("plot", reference, "--out", out / "archive.png") == cli.BAD_ARGUMENTS
+
+
+def test_curves_have_all_values() -> None:
+    rows = np.arange(5.0)
+    names = ("evaluations", "qd_score", "coverage", "max_fitness")
+    again = Reevaluated(reevaluations=8, qd_score=3.0, coverage=2.0, max_fitness=1.0)
+    figure = plot_curves.curves_figure(
+        dict.fromkeys(names, rows), EvolveConfig(), again
+    )
+    labels = [axes.get_ylabel() for axes in figure.axes]
+    assert labels == ["QD score", "coverage [%]", "best fitness"]
+    for axes, last in zip(figure.axes, (3.0, 2.0, 1.0), strict=True):
+        line, mark = axes.lines
+        assert np.array_equal(line.get_ydata(), rows)
+        assert np.array_equal(mark.get_xydata(), [[4.0, last]])
+
+
+def test_cells_of_a_tessellation_fill_the_box() -> None:
+    random = np.random.default_rng(0)
+    low, high = np.array([-5.0, 0.0]), np.array([40.0, 2.0])
+    centroids = random.uniform(low, high, (200, 2))
+    cells = voronoi_cells(centroids, (low, high))
+    area = 0.0
+    for index, corners in enumerate(cells):
+        x, y = corners.T
+        area += 0.5 * np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))
+        # a corner is as far from its own centre as from the nearest one
+        gaps = np.linalg.norm(corners[:, None] - centroids, axis=-1)
+        assert np.allclose(gaps[:, index], gaps.min(axis=1), rtol=1e-9)
+    assert area == pytest.approx(90.0, rel=1e-9)
+    alone = voronoi_cells(centroids[:1], (low, high))
+    assert len(alone) == 1 and len(alone[0]) == 4
+
+
+@pytest.mark.parametrize("count", [1, 2])
+@pytest.mark.parametrize("grid", [False, True])
+def test_pictures_show_cells_with_round_ticks(count: int, grid: bool) -> None:
+    axis = (np.arange(8) + 0.5) / 8
+    centroids = np.stack(np.meshgrid(*[axis] * count), -1).reshape(-1, count)
+    centroids = (60 * centroids - 30).astype(np.float32)
+    fitnesses = np.arange(len(centroids), dtype=np.float32)
+    fitnesses[3] = -np.inf
+    archive = Archive(np.zeros((len(centroids), 1)), fitnesses, centroids, centroids)
+    limits = (np.full(count, -30.0), np.full(count, 30.0))
+    figure = plot_archive(
+        archive,
+        grid=(8,) * count if grid else None,
+        limits=limits,
+        labels=("x", "y")[:count],
+    )
+    axes = figure.axes[0]
+    ticks = [label.get_text() for label in axes.get_xticklabels()]
+    assert ticks == ["-30", "-20", "-10", "0", "10", "20", "30"]
+    if count == 1:
+        assert len(axes.patches) == 8  # bars
+        heights = [bar.get_height() for bar in axes.containers[1]]
+        assert heights == [0, 1, 2, 4, 5, 6, 7]  # the empty cell has none
+    elif not grid:
+        (cells,) = axes.collections
+        assert len(cells.get_paths()) == 64
+
+
+def test_ticks_are_round() -> None:
+    for low, high, texts in (
+        (0, 1, "0 0.2 0.4 0.6 0.8 1"),
+        (-5, 40, "0 10 20 30 40"),
+        (0, 70, "0 10 20 30 40 50 60 70"),
+    ):
+        assert round_ticks(low, high)[1] == texts.split()
+
+
+@pytest.mark.slow
+def test_elites_of_an_ant_repeat_bitwise(tmp_path: Path) -> None:
+    out = tmp_path / "ant"
+    arguments = ["evolve", "ant_uni", "--quiet", "--batch-size", "16"]
+    arguments += ["--episode-length", "20", "--iterations", "2", "--out", str(out)]
+    assert cli.main(arguments) == cli.OK
+    found = load_run(out)
+    cells = found.cells
+    for again in (found.evaluate(), found.evaluate(keys=found.start_key)):
+        assert np.array_equal(again.fitnesses, found.archive.fitnesses[cells])
+        assert np.array_equal(again.descriptors, found.archive.descriptors[cells])
+
+
+def test_runs_need_no_finished_run(tmp_path: Path) -> None:
+    config = SMALL.replace(iterations=0)
+    run(config, out=tmp_path / "run")
+    assert opened(tmp_path / "run").iteration == 0
