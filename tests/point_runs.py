@@ -95,16 +95,18 @@ def run(config: EvolveConfig = SMALL, **options: Any) -> EvolveResult:
     return evolve(config, task_factory=point_task, **options)
 
 
+_MADE: dict[tuple[EvolveConfig, bool], Search] = {}
+
+
 @pytest.fixture(scope="module", autouse=True)
 def compile_once() -> Iterator[None]:
     """Share compiled functions between runs with the same settings."""
-    made: dict[tuple[EvolveConfig, bool], Search] = {}
 
     def search(config: EvolveConfig, task: Task, mesh: Any) -> Search:
         key = (config, bool(jax.config.read("jax_enable_x64")))
         if type(task.env) is not PointEnv or mesh is not None:
             return Search(config, task, mesh)
-        return made.setdefault(key, made.get(key) or Search(config, task))
+        return _MADE.setdefault(key, _MADE.get(key) or Search(config, task))
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(evolve_module, "Search", search)

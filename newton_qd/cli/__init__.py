@@ -10,6 +10,7 @@ from newton_qd.cli import algorithms, doctor, envs, evolve, runs
 from newton_qd.cli.arguments import BAD_ARGUMENTS, FAILED, OK, complain
 from newton_qd.errors import FaultError, MissingExtra, UnknownEnvironment
 from newton_qd.qd.config import ConfigError, EvolveConfig
+from newton_qd.qd.run.archive import ArchiveError
 from newton_qd.qd.run.checkpoint import CheckpointError
 from newton_qd.qd.run.interrupt import INTERRUPTED
 
@@ -50,7 +51,7 @@ def main(
         return arguments.run(arguments)
     except (ConfigError, UnknownEnvironment) as error:
         return complain(arguments, error, BAD_ARGUMENTS)
-    except (CheckpointError, FaultError, MissingExtra, OSError) as error:
+    except (ArchiveError, CheckpointError, FaultError, MissingExtra, OSError) as error:
         return complain(arguments, error, FAILED)
     except KeyboardInterrupt:
         return complain(arguments, "interrupted", INTERRUPTED)

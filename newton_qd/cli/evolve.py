@@ -66,7 +66,13 @@ def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
         "--resume",
         action="store_true",
         help="continue the run in the results folder, with its settings; start it if "
-        "the folder has none",
+        "the folder has none; with more --iterations it goes on beyond its end",
+    )
+    parser.add_argument(
+        "--start-from",
+        type=Path,
+        metavar="DIR",
+        help="start from the elites of another results folder, not a random population",
     )
     parser.add_argument(
         "--config",
@@ -199,6 +205,7 @@ def run(
             config,
             out=out,
             resume=arguments.resume,
+            start_from=arguments.start_from,
             progress=not arguments.quiet,
             tensorboard=arguments.tensorboard,
             checkpoint_seconds=arguments.checkpoint_seconds,

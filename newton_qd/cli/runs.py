@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import io
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -112,12 +113,7 @@ def evaluate(arguments: argparse.Namespace, task_factory: TaskFactory = None) ->
     checks.integer("--seed", arguments.seed, least=0, error=ConfigError)
     if arguments.best is not None:
         checks.integer("--best", arguments.best, error=ConfigError)
-    from newton_qd.qd.run.archive import ArchiveError
-
-    try:
-        run = _opened(arguments.folder, task_factory)
-    except ArchiveError as error:
-        return complain(arguments, error, FAILED)
+    run = _opened(arguments.folder, task_factory)
     try:
         elites = _chosen(run, arguments)
     except (LookupError, ValueError) as error:
@@ -231,23 +227,12 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
 
 
 def plot(arguments: argparse.Namespace, task_factory: TaskFactory = None) -> int:
-    """Writes the pictures of a run. Returns the exit code.
-
-    Raises:
-        ConfigError: ``--out`` is a file, or the archive cannot be read.
-    """
-    import io
-
-    from newton_qd.qd.run.archive import ArchiveError
-
+    """Writes the pictures of a run. Returns the exit code."""
     out = arguments.folder if arguments.out is None else arguments.out
     if out.exists() and not out.is_dir():
         refused = f"--out: got {out}, a file; allowed: a folder, or a new name"
         return complain(arguments, refused, BAD_ARGUMENTS)
-    try:
-        run = _opened(arguments.folder, task_factory)
-    except ArchiveError as error:
-        return complain(arguments, error, FAILED)
+    run = _opened(arguments.folder, task_factory)
     out.mkdir(parents=True, exist_ok=True)
     for name, figure in (
         ("archive.png", run.plot()),

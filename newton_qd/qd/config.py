@@ -60,6 +60,8 @@ class EvolveConfig:
         algorithm: Name of one of ``newton_qd.qd.algorithms.ALGORITHMS``.
         options: Settings of this algorithm, as ``(name, value)`` sorted by name. A
             dictionary is allowed too.
+        warm_start: SHA-256 of the genotypes that the run starts from; ``None``: random
+            ones. ``evolve`` sets it from ``start_from``.
 
     Raises:
         ConfigError: A value is wrong, or both ``grid`` and ``centroids`` are given.
@@ -78,6 +80,7 @@ class EvolveConfig:
     reevaluations: int = 32
     algorithm: str = "me"
     options: tuple[tuple[str, Any], ...] = ()
+    warm_start: str | None = None
 
     def __post_init__(self) -> None:
         """Converts sequences to tuples and checks every value."""
@@ -93,6 +96,7 @@ class EvolveConfig:
     def _check(self) -> None:
         checks.text("env_name", self.env_name, error=ConfigError)
         checks.text("algorithm", self.algorithm, error=ConfigError)
+        checks.text("warm_start", self.warm_start, optional=True, error=ConfigError)
         check_integer("seed", self.seed, 0, 2**32 - 1)
         check_integer("iterations", self.iterations, 0)
         check_integer("batch_size", self.batch_size, 1)
@@ -236,13 +240,19 @@ def config_to_json(config: EvolveConfig, facts: dict[str, object]) -> str:
 
 
 def settings_text(config: EvolveConfig) -> str:
-    """Returns the settings as one line, for ``equal_settings``."""
+    """Returns the settings as one line, for ``same_run``."""
     return json.dumps(dataclasses.asdict(config), sort_keys=True)
 
 
-def equal_settings(one: str, other: str) -> bool:
-    """Returns whether two lines of ``settings_text`` are equal; 1 is equal to 1.0."""
-    return json.loads(one) == json.loads(other)
+def same_run(one: str, other: str) -> bool:
+    """Returns whether two lines of ``settings_text`` are those of the same run.
+
+    1 is equal to 1.0. The number of generations may differ, because a run can go on
+    beyond its end. An earlier version wrote fewer settings; it had their defaults.
+    """
+    plain = json.loads(settings_text(EvolveConfig()))
+    known = [{**plain, **json.loads(text), "iterations": 0} for text in (one, other)]
+    return known[0] == known[1]
 
 
 def read_config(

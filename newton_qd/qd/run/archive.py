@@ -20,7 +20,7 @@ FORMAT = 1
 
 
 # Errors of NumPy and zipfile for a damaged file.
-_DAMAGE = (
+DAMAGE = (
     AttributeError,
     EOFError,
     KeyError,
@@ -82,7 +82,7 @@ def load_archive(folder: str | os.PathLike[str]) -> Archive:
     try:
         with np.load(content, allow_pickle=False) as arrays:
             found = {name: arrays[name] for name in arrays.files}
-    except _DAMAGE as error:
+    except DAMAGE as error:
         raise ArchiveError(f"{path} is damaged: {error}") from error
     # The first files of format 1 have no number.
     version = found.pop("format", np.asarray(FORMAT))

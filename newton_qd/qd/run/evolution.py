@@ -15,7 +15,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from newton_qd import checks
-from newton_qd.checks import message
+from newton_qd.checks import Fact, message
 from newton_qd.physics import interrupts
 from newton_qd.qd.config import ConfigError, EvolveConfig, environment_facts
 from newton_qd.qd.extras import require_extra
@@ -28,6 +28,8 @@ from newton_qd.qd.run.progress import Progress
 from newton_qd.qd.run.reevaluation import Reevaluated
 from newton_qd.qd.run.search import Search, SearchState
 from newton_qd.qd.run.tensorboard import EventLog
+from newton_qd.qd.run.warm_start import StartFrom, digest_of, start_genotypes
+from newton_qd.qd.scoring.rollout import make_policy
 from newton_qd.qd.scoring.sharding import device_mesh
 from newton_qd.qd.scoring.task import Task, make_task
 
@@ -74,6 +76,7 @@ def evolve(
     *,
     out: str | os.PathLike[str] | None = None,
     resume: bool = False,
+    start_from: StartFrom = None,
     progress: bool = True,
     tensorboard: bool = False,
     checkpoint_seconds: float = 5.0,
@@ -89,6 +92,11 @@ def evolve(
         config: Settings.
         out: Results folder to create; ``None`` writes no files.
         resume: Whether to continue the run in ``out``. Without a run, a new one starts.
+            The run goes on beyond its end if ``config`` has more generations.
+        start_from: Archive whose elites become the initial population: a results
+            folder, a ``Run``, an ``EvolveResult``, an ``Archive``, a repertoire of QDax
+            or an archive of pyribs. They are evaluated on the task of this run.
+            ``None``: a random population.
         progress: Whether to show progress on standard error.
         tensorboard: Whether to write the metrics for TensorBoard too.
         checkpoint_seconds: Shortest time between two checkpoints [s]. It does not
@@ -103,6 +111,7 @@ def evolve(
     Raises:
         ConfigError: A setting is wrong, the folder is in use, or the run to resume has
             other settings.
+        ArchiveError: The archive in the folder ``start_from`` is damaged.
         CheckpointError: The checkpoint of the run to resume is damaged.
         MissingExtra: QDax, matplotlib or tensorboardX is not installed.
         SearchError: No individual of the initial population has finite scores.
@@ -115,12 +124,13 @@ def evolve(
         stop = stack.enter_context(graceful_stop())
         task = task_factory(config)
         config = config.resolve(task.descriptor_length)
+        config, start = _started(config, start_from, task, folder)
         search = Search(config, task, mesh)
         display = Progress(config.env_name, config.iterations, enabled=progress)
         stack.callback(display.close)
         if folder is not None:
             stack.enter_context(folder.lock())
-        state = _first(search, folder, config, resume, display)
+        state = _first(search, folder, config, start, resume, display)
         watchers = [display.update]
         if folder is not None and tensorboard:
             log = EventLog(folder.path / EVENTS, state.iteration + 1)
@@ -155,6 +165,38 @@ def _folder(
     return folder
 
 
+def _started(
+    config: EvolveConfig, start_from: StartFrom, task: Task, folder: RunFolder | None
+) -> tuple[EvolveConfig, np.ndarray | None]:
+    """Returns the settings, and the genotypes (N, size) that the run starts from.
+
+    Raises:
+        ArchiveError: The archive in the folder ``start_from`` is damaged.
+        CheckpointError: A file of the run to resume, or of ``start_from``, is damaged.
+        ConfigError: ``start_from`` does not fit the policy, is missing, or is another
+            archive than that of the settings.
+    """
+    start = None
+    if start_from is not None:
+        start = start_genotypes(start_from, make_policy(task.env, config.hidden))
+    elif config.warm_start is not None and folder is not None:
+        start = folder.start_genotypes()
+    if start is None:
+        if config.warm_start is not None and not (folder and folder.has_config):
+            raise ConfigError(_other_start(config, "nothing"))
+        return config, None
+    found = digest_of(start)
+    if config.warm_start not in (None, found):
+        given = f"genotypes with SHA-256 {found}"
+        raise ConfigError(_other_start(config, given))
+    return config.replace(warm_start=found), start
+
+
+def _other_start(config: EvolveConfig, given: str) -> str:
+    allowed = f"the archive with SHA-256 {config.warm_start}, as the settings say"
+    return message("start_from", Fact(given), allowed)
+
+
 def _mesh(devices: int | None, resume: bool) -> Mesh | None:
     """Returns the devices that share the evaluations; ``None``: the default device.
 
@@ -176,21 +218,37 @@ def _first(
     search: Search,
     folder: RunFolder | None,
     config: EvolveConfig,
+    start: np.ndarray | None,
     resume: bool,
     display: Progress,
 ) -> SearchState:
-    """Returns the state at the start of this call."""
+    """Returns the state at the start of this call.
+
+    Raises:
+        ConfigError: The genotypes that the run starts from are missing.
+    """
     checkpoint = None
     if folder is not None:
-        checkpoint = _open(folder, config, resume, display)
-    state = search.empty() if checkpoint is None else search.restore(checkpoint)
+        checkpoint = _open(folder, config, start, resume, display)
+    if checkpoint is not None:
+        state = search.restore(checkpoint)
+    elif config.warm_start is not None and start is None:
+        raise ConfigError(_other_start(config, "nothing"))
+    else:
+        state = search.empty(start)
+        if start is not None:
+            display.note(f"starting from {len(start)} elites of another archive")
     if state.iteration < config.iterations:
         display.note("compiling the physics and the rollout (longer on a first start)")
     return state
 
 
 def _open(
-    folder: RunFolder, config: EvolveConfig, resume: bool, display: Progress
+    folder: RunFolder,
+    config: EvolveConfig,
+    start: np.ndarray | None,
+    resume: bool,
+    display: Progress,
 ) -> Checkpoint | None:
     """Starts a new run in the folder, or reads the state of the run in it."""
     # Another process may have started a run here after the first check.
@@ -199,7 +257,7 @@ def _open(
     if not folder.has_config:
         if resume:
             display.note(f"no run in {folder.path} yet: starting it")
-        folder.start(config, facts)
+        folder.start(config, facts, start)
         return None
     checkpoint, warnings = folder.restore(config, facts)
     for warning in warnings:

@@ -3,12 +3,14 @@
 ``config.json`` (settings), ``checkpoint.bin`` (state to resume from),
 ``metrics.csv`` (one row per generation), ``archive.npz``, ``archive.png`` and
 ``corrected.json`` (metrics of the finished run, from re-evaluated elites).
+``start.npz`` has the genotypes that the run started from, if they were given.
 ``tensorboard`` has event files, if the run writes them.
 """
 
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import os
 from collections.abc import Iterator
@@ -23,15 +25,16 @@ from newton_qd.qd.config import (
     EvolveConfig,
     changed_facts,
     config_to_json,
-    equal_settings,
     read_config,
+    same_run,
     settings_text,
 )
-from newton_qd.qd.run.archive import ARCHIVE, Archive, archive_bytes
+from newton_qd.qd.run.archive import ARCHIVE, DAMAGE, Archive, archive_bytes
 from newton_qd.qd.run.checkpoint import (
     Checkpoint,
     CheckpointError,
     load_checkpoint,
+    npz_bytes,
     save_checkpoint,
 )
 
@@ -40,8 +43,9 @@ CHECKPOINT = "checkpoint.bin"
 METRICS = "metrics.csv"
 PICTURE = "archive.png"
 REEVALUATED = "corrected.json"  # a name that earlier versions know
+START = "start.npz"
 EVENTS = "tensorboard"
-_FILES = (CONFIG, CHECKPOINT, METRICS, ARCHIVE, PICTURE, REEVALUATED)
+_FILES = (CONFIG, CHECKPOINT, METRICS, ARCHIVE, PICTURE, REEVALUATED, START)
 
 COLUMNS = (
     "iteration",
@@ -105,6 +109,8 @@ class RunFolder:
         if not self.path.exists():
             return False
         ignored = {temporary_name(Path(name)).name for name in _FILES}
+        if not self.has_config:  # killed between this file and the settings
+            ignored.add(START)
         return any(entry.name not in ignored for entry in self.path.iterdir())
 
     @contextlib.contextmanager
@@ -136,18 +142,42 @@ class RunFolder:
         finally:
             os.close(descriptor)
 
-    def start(self, config: EvolveConfig, facts: dict[str, object]) -> None:
-        """Writes the settings of a new run."""
+    def start(
+        self,
+        config: EvolveConfig,
+        facts: dict[str, object],
+        genotypes: np.ndarray | None = None,
+    ) -> None:
+        """Writes the settings of a new run, and the genotypes that it starts from."""
+        if genotypes is not None:
+            write_atomically(self.path / START, npz_bytes(genotypes=genotypes))
         content = config_to_json(config, facts)
         write_atomically(self.path / CONFIG, content.encode())
+
+    def start_genotypes(self) -> np.ndarray | None:
+        """Returns the genotypes (N, size) that the run started from, if it has any.
+
+        Raises:
+            CheckpointError: The file is damaged.
+        """
+        path = self.path / START
+        if not path.is_file():
+            return None
+        content = io.BytesIO(path.read_bytes())
+        try:
+            with np.load(content, allow_pickle=False) as arrays:
+                return arrays["genotypes"]
+        except DAMAGE as error:
+            raise CheckpointError(f"{path} is damaged: {error}") from error
 
     def restore(
         self, config: EvolveConfig, facts: dict[str, object]
     ) -> tuple[Checkpoint | None, list[str]]:
-        """Reads the state of a run that was stopped.
+        """Reads the state of a run that was stopped, or that goes on beyond its end.
 
         Args:
-            config: Settings that the run is expected to have.
+            config: Settings that the run is expected to have. It may have more
+                generations, which is then written to the settings.
             facts: Facts of this machine.
 
         Returns:
@@ -160,7 +190,11 @@ class RunFolder:
         """
         stored, old_facts = read_config(self.path / CONFIG)
         for name, old, new in stored.differences(config):
-            allowed = f"{old!r}, as the run in {self.path} has; or start a new run in "
+            longer = name == "iterations" and config.iterations > stored.iterations
+            if longer:
+                continue
+            old = f"{old!r} or more" if name == "iterations" else repr(old)
+            allowed = f"{old}, as the run in {self.path} has; or start a new run in "
             allowed += "another folder"
             raise ConfigError(message(name, new, allowed))
         warnings = []
@@ -173,13 +207,14 @@ class RunFolder:
                 "the result may differ from an uninterrupted run"
             )
         path = self.path / CHECKPOINT
-        if not path.exists():
-            return None, warnings
-        checkpoint = load_checkpoint(path)
-        if not equal_settings(checkpoint.settings, settings_text(config)):
+        checkpoint = load_checkpoint(path) if path.exists() else None
+        if checkpoint and not same_run(checkpoint.settings, settings_text(config)):
             raise CheckpointError(
                 f"{path} belongs to a run with other settings than {CONFIG}"
             )
+        if stored != config:
+            (self.path / REEVALUATED).unlink(missing_ok=True)  # of the earlier end
+            self.start(config, old_facts)
         return checkpoint, warnings
 
     def save(self, checkpoint: Checkpoint) -> None:

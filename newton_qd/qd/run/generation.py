@@ -37,6 +37,12 @@ class Generation:
         # With JAX x64, QDax draws its noise in double precision.
         return genotypes.astype(jnp.float32), remembered
 
+    def enter(
+        self, repertoire: Repertoire, genotypes: Genotype, scores: PyTree
+    ) -> PyTree:
+        """Returns the archive with individuals that no emitter hears of."""
+        return self._added(repertoire, genotypes, scores)[0]
+
     def begin(
         self, repertoire: Repertoire, genotypes: Genotype, scores: PyTree
     ) -> PyTree:

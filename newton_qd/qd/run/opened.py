@@ -342,7 +342,7 @@ def load_run(
     path = Path(folder)
     config, facts = read_config(path / CONFIG)
     algorithm_named(config.algorithm)
-    archive, metrics = _results(path)
+    archive, metrics = read_results(path)
     task = task_factory(config)
     config = config.resolve(task.descriptor_length)
     policy = make_policy(task.env, config.hidden)
@@ -364,14 +364,17 @@ def load_run(
     )
 
 
-def _results(path: Path) -> tuple[Archive, dict[str, np.ndarray]]:
-    """Returns archive and metrics, from the newest files.
+def read_results(
+    folder: str | os.PathLike[str],
+) -> tuple[Archive, dict[str, np.ndarray]]:
+    """Returns archive and metrics of a results folder, from the newest files.
 
     Raises:
         ArchiveError: ``archive.npz`` is damaged, and there is no checkpoint.
         CheckpointError: The checkpoint is damaged, and there is no ``archive.npz``.
         FileNotFoundError: The run was stopped before its first checkpoint.
     """
+    path = Path(folder)
     checkpoint = path / CHECKPOINT
     if checkpoint.is_file():  # never older than the archive
         try:

@@ -49,12 +49,15 @@ class SearchState:
         repertoire: QDax's ``MapElitesRepertoire`` with flat genotypes.
         metrics: (iteration + 1, columns) one row per generation.
         emitter: State of QDax's emitter; ``None`` before the initial population.
+        start: (N, size) genotypes of the initial population, the best first; ``None``:
+            random ones.
     """
 
     iteration: int
     repertoire: Repertoire
     metrics: np.ndarray
     emitter: Any = None
+    start: np.ndarray | None = None
 
 
 class Search:
@@ -117,12 +120,13 @@ class Search:
         learns_on_mesh = self._algorithm.evaluates
         self._score = self._compiled(score)
         self._ask = jax.jit(self._generation.propose)
+        self._enter = jax.jit(self._generation.enter)
         self._begin = self._compiled(self._generation.begin, learns_on_mesh)
         self._tell = self._compiled(self._generation.tell, learns_on_mesh)
         self._population = jax.jit(jax.vmap(self._initial))
 
-    def empty(self) -> SearchState:
-        """State before the initial population."""
+    def empty(self, start: np.ndarray | None = None) -> SearchState:
+        """State before the initial population, which may be given (N, size)."""
         from qdax.core.containers.mapelites_repertoire import MapElitesRepertoire
 
         repertoire = MapElitesRepertoire.init_default(
@@ -130,7 +134,7 @@ class Search:
             centroids=self._centroids,
         )
         rows = np.zeros((0, len(COLUMNS)))
-        return SearchState(iteration=-1, repertoire=repertoire, metrics=rows)
+        return SearchState(-1, repertoire, rows, start=start)
 
     def advance(self, state: SearchState) -> SearchState:
         """Evaluates one generation and adds it to the archive.
@@ -140,12 +144,10 @@ class Search:
         """
         iteration = state.iteration + 1
         if iteration == 0:
-            keys = jax.random.split(self._key_initial, self._config.batch_size)
-            genotypes = self._population(keys)
+            genotypes, repertoire, evaluations, rejected = self._settled(state)
             scores = self._score(genotypes, self._key_reset)
-            repertoire, emitter, metrics = self._begin(
-                state.repertoire, genotypes, scores
-            )
+            repertoire, emitter, metrics = self._begin(repertoire, genotypes, scores)
+            metrics["rejected"] += rejected
         else:
             key = jax.random.fold_in(self._key_generations, iteration)
             genotypes, remembered = self._ask(state.repertoire, state.emitter, key)
@@ -153,8 +155,9 @@ class Search:
             repertoire, emitter, metrics = self._tell(
                 state.repertoire, state.emitter, genotypes, remembered, scores
             )
-        each = self._algorithm.evaluations(self._config, self.options)
-        evaluations = self._config.batch_size + iteration * each
+            each = self._algorithm.evaluations(self._config, self.options)
+            before = state.metrics[-1][COLUMNS.index("evaluations")]
+            evaluations = int(before) + each
         row = {
             "iteration": iteration,
             "evaluations": evaluations,
@@ -165,6 +168,34 @@ class Search:
             raise SearchError(self._emptiness(genotypes))
         rows = np.vstack([state.metrics, [row[name] for name in COLUMNS]])
         return SearchState(iteration, repertoire, rows, emitter)
+
+    def _settled(self, state: SearchState) -> tuple[jax.Array, Repertoire, int, int]:
+        """Prepares the initial population.
+
+        A generation has a fixed size. The best of the given genotypes become the
+        initial population, which random ones complete. The others enter the archive
+        before it, so that the emitter begins with the whole archive.
+
+        Returns:
+            Genotypes (batch_size, size) of the initial population, the archive with the
+            others, the number of individuals in total, and how many of the others have
+            no finite scores.
+        """
+        size = self._config.batch_size
+        keys = jax.random.split(self._key_initial, size)
+        population, repertoire = self._population(keys), state.repertoire
+        if state.start is None:
+            return population, repertoire, size, 0
+        start, rejected = state.start, 0
+        for begin in range(size, len(start), size):
+            rows = np.minimum(np.arange(begin, begin + size), len(start) - 1)
+            some = jnp.asarray(start[rows])
+            scores = self._score(some, self._key_reset)
+            repertoire = self._enter(repertoire, some, scores)
+            rejected += int((~np.isfinite(scores[0])[: len(start) - begin]).sum())
+        best = start[:size]
+        population = population.at[: len(best)].set(jnp.asarray(best))
+        return population, repertoire, max(size, len(start)), rejected
 
     def _emptiness(self, genotypes: jax.Array) -> str:
         """Returns the text of the error about genotypes that no archive takes."""
