@@ -235,3 +235,56 @@ def test_gpus_share_the_worlds() -> None:
     if len(jax.devices("gpu")) < 2:
         pytest.skip("needs two GPUs")
     check_devices()
+
+
+@pytest.mark.slow
+def test_a_mesh_with_explicit_axes_splits_steps_and_gradients() -> None:
+    """Axes are explicit by default; each device steps its share of the worlds."""
+    code = """
+import contextlib
+import newton_qd
+from jax.sharding import NamedSharding, PartitionSpec
+from newton_qd.physics import launch
+launched = []
+original = launch.Launcher.launch
+
+def recorded(self, name, worlds, *arguments, **options):
+    launched.append(worlds)
+    return original(self, name, worlds, *arguments, **options)
+
+launch.Launcher.launch = recorded
+env = newton_qd.create("ant_uni")
+keys = jax.random.split(jax.random.key(0), 8)
+actions = jnp.full((8, env.action_size), 0.1)
+reset, step = (jax.jit(jax.vmap(f)) for f in (env.reset, env.step))
+
+@jax.jit
+def slope(state, action):
+    return jax.grad(lambda a: jax.vmap(env.step)(state, a).reward.sum())(action)
+
+start, one = reset(keys), jax.jit(env.reset)(keys[0])
+expected = jax.tree.leaves((start, step(start, actions), slope(start, actions)))
+for count in (2, 4):
+    mesh = jax.make_mesh((count,), ("b",), devices=jax.devices()[:count])
+    assert mesh.axis_types == (jax.sharding.AxisType.Explicit,)
+    axis = NamedSharding(mesh, PartitionSpec("b"))
+    own_keys, own_actions = jax.device_put((keys, actions), axis)
+    for context in (contextlib.nullcontext(), mesh):
+        with jax.set_mesh(mesh) if context is mesh else context:
+            start = reset(own_keys)
+            launched.clear()
+            after = jax.block_until_ready(step(start, own_actions))
+            assert launched == [8 // count] * count, launched
+            found = jax.tree.leaves((start, after, slope(start, own_actions)))
+            for axes, state, action in (
+                ((0, None), start, actions[0]),
+                ((None, 0), one, own_actions),
+            ):
+                shared = jax.jit(jax.vmap(env.step, axes))(state, action)
+                jax.block_until_ready((shared, found))
+    for a, b in zip(expected, found, strict=True):
+        assert b.sharding.spec[0] == "b", b.sharding
+        np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6)
+print(json.dumps(True))
+"""
+    assert answer(start(code, **FOUR_DEVICES))

@@ -10,6 +10,7 @@ from newton_qd.envs.base import PhysicsEnv
 from newton_qd.envs.contacts import angular_changes, linear_changes
 from newton_qd.envs.options import checked_options
 from newton_qd.envs.vectors import length, ordered_sum, rounded
+from newton_qd.physics.explicit_mesh import split_as
 from newton_qd.physics.system import PhysicsState
 from newton_qd.robots import ANT
 from newton_qd.types import Action, Metrics
@@ -158,5 +159,5 @@ def _clipped(changes: jax.Array) -> jax.Array:
 def _rows(changes: jax.Array, still: int) -> jax.Array:
     """Returns the rows of bodies (nb, 3), then zeros for obstacles, as one vector."""
     # Ground and walls never move. Their zeros keep the layout that policies expect.
-    zeros = jnp.zeros((still, 3), changes.dtype)
+    zeros = split_as([changes], jnp.zeros((still, 3), changes.dtype))
     return jnp.concatenate([changes, zeros]).reshape(-1)

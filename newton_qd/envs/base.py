@@ -19,6 +19,7 @@ from newton_qd.envs.env import Env, QDEnv
 from newton_qd.envs.joints import joint_indices
 from newton_qd.envs.options import checked_options
 from newton_qd.envs.state import State, select
+from newton_qd.physics.explicit_mesh import split_as
 from newton_qd.physics.system import Kinematics, PhysicsState, System
 from newton_qd.robots import Material, RobotSpec
 from newton_qd.scenes import Scene
@@ -275,7 +276,7 @@ class PhysicsEnv(Env):
         """
         checks.x64(self._dtype)
         root_key, angle_key, velocity_key = jax.random.split(rng, 3)
-        rest = self._rest()
+        rest = split_as([rng], self._rest())
         q = self.reset_pose(root_key, rest.q)
         q = q.at[self._joint_q].add(self._noise(angle_key, self._angle_noise))
         if self._grounding is not None:
@@ -283,7 +284,8 @@ class PhysicsEnv(Env):
             q = q.at[coordinate].add(-sign * physics.lowest_contact(self.system, q))
         noise = self._noise(velocity_key, self._velocity_noise)
         v = rest.v.at[self._joint_v].set(noise)
-        return self._first_state(physics.initial_state(self.system, q, v))
+        state = self._first_state(physics.initial_state(self.system, q, v))
+        return split_as([rng], state)
 
     def fixed_state(self) -> State:
         """Returns the state of a reset without noise: the default pose, at rest.
@@ -305,6 +307,8 @@ class PhysicsEnv(Env):
         checks.x64(self._dtype)
         inputs.require_state(state, "fault")
         action = inputs.checked_action(action, self.action_size, self._dtype)
+        given = (state, action, params)
+        state, action, params = split_as([state.obs, action], given)
         # NaN control tells the physics to freeze a world. ``outcome`` gets finite
         # numbers instead, so that its gradient is 0 and not 0 * nan ("double where").
         start: PhysicsState = state.pipeline_state
@@ -391,7 +395,8 @@ class PhysicsEnv(Env):
 
     def _observation(self, state: PhysicsState, action: Action) -> Observation:
         blocks = self.observe(state, action).values()
-        return jnp.concatenate([self._number(block) for block in blocks])
+        numbers = [self._number(block) for block in blocks]
+        return jnp.concatenate(split_as([state.q], numbers))
 
     def _first_state(self, state: PhysicsState) -> State:
         action = jnp.zeros((self.action_size,), self._dtype)

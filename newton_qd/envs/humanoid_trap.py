@@ -9,6 +9,7 @@ from newton_qd.envs.contacts import angular_changes, linear_changes
 from newton_qd.envs.humanoid import Humanoid
 from newton_qd.envs.options import checked_options
 from newton_qd.envs.vectors import rounded
+from newton_qd.physics.explicit_mesh import split_as
 from newton_qd.physics.system import PhysicsState
 from newton_qd.scenes import HUMANOID_TRAP
 from newton_qd.types import Action, Metrics
@@ -92,7 +93,7 @@ class HumanoidTrap(Humanoid):
     def _rows(self, changes: jax.Array) -> jax.Array:
         """Returns the rows of bodies (n, 3), ground and walls as one vector."""
         still = jnp.zeros((1 + len(self.system.scene_links), 3), changes.dtype)
-        return jnp.concatenate([changes, still]).reshape(-1)
+        return jnp.concatenate([changes, split_as([changes], still)]).reshape(-1)
 
     def _inertia_about_centre(
         self, mass: jax.Array, arm: jax.Array, square: jax.Array

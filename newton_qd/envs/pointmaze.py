@@ -18,6 +18,7 @@ from newton_qd.envs.inputs import (
 )
 from newton_qd.envs.state import State
 from newton_qd.envs.vectors import length, rounded
+from newton_qd.physics.explicit_mesh import split_as
 from newton_qd.types import Action, Params, RNGKey
 
 _WALL_THICKNESS = 0.01
@@ -109,7 +110,7 @@ class PointMaze(QDEnv):
         (left, bottom), (right, _) = self._low, self._high
         x = jax.random.uniform(x_key, (), self._dtype, left, right) / _START_FRACTION
         y = jax.random.uniform(y_key, (), self._dtype, bottom, _HIGHEST_START)
-        return self._first_state(jnp.stack([x, y]))
+        return split_as([rng], self._first_state(jnp.stack([x, y])))
 
     def fixed_state(self) -> State:
         """Returns the state of a reset without noise: the mean start position.

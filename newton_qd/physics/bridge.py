@@ -16,6 +16,7 @@ from jax.core import Tracer
 
 from newton_qd.checks import Fact, listed, message
 from newton_qd.physics import interrupts, layout
+from newton_qd.physics.explicit_mesh import split_as
 from newton_qd.physics.launch import Launcher, thread_count
 from newton_qd.physics.layout import Layout
 from newton_qd.physics.precision import SCALARS, Variant, build_kernels
@@ -90,7 +91,8 @@ def _row(
             raise ValueError(message(name, array, allowed))
         if array.dtype != system.dtype:
             raise TypeError(message(name, array, allowed))
-    return jnp.concatenate(list(arrays.values()))
+    inputs = list(arrays.values())
+    return jnp.concatenate(split_as(inputs, inputs))
 
 
 def _split(row: jax.Array, fields: Layout) -> dict[str, jax.Array]:

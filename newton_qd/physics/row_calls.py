@@ -13,6 +13,7 @@ import jax
 import warp as wp
 
 from newton_qd.physics import interrupts
+from newton_qd.physics.explicit_mesh import over_devices
 from newton_qd.physics.precision import SCALARS
 from newton_qd.physics.warp_internals import ffi_callback
 
@@ -94,7 +95,8 @@ def row_call(
     )
     # Warp gives each traced call a number and keeps it, and XLA compiles each number.
     # jit traces once. Without jit, every eager call would be traced and compiled.
-    return jax.jit(call, static_argnames="output_dims", inline=True)
+    traced = jax.jit(call, static_argnames="output_dims", inline=True)
+    return over_devices(traced)
 
 
 def differentiable(

@@ -1,0 +1,123 @@
+"""Batches that JAX splits over the devices of a mesh with explicit axes.
+
+The axes of :func:`jax.make_mesh` are explicit by default. Then an array's type tells
+how it is split, and JAX needs a rule for each operation:
+
+- A call of a kernel has no such rule. Each device runs the worlds that it holds.
+- Under ``vmap`` the type of a constant does not tell how the worlds are split. JAX then
+  refuses to join a constant with values of the worlds.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+from jax.custom_batching import custom_vmap
+from jax.sharding import AxisType, NamedSharding, PartitionSpec
+
+Tree = TypeVar("Tree")
+Rows = Callable[..., jax.Array]
+"""A function of arrays (..., size): a row for each world. It returns such an array."""
+
+
+def over_devices(
+    call: Callable[..., tuple[jax.Array, ...]],
+) -> Callable[..., tuple[jax.Array, ...]]:
+    """Returns a function of one world's rows that takes split arrays under ``vmap``.
+
+    Args:
+        call: A :class:`~newton_qd.physics.row_calls.RowCall`. Under ``vmap`` the worlds
+            share one launch.
+    """
+
+    @functools.partial(jax.jit, static_argnames="output_dims", inline=True)
+    def run(*rows: jax.Array, output_dims: int) -> tuple[jax.Array, ...]:
+        return (batched(output_dims)(*rows),)
+
+    @functools.cache
+    def batched(output_dims: int) -> Callable[..., jax.Array]:
+        return _with_batch_rule(lambda *rows: call(*rows, output_dims=output_dims)[0])
+
+    return run
+
+
+def _with_batch_rule(call: Rows) -> Rows:
+    @custom_vmap
+    def run(*rows: jax.Array) -> jax.Array:
+        return _split(call, rows)
+
+    @run.def_vmap
+    def run_batch(
+        size: int, batched: list[bool], *rows: jax.Array
+    ) -> tuple[jax.Array, bool]:
+        whole = [
+            row if given else jnp.broadcast_to(row, (size, *row.shape))
+            for row, given in zip(rows, batched, strict=True)
+        ]
+        return run(*whole), True
+
+    return run
+
+
+def _split(call: Rows, rows: tuple[jax.Array, ...]) -> jax.Array:
+    """Calls a function of rows on arrays (..., size), on each device for its worlds."""
+    for _ in range(rows[0].ndim - 1):
+        call = jax.vmap(call)
+    found = [sharding for row in rows if (sharding := _explicit(row)) is not None]
+    if not found:
+        return call(*rows)
+    own = [jax.sharding.reshard(row, found[0]) for row in rows]
+    mesh, worlds = found[0].mesh, found[0].spec
+    return jax.shard_map(call, mesh=mesh, in_specs=worlds, out_specs=worlds)(*own)
+
+
+def _explicit(row: jax.Array) -> NamedSharding | None:
+    """Returns how the worlds of an array (..., size) are split; ``None``: not."""
+    sharding = jax.typeof(row).sharding
+    worlds = PartitionSpec(*sharding.spec[: row.ndim - 1])
+    if all(axis is None for axis in worlds):
+        return None
+    return NamedSharding(sharding.mesh, worlds)
+
+
+def split_as(likes: Sequence[jax.Array], values: Tree) -> Tree:
+    """Returns values of one world, split over devices as other arrays of this world.
+
+    Nothing changes without a mesh with explicit axes. With one, the values stay the
+    same, bit by bit.
+
+    Args:
+        likes: Arrays of the world, or its random key.
+        values: Pytree of numbers of the world.
+    """
+    likes = [like for like in likes if like.size and _on_explicit_mesh(like)]
+    if not likes:
+        return values
+
+    def split(value: jax.Array) -> jax.Array:
+        # The sum with -0 keeps the sign of a zero. The condition makes -0 depend on the
+        # world, so that JAX does not see a constant.
+        if jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
+            return value
+        zero = jnp.asarray(-0.0, value.dtype)
+        for like in likes:
+            same = _first(like) == _first(like)
+            value = value + jnp.where(same, zero, zero)
+        return value
+
+    return jax.tree.map(split, values)
+
+
+def _on_explicit_mesh(array: jax.Array) -> bool:
+    return AxisType.Explicit in jax.typeof(array).sharding.mesh.axis_types
+
+
+def _first(like: jax.Array) -> jax.Array:
+    """Returns the first number () of an array or of a random key."""
+    if jnp.issubdtype(like.dtype, jax.dtypes.prng_key):
+        like = jax.random.key_data(like)
+    return like.ravel()[0]
