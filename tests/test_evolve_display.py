@@ -96,6 +96,20 @@ def test_bar_fits_the_terminal(monkeypatch: pytest.MonkeyPatch, columns: int) ->
         assert "█" * 20 in drawn[1] and "200/200" in drawn[1]
 
 
+def test_a_long_run_says_how_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [0.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    for each, told in ((16.5, True), (0.01, False)):
+        stream = io.StringIO()
+        progress = Progress("ant_uni", 1000, stream=stream)
+        for iteration, seconds in enumerate((60.0, 30.0, each, each)):
+            now[0] += seconds
+            progress.update(iteration, ROW)
+        text = "a generation takes about 16 s: 4:34:27 for the 998 that are left\n"
+        assert (text in stream.getvalue()) == told
+        assert stream.getvalue().count("a generation takes") == told
+
+
 def test_plain_lines_without_a_terminal() -> None:
     stream = io.StringIO()
     progress = Progress("ant_uni", 200, stream=stream)

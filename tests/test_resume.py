@@ -263,6 +263,7 @@ CHANGES = {
     "line_sigma": 0.1,
     "algorithm": "cma-me",
     "reevaluations": 2,
+    "env_options": {"healthy_reward": 2.0},
     "warm_start": "0" * 64,
 }
 

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import os
+import sys
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from newton_qd.cli import algorithms, doctor, envs, evolve, runs
 from newton_qd.cli.arguments import BAD_ARGUMENTS, FAILED, OK, complain
+from newton_qd.cli.modules import import_modules
+from newton_qd.cli.version import ShowVersion
 from newton_qd.errors import FaultError, MissingExtra, UnknownEnvironment
 from newton_qd.qd.config import ConfigError, EvolveConfig
 from newton_qd.qd.run.archive import ArchiveError
@@ -40,17 +44,47 @@ def main(
     parser = argparse.ArgumentParser(
         prog="newton-qd", description="Quality-Diversity with differentiable physics."
     )
+    parser.add_argument(
+        "--version",
+        action=ShowVersion,
+        help="show the versions of newton_qd and of what results depend on",
+    )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for command in (envs, algorithms, evolve, doctor):
         command.add_parser(commands)
     runs.add_parsers(commands)
     arguments = parser.parse_args(argv)
     try:
+        code = _run(arguments, task_factory)
+        sys.stdout.flush()
+        return code
+    except BrokenPipeError:  # as in: newton-qd envs | head
+        # Python would complain at its end, when it flushes what nobody reads.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return OK
+
+
+def _run(
+    arguments: argparse.Namespace,
+    task_factory: Callable[[EvolveConfig], Task] | None,
+) -> int:
+    """Runs a command and returns its exit code.
+
+    Raises:
+        BrokenPipeError: Nobody reads the output any more.
+    """
+    try:
+        import_modules(arguments.modules)
         if arguments.command in ("evolve", "eval", "plot"):
             return arguments.run(arguments, task_factory)
         return arguments.run(arguments)
-    except (ConfigError, UnknownEnvironment) as error:
+    except UnknownEnvironment as error:
+        hint = " If a module of yours registers it, add --module NAME."
+        return complain(arguments, f"{error}{hint}", BAD_ARGUMENTS)
+    except ConfigError as error:
         return complain(arguments, error, BAD_ARGUMENTS)
+    except BrokenPipeError:
+        raise
     except (ArchiveError, CheckpointError, FaultError, MissingExtra, OSError) as error:
         return complain(arguments, error, FAILED)
     except KeyboardInterrupt:

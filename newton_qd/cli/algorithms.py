@@ -7,8 +7,9 @@ import textwrap
 from collections.abc import Iterable, Iterator
 from typing import Any
 
+from newton_qd.cli import modules
 from newton_qd.cli.arguments import OK, Commands
-from newton_qd.qd.algorithms import ALGORITHMS, AlgorithmSpec, algorithm_named
+from newton_qd.qd.algorithms import AlgorithmSpec, algorithm_named, algorithms
 from newton_qd.qd.algorithms.options import option_texts
 
 _WIDTH = 79
@@ -26,6 +27,7 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "name", nargs="?", metavar="NAME", help="algorithm, for example me-gradient"
     )
+    modules.add_argument(parser)
     parser.set_defaults(run=run)
 
 
@@ -38,9 +40,9 @@ def run(arguments: argparse.Namespace) -> int:
         ConfigError: No algorithm has this name.
     """
     if arguments.name is None:
-        print("\n".join(_columns((spec.name, _plain(spec)) for spec in ALGORITHMS)))
+        print("\n".join(_columns((spec.name, _plain(spec)) for spec in algorithms())))
     else:
-        print("\n".join(_details(algorithm_named(arguments.name))))
+        print("\n".join(details(algorithm_named(arguments.name))))
     return OK
 
 
@@ -49,7 +51,7 @@ def _plain(spec: AlgorithmSpec[Any]) -> str:
     return spec.summary.replace("`", "")
 
 
-def _details(spec: AlgorithmSpec[Any]) -> Iterator[str]:
+def details(spec: AlgorithmSpec[Any]) -> Iterator[str]:
     """Yields the lines that describe an algorithm and its options."""
     yield from textwrap.wrap(f"{spec.name}: {_plain(spec)}", _WIDTH)
     rows = [

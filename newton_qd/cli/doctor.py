@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from newton_qd.cli import modules
 from newton_qd.cli.arguments import BAD_ARGUMENTS, OK, Commands, complain, widths
 
 
@@ -18,6 +19,7 @@ def add_parser(commands: Commands) -> None:
         description="Compares the gradient of the return with central differences "
         "and with an evolution strategy, horizon by horizon.",
     )
+    modules.add_argument(parser)
     parser.set_defaults(run=run)
     parser.add_argument(
         "env_name", metavar="ENV", help="environment, for example ant_uni"

@@ -5,12 +5,14 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
+from newton_qd.cli import modules
 from newton_qd.cli.arguments import OK, Commands
 
 
 def add_parser(commands: Commands) -> None:
     """Adds the command to the subparsers of ``newton-qd``."""
     parser = commands.add_parser("envs", help="list the environments")
+    modules.add_argument(parser)
     parser.set_defaults(run=run)
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from newton_qd import checks
+from newton_qd.cli import modules
 from newton_qd.cli.arguments import (
     BAD_ARGUMENTS,
     FAILED,
@@ -59,6 +60,7 @@ def add_parsers(commands: Commands) -> None:
     parser.add_argument(
         "--seed", type=int, default=0, metavar="N", help="seed of --starts (default: 0)"
     )
+    modules.add_argument(parser)
     parser.set_defaults(run=evaluate)
 
     parser = commands.add_parser(
@@ -73,6 +75,7 @@ def add_parsers(commands: Commands) -> None:
         metavar="DIR",
         help="folder for the pictures (default: the results folder)",
     )
+    modules.add_argument(parser)
     parser.set_defaults(run=plot)
 
 

@@ -1,6 +1,7 @@
 """Quality-Diversity with the environments: settings, loop and results.
 
 - ``evolve(EvolveConfig(...), out=...)``: MAP-Elites on a registered environment
+- ``register_algorithm(AlgorithmSpec(...))``: an algorithm of your own for ``evolve``
 - ``newton_qd.qd.emitters``: emitters for QDax that use exact gradients, and
   ``AnnealedRepertoire`` for one of them
 - ``load_run(folder)``: a run with its settings, task, policy, elites and pictures;
@@ -23,6 +24,12 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from newton_qd.qd.algorithms import (
+        AlgorithmSpec,
+        EmitterContext,
+        register_algorithm,
+    )
+    from newton_qd.qd.algorithms.options import Options
     from newton_qd.qd.config import ConfigError, EvolveConfig
     from newton_qd.qd.emitters.annealed_repertoire import AnnealedRepertoire
     from newton_qd.qd.run.archive import Archive, ArchiveError, load_archive
@@ -43,15 +50,18 @@ if TYPE_CHECKING:
     from newton_qd.qd.scoring.task import Task, make_task
 
 __all__ = [
+    "AlgorithmSpec",
     "AnnealedRepertoire",
     "Archive",
     "ArchiveError",
     "CheckpointError",
     "ConfigError",
     "Elite",
+    "EmitterContext",
     "Evaluation",
     "EvolveConfig",
     "EvolveResult",
+    "Options",
     "Policy",
     "Run",
     "SearchError",
@@ -68,20 +78,24 @@ __all__ = [
     "make_scoring_function",
     "make_task",
     "plot_archive",
+    "register_algorithm",
     "shard_scoring",
     "to_ribs",
 ]
 
 _HOME = {
+    "AlgorithmSpec": "algorithms",
     "AnnealedRepertoire": "emitters.annealed_repertoire",
     "Archive": "run.archive",
     "ArchiveError": "run.archive",
     "CheckpointError": "run.checkpoint",
     "ConfigError": "config",
     "Elite": "run.opened",
+    "EmitterContext": "algorithms",
     "Evaluation": "run.opened",
     "EvolveConfig": "config",
     "EvolveResult": "run.evolution",
+    "Options": "algorithms.options",
     "Policy": "scoring.rollout",
     "Run": "run.opened",
     "SearchError": "run.search",
@@ -98,6 +112,7 @@ _HOME = {
     "make_scoring_function": "scoring.rollout",
     "make_task": "scoring.task",
     "plot_archive": "run.plot",
+    "register_algorithm": "algorithms",
     "shard_scoring": "scoring.sharding",
     "to_ribs": "scoring.ribs",
 }

@@ -8,7 +8,7 @@ import json
 import math
 import platform
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -60,6 +60,11 @@ class EvolveConfig:
         algorithm: Name of one of ``newton_qd.qd.algorithms.ALGORITHMS``.
         options: Settings of this algorithm, as ``(name, value)`` sorted by name. A
             dictionary is allowed too.
+        env_options: Options of the environment, as ``(name, value)`` or as a
+            dictionary: arguments of ``newton_qd.create``, as plain values. ``material``
+            is a table with the fields of ``Material`` that differ from the robot's;
+            ``scene`` is a name in ``newton_qd.scenes.SCENES``, a URDF file, or a table
+            with the fields of ``Scene``.
         warm_start: SHA-256 of the genotypes that the run starts from; ``None``: random
             ones. ``evolve`` sets it from ``start_from``.
 
@@ -80,6 +85,7 @@ class EvolveConfig:
     reevaluations: int = 32
     algorithm: str = "me"
     options: tuple[tuple[str, Any], ...] = ()
+    env_options: tuple[tuple[str, Any], ...] = ()
     warm_start: str | None = None
 
     def __post_init__(self) -> None:
@@ -88,7 +94,12 @@ class EvolveConfig:
             value = getattr(self, name)
             if isinstance(value, list):
                 object.__setattr__(self, name, tuple(value))
-        object.__setattr__(self, "options", _pairs(self.options))
+        object.__setattr__(self, "options", _pairs("options", self.options))
+        frozen = tuple(
+            (name, plain_value(f"env_options: {name}", value))
+            for name, value in _pairs("env_options", self.env_options)
+        )
+        object.__setattr__(self, "env_options", frozen)
         self._check()
         for name in ("iso_sigma", "line_sigma"):
             object.__setattr__(self, name, float(getattr(self, name)))
@@ -168,20 +179,45 @@ class EvolveConfig:
         return [row for row in pairs if row[1] != row[2]]
 
 
-def _pairs(options: Any) -> tuple[tuple[str, Any], ...]:
+class Table(dict[str, Any]):
+    """A table inside of the settings, which are hashable. It is never changed."""
+
+    def __hash__(self) -> int:  # type: ignore[override]
+        return hash(json.dumps(self, sort_keys=True))
+
+
+def plain_value(name: str, value: Any) -> Any:
+    """Returns a value that files of settings can hold, with tuples instead of lists.
+
+    Raises:
+        ConfigError: Files of settings cannot hold it.
+    """
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, list | tuple):
+        return tuple(plain_value(f"{name}[{i}]", x) for i, x in enumerate(value))
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        value = dataclasses.asdict(value)
+    if isinstance(value, Mapping):
+        return Table({str(k): plain_value(f"{name}.{k}", x) for k, x in value.items()})
+    allowed = "numbers, text, True, False, and lists or tables of them"
+    raise ConfigError(message(name, value, allowed))
+
+
+def _pairs(name: str, options: Any) -> tuple[tuple[str, Any], ...]:
     """Sorts options by name, and converts lists to tuples.
 
     Raises:
         ConfigError: They are not names with values.
     """
-    items = options.items() if isinstance(options, dict) else options
+    items = options.items() if isinstance(options, Mapping) else options
     try:
         pairs = {
-            str(name): tuple(value) if isinstance(value, list) else value
-            for name, value in items
+            str(key): tuple(value) if isinstance(value, list) else value
+            for key, value in items
         }
     except (TypeError, ValueError) as error:
-        raise ConfigError(message("options", options, "names with values")) from error
+        raise ConfigError(message(name, options, "names with values")) from error
     return tuple(sorted(pairs.items()))
 
 
@@ -218,8 +254,13 @@ def environment_facts() -> dict[str, object]:
         "machine": platform.machine(),
         "backend": jax.default_backend(),
         "x64": bool(jax.config.read("jax_enable_x64")),
-        "packages": {name: _version(name) for name in _PACKAGES},
+        "packages": package_versions(),
     }
+
+
+def package_versions() -> dict[str, str | None]:
+    """Returns the versions of the packages that results depend on."""
+    return {name: _version(name) for name in _PACKAGES}
 
 
 def _version(package: str) -> str | None:
@@ -262,7 +303,7 @@ def read_config(
 
     Args:
         path: File to read. A ``.toml`` file has settings as ``name = value``, and a
-            table ``options``.
+            tables ``options`` and ``env_options``.
         env_name: Environment, if the file does not name one.
 
     Returns:

@@ -2,15 +2,16 @@
 
 One file has one algorithm: its options with their defaults, the defaults that depend on
 the environment, and the function that makes its emitter for QDax. The file exports one
-``AlgorithmSpec``. ``ALGORITHMS`` lists them. The command line and the documentation are
-generated from this list, which does not import JAX. All genotypes are weight vectors
-(size,).
+``AlgorithmSpec``. ``ALGORITHMS`` lists them; ``register_algorithm`` adds one. The
+command line and the documentation are generated from this list, which does not import
+JAX. All genotypes are weight vectors (size,).
 """
 
 from __future__ import annotations
 
 from typing import Any
 
+from newton_qd import checks
 from newton_qd.checks import listed, message
 from newton_qd.qd.algorithms.cma_maega import CMA_MAEGA
 from newton_qd.qd.algorithms.cma_me import CMA_ME
@@ -25,7 +26,14 @@ from newton_qd.qd.algorithms.pga_me import PGA_ME
 from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext
 from newton_qd.qd.config import ConfigError
 
-__all__ = ["ALGORITHMS", "AlgorithmSpec", "EmitterContext", "algorithm_named"]
+__all__ = [
+    "ALGORITHMS",
+    "AlgorithmSpec",
+    "EmitterContext",
+    "algorithm_named",
+    "algorithms",
+    "register_algorithm",
+]
 
 ALGORITHMS: tuple[AlgorithmSpec[Any], ...] = (
     ME,
@@ -39,7 +47,35 @@ ALGORITHMS: tuple[AlgorithmSpec[Any], ...] = (
     CMA_MEGA,
     CMA_MAEGA,
 )
-"""The algorithms of ``evolve``."""
+"""The algorithms of ``evolve`` that come with the package."""
+
+_REGISTERED: dict[str, AlgorithmSpec[Any]] = {}
+
+
+def algorithms() -> tuple[AlgorithmSpec[Any], ...]:
+    """Returns the algorithms of the package, then the registered ones."""
+    return (*ALGORITHMS, *_REGISTERED.values())
+
+
+def register_algorithm(spec: AlgorithmSpec[Any]) -> None:
+    """Adds an algorithm to ``evolve``.
+
+    Args:
+        spec: The algorithm: a name, a function that makes an emitter for QDax, and a
+            dataclass of its options.
+
+    Raises:
+        TypeError: ``spec`` is not an ``AlgorithmSpec``.
+        ValueError: The name is in use, or is not text.
+    """
+    checks.instance("spec", spec, AlgorithmSpec, "an AlgorithmSpec")
+    checks.text("spec.name", spec.name)
+    taken = [known.name for known in algorithms()]
+    if spec.name in taken:
+        allowed = f"any name but {listed(taken)}"
+        why = "which is taken"
+        raise ValueError(message("spec.name", spec.name, allowed, why=why))
+    _REGISTERED[spec.name] = spec
 
 
 def algorithm_named(name: str) -> AlgorithmSpec[Any]:
@@ -48,8 +84,8 @@ def algorithm_named(name: str) -> AlgorithmSpec[Any]:
     Raises:
         ConfigError: No algorithm has this name.
     """
-    for spec in ALGORITHMS:
+    for spec in algorithms():
         if spec.name == name:
             return spec
-    names = listed([spec.name for spec in ALGORITHMS])
+    names = listed([spec.name for spec in algorithms()])
     raise ConfigError(message("algorithm", name, names, why="which does not exist"))

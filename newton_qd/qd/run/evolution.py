@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -30,7 +31,7 @@ from newton_qd.qd.run.search import Search, SearchState
 from newton_qd.qd.run.tensorboard import EventLog
 from newton_qd.qd.run.warm_start import StartFrom, digest_of, start_genotypes
 from newton_qd.qd.scoring.rollout import make_policy
-from newton_qd.qd.scoring.sharding import device_mesh
+from newton_qd.qd.scoring.sharding import device_mesh, device_named
 from newton_qd.qd.scoring.task import Task, make_task
 
 
@@ -81,6 +82,7 @@ def evolve(
     tensorboard: bool = False,
     checkpoint_seconds: float = 5.0,
     devices: int | None = None,
+    device: str | None = None,
     task_factory: Callable[[EvolveConfig], Task] = make_task,
 ) -> EvolveResult:
     """Evolves an archive of policies with an algorithm of the MAP-Elites family.
@@ -103,6 +105,8 @@ def evolve(
             change the result.
         devices: Number of devices that share each evaluation. It does not change the
             result. ``None``: only the default device.
+        device: Device of the whole run, such as ``"cpu"``, ``"gpu"`` or ``"gpu:1"``;
+            ``None``: JAX's default device.
         task_factory: Makes the task; by default from registered environments.
 
     Returns:
@@ -119,9 +123,11 @@ def evolve(
     begin = time.monotonic()
     folder = _folder(out, resume, tensorboard)
     mesh = _mesh(devices, resume)
+    chosen = _device(device, devices)
     interrupts.install()  # before the handlers below, so that it outlives them
     with ExitStack() as stack:
         stop = stack.enter_context(graceful_stop())
+        stack.enter_context(jax.default_device(chosen))
         task = task_factory(config)
         config = config.resolve(task.descriptor_length)
         config, start = _started(config, start_from, task, folder)
@@ -212,6 +218,23 @@ def _mesh(devices: int | None, resume: bool) -> Mesh | None:
     most = len(jax.devices())
     checks.integer("devices", devices, most=most, error=ConfigError)
     return device_mesh(devices)
+
+
+def _device(device: str | None, devices: int | None) -> Any:
+    """Returns the device of a run; ``None``: the default device.
+
+    Raises:
+        ConfigError: It does not exist, or several devices are asked for too.
+    """
+    if device is None:
+        return None
+    if devices is not None:
+        given = (device, devices)
+        raise ConfigError(message("device, devices", given, "one of the two"))
+    try:
+        return device_named(device)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
 
 
 def _first(

@@ -10,6 +10,7 @@ from typing import TextIO
 _PLAIN_SECONDS = 10.0
 _REDRAW_SECONDS = 0.1
 _BAR_WIDTH = 20
+_LONG_SECONDS = 60.0  # a run whose time is worth an estimate of its own
 _COMPILING_UPDATES = 2  # first updates compile, so their time is not typical
 
 
@@ -67,6 +68,8 @@ class Progress:
         self._updates += 1
         if self._updates <= _COMPILING_UPDATES:
             self._paced_from = (iteration, now)
+        if self._updates == _COMPILING_UPDATES + 1:
+            self._estimate(iteration, now)
         pause = _REDRAW_SECONDS if self._tty else _PLAIN_SECONDS
         if now - self._shown_at < pause and iteration < self.total:
             return
@@ -77,6 +80,17 @@ class Progress:
             self._open_line = True
         else:
             self._write(text + "\n")
+
+    def _estimate(self, iteration: int, now: float) -> None:
+        """Says once how long the run will take, if it is long."""
+        first, since = self._paced_from
+        each = (now - since) / max(1, iteration - first)
+        left = (self.total - iteration) * each
+        if left >= _LONG_SECONDS:
+            self.note(
+                f"a generation takes about {each:.2g} s: {_clock(left)} for the "
+                f"{self.total - iteration} that are left"
+            )
 
     def close(self) -> None:
         """Ends the redrawn line so that later text starts on its own line."""

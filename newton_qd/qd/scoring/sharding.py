@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from typing import Any, TypeVar, TypeVarTuple
 
@@ -11,6 +12,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from newton_qd import checks
+from newton_qd.checks import listed, message
 from newton_qd.types import ScoringFunction
 
 AXIS = "individuals"
@@ -34,6 +36,31 @@ def device_mesh(count: int | None = None) -> Mesh:
         count = len(devices)
     checks.integer("count", count, most=len(devices))
     return Mesh(np.array(devices[:count]), (AXIS,))
+
+
+def device_named(name: str) -> Any:
+    """Returns a device of JAX.
+
+    Args:
+        name: Platform, such as ``"cpu"`` or ``"gpu"``, and optionally the number of the
+            device, as in ``"gpu:1"``.
+
+    Raises:
+        ValueError: There is no such device.
+    """
+    checks.text("device", name)
+    platform, _, number = name.partition(":")
+    found = [str(device) for device in jax.devices()]
+    with contextlib.suppress(RuntimeError, ValueError, IndexError):
+        devices = jax.devices(platform)
+        found += [str(device) for device in devices if str(device) not in found]
+        index = int(number or 0)
+        if index >= 0:
+            return devices[index]
+    allowed = f"one that JAX finds: {listed(found)}"
+    if platform in ("gpu", "cuda"):
+        allowed += "; for a GPU, install newton_qd[cuda12] or newton_qd[cuda13]"
+    raise ValueError(message("device", name, allowed))
 
 
 def shard_scoring(score: ScoringFunction, mesh: Mesh) -> ScoringFunction:

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
+from newton_qd import checks, tasks
 from newton_qd.checks import listed, message
 from newton_qd.qd.config import ConfigError, EvolveConfig
+from newton_qd.robots import ROBOTS, Material
+from newton_qd.scenes import SCENES, Scene
+
+_OWN = ("auto_reset", "batch_size", "brax_views", "episode_length", "eval_metrics")
+"""Arguments of ``create`` that are not for the settings of a run."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,12 +52,14 @@ def make_task(config: EvolveConfig) -> Task:
     """Creates the registered task of a configuration.
 
     Args:
-        config: Settings, of which ``env_name`` and ``episode_length`` are used.
+        config: Settings, of which ``env_name``, ``env_options`` and ``episode_length``
+            are used.
 
     Raises:
         UnknownEnvironment: No environment of this name is registered.
         ConfigError: The environment has no descriptor, no reward offset, or no finite
-            limits of its descriptor. Or the grid does not fit the descriptor.
+            limits of its descriptor. Or the grid does not fit the descriptor, or an
+            option of the environment is wrong.
     """
     # imported here, because the registry imports every environment
     import newton_qd
@@ -69,9 +78,7 @@ def make_task(config: EvolveConfig) -> Task:
     length = _declared_length(name)
     if length is not None:
         config.resolve(length)  # its error comes before the slow part
-    env: Any = newton_qd.create(
-        name, episode_length=config.episode_length, auto_reset=False
-    )
+    env = _environment(config)
     low, high = (np.asarray(x, np.float32) for x in env.descriptor_limits)
     if not np.all(np.isfinite([low, high])):
         allowed = "finite numbers, such as minval and maxval of XYPositionWrapper"
@@ -86,12 +93,75 @@ def make_task(config: EvolveConfig) -> Task:
     )
 
 
+def _environment(config: EvolveConfig) -> Any:
+    """Creates the environment of a configuration.
+
+    Raises:
+        ConfigError: An option of the environment is wrong.
+        TypeError: As ``newton_qd.create``, without options.
+        ValueError: As ``newton_qd.create``, without options.
+    """
+    import newton_qd
+
+    options = dict(config.env_options)
+    for name in _OWN:
+        if name in options:
+            why = "which evolve sets itself"
+            allowed = "other arguments of newton_qd.create"
+            raise ConfigError(message("env_options", name, allowed, why=why))
+    try:
+        if options.get("material") is not None:
+            options["material"] = _material(config.env_name, options["material"])
+        if options.get("scene") is not None:
+            options["scene"] = _scene(options["scene"])
+        return newton_qd.create(
+            config.env_name,
+            episode_length=config.episode_length,
+            auto_reset=False,
+            **options,
+        )
+    except (TypeError, ValueError) as error:
+        if not options:
+            raise
+        raise ConfigError(f"env_options: {error}") from error
+
+
+def _material(env_name: str, fields: Any) -> Material:
+    """Returns the material of the environment's robot with other fields.
+
+    Raises:
+        TypeError: ``fields`` is not a table, or a field does not exist.
+    """
+    checks.instance("material", fields, Mapping, "a table of fields of Material")
+    spec = tasks.ENVIRONMENTS[env_name]
+    robot = spec.robot or ROBOTS.get(spec.base_name)
+    return dataclasses.replace(
+        Material() if robot is None else robot.material, **fields
+    )
+
+
+def _scene(value: Any) -> Scene:
+    """Returns a scene from its name, its URDF file or its fields.
+
+    Raises:
+        TypeError: It is none of them, or a field does not exist.
+    """
+    if isinstance(value, Mapping):
+        return Scene(**value)
+    if isinstance(value, str) and value in SCENES:
+        return SCENES[value]
+    if isinstance(value, str) and value.endswith(".urdf"):
+        return Scene(Path(value).stem, value)
+    allowed = f"{listed(SCENES)}, a URDF file, or a table of fields of Scene"
+    raise TypeError(message("scene", value, allowed))
+
+
 def _declared_length(name: str) -> int | None:
     """Returns the length of a descriptor without building its environment.
 
     ``None``: only the environment knows it.
     """
-    from newton_qd import tasks, wrappers
+    from newton_qd import wrappers
 
     spec = tasks.ENVIRONMENTS[name]
     found = [

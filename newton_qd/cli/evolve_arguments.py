@@ -1,0 +1,263 @@
+"""The arguments of ``newton-qd evolve``, and the settings that they make."""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import contextlib
+import json
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from newton_qd.checks import message
+from newton_qd.cli import modules
+from newton_qd.cli.arguments import Commands, integers, warn_of_changes, widths
+from newton_qd.qd.algorithms import ALGORITHMS
+from newton_qd.qd.config import ConfigError, EvolveConfig, read_config
+
+_DEFAULTS = EvolveConfig()
+
+_UNNAMED = message("ENV", None, "the name of an environment, as in evolve ant_uni")
+
+
+def add_arguments(commands: Commands, run: Callable[..., int]) -> None:
+    """Adds the command to the subparsers of ``newton-qd``.
+
+    Args:
+        commands: The subparsers.
+        run: The command.
+    """
+    parser = commands.add_parser(
+        "evolve",
+        help="run a Quality-Diversity algorithm on an environment",
+        description="Evolves an archive of policies and writes a results folder: "
+        "archive.npz, archive.png, metrics.csv, corrected.json, config.json and a "
+        "checkpoint. With --algorithm NAME, this help also lists the options of the "
+        "algorithm.",
+        add_help=False,
+    )
+    parser.set_defaults(run=run)
+    # shown by ``run``, because the options of an algorithm may be those of a module
+    parser.add_argument(
+        "-h", "--help", action="store_true", help="show this help and exit"
+    )
+    parser.set_defaults(parser=parser)
+    _add_run_arguments(parser)
+    _add_setting_arguments(parser)
+
+
+def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "env_name",
+        nargs="?",
+        metavar="ENV",
+        help="environment, for example ant_uni (newton-qd envs lists them)",
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="results folder (default: results/ENV-seedSEED)",
+    )
+    parser.add_argument(
+        "--resume",
+        action="store_true",
+        help="continue the run in the results folder, with its settings; start it if "
+        "the folder has none; with more --iterations it goes on beyond its end",
+    )
+    parser.add_argument(
+        "--start-from",
+        type=Path,
+        metavar="DIR",
+        help="start from the elites of another results folder, not a random population",
+    )
+    parser.add_argument(
+        "--config",
+        type=Path,
+        metavar="FILE",
+        help="read settings from a TOML file, or from config.json of an earlier run",
+    )
+    parser.add_argument(
+        "--checkpoint-seconds",
+        type=float,
+        default=5.0,
+        metavar="S",
+        help="minimum time between two checkpoints [s] (default: 5)",
+    )
+    parser.add_argument(
+        "--tensorboard",
+        action="store_true",
+        help="also write the metrics as event files for TensorBoard",
+    )
+    parser.add_argument(
+        "--devices",
+        type=int,
+        metavar="N",
+        help="number of devices for each evaluation; does not change the result",
+    )
+    parser.add_argument(
+        "--device",
+        metavar="NAME",
+        help="device of the whole run: cpu, gpu or gpu:1 (default: that of JAX, a GPU "
+        "if there is one)",
+    )
+    modules.add_argument(parser)
+    parser.add_argument("--quiet", action="store_true", help="show no progress")
+
+
+def _add_setting_arguments(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("settings that determine the result")
+    for name, kind, text in (
+        ("seed", int, "seed of all random numbers"),
+        ("iterations", int, "generations after the initial population"),
+        ("batch_size", int, "individuals evaluated in one generation"),
+        ("episode_length", int, "control steps of one evaluation"),
+        ("iso_sigma", float, "standard deviation of the isotropic variation"),
+        ("line_sigma", float, "standard deviation of the step to a second parent"),
+        ("reevaluations", int, "evaluations of each elite at the end; 0: none"),
+    ):
+        group.add_argument(
+            f"--{name.replace('_', '-')}",
+            type=kind,
+            metavar="N" if kind is int else "X",
+            help=f"{text} (default: {getattr(_DEFAULTS, name)})",
+        )
+    group.add_argument(
+        "--algorithm",
+        metavar="NAME",
+        help=f"{', '.join(spec.name for spec in ALGORITHMS)} (default: "
+        f"{_DEFAULTS.algorithm}); 'newton-qd algorithms' says what they are",
+    )
+    group.add_argument(
+        "--option",
+        dest="options",
+        type=_option,
+        action="append",
+        metavar="NAME=VALUE",
+        help="option of the algorithm, for example discount=0.95; may be "
+        "repeated; 'newton-qd algorithms NAME' lists them",
+    )
+    group.add_argument(
+        "--env-option",
+        dest="env_options",
+        type=_env_option,
+        action="append",
+        metavar="NAME=VALUE",
+        help="argument of newton_qd.create, for example healthy_reward=0.5, scene=maze "
+        "or material.friction=0.8; may be repeated",
+    )
+    group.add_argument(
+        "--hidden",
+        type=widths,
+        metavar="N,N",
+        help="hidden layers of the policy; none: a linear policy (default: "
+        f"{','.join(map(str, _DEFAULTS.hidden))})",
+    )
+    cells = group.add_mutually_exclusive_group()
+    cells.add_argument(
+        "--grid",
+        type=_grid,
+        metavar="NxN",
+        help="cells along each descriptor dimension (default with four: 5x5x5x5)",
+    )
+    cells.add_argument(
+        "--centroids",
+        type=int,
+        metavar="N",
+        help="number of cells of a centroidal Voronoi tessellation, instead of a grid",
+    )
+
+
+def _option(text: str) -> tuple[str, Any]:
+    name, separator, value = text.partition("=")
+    try:
+        if name and separator:
+            return name, ast.literal_eval(value)
+    except (SyntaxError, ValueError):
+        pass
+    raise argparse.ArgumentTypeError(
+        f"got {text!r}; allowed: a name and a value like discount=0.95"
+    )
+
+
+def _env_option(text: str) -> tuple[str, Any]:
+    name, separator, value = text.partition("=")
+    if not (name and separator and value):
+        raise argparse.ArgumentTypeError(
+            f"got {text!r}; allowed: a name and a value like healthy_reward=0.5"
+        )
+    for parse in (json.loads, ast.literal_eval):
+        with contextlib.suppress(SyntaxError, ValueError):
+            return name, parse(value)
+    return name, value  # text, as in scene=maze
+
+
+def _grid(text: str) -> tuple[int, ...]:
+    return integers(text, "x")
+
+
+def settle(arguments: argparse.Namespace) -> tuple[EvolveConfig, Path]:
+    """Combines the settings of the arguments, the config file and the run to resume.
+
+    Raises:
+        ConfigError: No environment is named, or a setting is not allowed.
+    """
+    from newton_qd.qd.run.folder import CONFIG, RunFolder
+
+    names = vars(_DEFAULTS)
+    given = {
+        name: value
+        for name, value in vars(arguments).items()
+        if name in names and value is not None
+    }
+    base = None
+    if arguments.config is not None:
+        base, facts = read_config(arguments.config, given.get("env_name"))
+        warn_of_changes(facts, "when this config was written")
+    out = arguments.out
+    if out is None:
+        named = (base or _DEFAULTS).replace(**given)
+        if base is None and "env_name" not in given:
+            raise ConfigError(_UNNAMED)
+        out = Path("results") / f"{named.env_name}-seed{named.seed}"
+    folder = RunFolder(out)
+    folder.check(resume=arguments.resume)
+    if base is None and arguments.resume and folder.has_config:
+        base = read_config(out / CONFIG)[0]
+    if base is None and "env_name" not in given:
+        raise ConfigError(_UNNAMED)
+    base = base or _DEFAULTS
+    # A grid replaces centroids of the config, and centroids replace its grid.
+    if "grid" in given:
+        base = base.replace(centroids=None)
+    if "centroids" in given:
+        base = base.replace(grid=None)
+    if "options" in given:
+        given["options"] = {**dict(base.options), **dict(given["options"])}
+    if "env_options" in given:
+        given["env_options"] = _merged(dict(base.env_options), given["env_options"])
+    return base.replace(**given), out
+
+
+def _merged(
+    options: dict[str, Any], given: Iterable[tuple[str, Any]]
+) -> dict[str, Any]:
+    """Returns options with others; ``material.friction`` is an entry of a table.
+
+    Raises:
+        ConfigError: A name with a dot does not belong to a table.
+    """
+    for path, value in given:
+        *tables, name = path.split(".")
+        inside = options
+        for table in tables:
+            below = inside.get(table, {})
+            if not isinstance(below, Mapping):
+                given_text = f"{path}, where {table} is {below!r}"
+                raise ConfigError(
+                    message("env_options", given_text, "names of a table")
+                )
+            inside[table] = inside = dict(below)
+        inside[name] = value
+    return options

@@ -1,0 +1,295 @@
+"""Environment options, modules, versions and help of the command line."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from point_runs import SMALL, point_task
+
+import newton_qd
+from newton_qd import cli
+from newton_qd.qd import register_algorithm
+from newton_qd.qd.algorithms import ALGORITHMS, algorithm_named, algorithms
+from newton_qd.qd.config import (
+    ConfigError,
+    EvolveConfig,
+    config_to_json,
+    environment_facts,
+    read_config,
+)
+from newton_qd.qd.run.evolution import evolve
+from newton_qd.qd.scoring.task import make_task
+from newton_qd.scenes import MAZE
+
+TESTS = Path(__file__).resolve().parent
+POINT = ["evolve", "point", "--quiet", "--iterations", "1", "--batch-size", "16"]
+POINT += ["--episode-length", "9", "--hidden", "4", "--grid", "4x4"]
+POINT += ["--reevaluations", "0"]
+
+
+class Seen(Exception):  # noqa: N818 - it only stops the command
+    def __init__(self, config: EvolveConfig) -> None:
+        self.config = config
+
+
+def settings(*arguments: str) -> EvolveConfig:
+    """The settings that arguments make."""
+
+    def stop(config: EvolveConfig) -> Any:
+        raise Seen(config)
+
+    with pytest.raises(Seen) as seen:
+        cli.main([*POINT, *arguments], task_factory=stop)
+    return seen.value.config
+
+
+def test_options_of_the_environment_on_the_command_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    options = ["healthy_reward=0.5", "terminate_when_unhealthy=false", "scene=maze"]
+    options += ["material.friction=0.8", "healthy_z_range=[0.1, 2]", "a.b.c=None"]
+    arguments = [part for text in options for part in ("--env-option", text)]
+    expected = {
+        "healthy_reward": 0.5,
+        "terminate_when_unhealthy": False,
+        "scene": "maze",
+        "material": {"friction": 0.8},
+        "healthy_z_range": (0.1, 2),
+        "a": {"b": {"c": None}},
+    }
+    config = settings(*arguments)
+    assert dict(config.env_options) == expected
+    # also from files, which arguments complete
+    path = tmp_path / "config.json"
+    path.write_text(config_to_json(config, environment_facts()))
+    assert read_config(path)[0] == config and hash(config) == hash(config)
+    more = ["--config", str(path), "--env-option", "material.smoothing=0.01"]
+    table = dict(settings(*more).env_options)["material"]
+    assert table == {"friction": 0.8, "smoothing": 0.01}
+    toml = tmp_path / "run.toml"
+    toml.write_text(
+        'env_name = "point"\n[env_options]\nhealthy_reward = 0.5\n'
+        "qdax_wrappers_kwargs = [{minval = [-1, -1]}]\n"
+        "[env_options.material]\nfriction = 0.8\n"
+    )
+    found = dict(settings("--config", str(toml)).env_options)
+    assert found["material"] == {"friction": 0.8}
+    assert found["qdax_wrappers_kwargs"] == ({"minval": (-1, -1)},)
+
+
+def test_wrong_options_of_the_environment(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    ant = ["evolve", "ant_uni", "--env-option"]
+    for option, text in (
+        ("healthy_rewrd=1", "'ant_uni'; allowed: those of create, and ctrl_cost_wei"),
+        ("healthy_reward=high", "env_options: healthy_reward: got 'high'; allowed"),
+        ("batch_size=3", "got 'batch_size', which evolve sets itself; allowed"),
+        ("material=3", "material: got 3; allowed: a table of fields of Material"),
+        ("material.colour=3", "unexpected keyword argument 'colour'"),
+        ("qdax_wrappers_kwargs=[{}, {}]", "got 2 entries; allowed: None, or 1 for"),
+        ("fixed_init_state=3", "fixed_init_state: got 3"),
+    ):
+        assert cli.main([*ant, option]) == cli.BAD_ARGUMENTS, option
+        assert text in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(SystemExit):
+        cli.main([*ant, "healthy_reward"])
+    assert "a name and a value like healthy_reward=0.5" in capsys.readouterr().err
+    with pytest.raises(ConfigError, match=r"env_options: a\[1\]: got <object"):
+        EvolveConfig(env_options={"a": [1, object()]})  # type: ignore[arg-type]
+
+
+@pytest.mark.slow
+def test_options_reach_the_environment() -> None:
+    options = {"healthy_reward": 0.25, "material": {"friction": 0.5}}
+    options |= {"fixed_init_state": True}
+    config = EvolveConfig(env_name="hopper_uni", env_options=options)  # type: ignore[arg-type]
+    env = make_task(config).env
+    plain: Any = newton_qd.create("hopper")
+    material = plain.unwrapped.robot.material
+    own = env.unwrapped.robot.material
+    assert own.friction == 0.5 != material.friction
+    assert own.static_penetration == material.static_penetration
+    state = jax.jit(env.step)(env.reset(jax.random.key(0)), np.zeros(3, np.float32))
+    assert state.metrics["reward_healthy"] == 0.25
+    one, two = (env.reset(jax.random.key(seed)).obs for seed in (0, 1))
+    assert (one == two).all()
+
+
+@pytest.mark.parametrize(
+    ("value", "name"),
+    [
+        ("maze", "maze"),
+        (str(TESTS.parent / "examples" / "yard.urdf"), "yard"),
+        ({"name": "mine", "urdf": MAZE.urdf, "links": ["torso"]}, "mine"),
+    ],
+)
+def test_scenes_by_name_file_and_table(value: Any, name: str) -> None:
+    from newton_qd.qd.scoring.task import _scene
+
+    scene = _scene(dict(EvolveConfig(env_options={"s": value}).env_options)["s"])  # type: ignore[arg-type]
+    assert scene.name == name and scene.urdf.endswith(".urdf")
+    assert scene.links in (None, ("torso",))
+    with pytest.raises(TypeError, match="scene: got 'moon'; allowed: trap, humanoid_"):
+        _scene("moon")
+
+
+MODULE = """
+import dataclasses
+import newton_qd.wrappers
+from newton_qd.envs.ant import Ant
+from newton_qd.qd import AlgorithmSpec, Options, register_algorithm
+from newton_qd.qd.algorithms.me import ME
+
+newton_qd.register(
+    "{name}", Ant, descriptor=newton_qd.wrappers.FeetContactWrapper, base_name="ant"
+)
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class MyOptions(Options):
+    \"\"\"Options of mine.
+
+    Attributes:
+        courage: How brave it is [-].
+    \"\"\"
+
+    courage: float = 0.5
+
+register_algorithm(AlgorithmSpec(
+    name="{name}-me", summary="mine", make=ME.make, options=MyOptions
+))
+"""
+
+
+@pytest.fixture
+def forgotten() -> Any:
+    """Removes what a test registers."""
+    from newton_qd import tasks
+    from newton_qd.qd.algorithms import _REGISTERED
+
+    names, path = set(tasks.ENVIRONMENTS), list(sys.path)
+    yield
+    for name in set(tasks.ENVIRONMENTS) - names:
+        del tasks.ENVIRONMENTS[name]
+    _REGISTERED.clear()
+    sys.path[:] = path
+
+
+@pytest.mark.usefixtures("forgotten")
+def test_modules_register_environments_and_algorithms(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "my_tasks.py").write_text(MODULE.format(name="mine"))
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "sub" / "others.py").write_text(MODULE.format(name="other"))
+    modules = ["--module", "my_tasks", "--module", "sub/others.py"]
+    assert cli.main(["algorithms", *modules]) == cli.OK
+    listed = capsys.readouterr().out
+    assert "mine-me" in listed and "other-me" in listed
+    assert "mine" in newton_qd.registered_envs()
+    del sys.modules["my_tasks"]
+    assert cli.main(["algorithms", "mine-me"]) == cli.OK
+    assert "courage=0.5  How brave it is" in capsys.readouterr().out
+    own = ["--algorithm", "mine-me", "--option", "courage=0.75"]
+    out = tmp_path / "run"
+    assert cli.main([*POINT, *own, "--out", str(out)], task_factory=point_task) == 0
+    assert read_config(out / "config.json")[0].options == (("courage", 0.75),)
+
+
+@pytest.mark.usefixtures("forgotten")
+def test_modules_that_cannot_be_imported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "broken_tasks.py").write_text("import newton_qd\n1 / 0\n")
+    (tmp_path / "poor_tasks.py").write_text("import no_such_package\n")
+    for name, text in (
+        ("no_such_tasks", "got 'no_such_tasks', which cannot be found; allowed: a mod"),
+        ("no.such.tasks", "got 'no.such.tasks', which cannot be found"),
+        ("missing.py", "which cannot be found"),
+        ("broken_tasks", "whose import fails with ZeroDivisionError: division by zero"),
+        ("poor_tasks", "ModuleNotFoundError: No module named 'no_such_package'"),
+    ):
+        assert cli.main(["algorithms", "--module", name]) == cli.BAD_ARGUMENTS
+        assert text in capsys.readouterr().err
+    assert cli.main(["evolve", "my_ant"]) == cli.BAD_ARGUMENTS
+    assert "registers it, add --module NAME" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("forgotten")
+def test_registered_algorithms_have_names_of_their_own() -> None:
+    me = algorithm_named("me")
+    with pytest.raises(ValueError, match=r"spec\.name: got 'me', which is taken"):
+        register_algorithm(me)
+    with pytest.raises(TypeError, match="spec: got 'me'; allowed: an AlgorithmSpec"):
+        register_algorithm("me")  # type: ignore[arg-type]
+    assert algorithms() == ALGORITHMS
+
+
+def test_help_has_the_options_of_an_algorithm(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["evolve", "--help", "--algorithm", "pga-me"])
+    assert ended.value.code == cli.OK
+    printed = capsys.readouterr().out
+    assert "--env-option NAME=VALUE" in printed and "--device" in printed
+    assert "greedy_learning_rate=0.0003" in printed
+    assert printed.rstrip().endswith("Give them as --option NAME=VALUE.")
+    assert cli.main(["evolve", "--help", "--algorithm", "no"]) == cli.BAD_ARGUMENTS
+    assert "'no', which does not exist" in capsys.readouterr().err
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["--version"])
+    assert ended.value.code == cli.OK
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == f"newton_qd {newton_qd.__version__}"
+    assert f"jax {jax.__version__}" in lines
+
+
+def test_devices_by_name(tmp_path: Path) -> None:
+    config = SMALL.replace(iterations=0)
+    for name, text in (
+        ("gpu", r"device: got 'gpu'; allowed: one that JAX finds: .*\[cuda12\] or"),
+        ("cpu:999", "device: got 'cpu:999'; allowed: one that JAX finds"),
+        ("cpu:-1", "device: got 'cpu:-1'"),
+        ("cpu:one", "device: got 'cpu:one'"),
+        ("", "device: got ''; allowed: text"),
+    ):
+        if name == "gpu" and jax.default_backend() == "gpu":
+            continue
+        with pytest.raises(ConfigError, match=text):
+            evolve(config, device=name, task_factory=point_task, out=tmp_path / "run")
+    with pytest.raises(
+        ConfigError, match=r"device, devices: got \('cpu', 1\); allowed"
+    ):
+        evolve(config, device="cpu", devices=1, task_factory=point_task)
+    assert not list(tmp_path.iterdir())
+    found = evolve(config, device="cpu", task_factory=point_task, progress=False)
+    assert found.iteration == 0
+
+
+def test_a_reader_that_leaves_early_is_no_failure() -> None:
+    code = "import sys; from newton_qd.cli import main; sys.exit(main(sys.argv[1:]))"
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, "algorithms"],
+        cwd=TESTS,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+    assert process.stdout is not None and process.stderr is not None
+    process.stdout.close()
+    assert process.stderr.read() == b""
+    assert process.wait(timeout=60) == cli.OK
