@@ -23,6 +23,7 @@ from throughput import seconds
 
 from newton_qd.gradients import Episode
 from newton_qd.physics.launch import Launcher
+from newton_qd.physics.native import all_plans
 from newton_qd.qd.config import EvolveConfig
 from newton_qd.qd.scoring.sharding import device_mesh, shard_scoring
 from newton_qd.qd.scoring.task import Task, make_task
@@ -33,7 +34,7 @@ REPETITIONS = 3
 
 
 def watch_launches() -> set[tuple[str, str, int]]:
-    """Collects device, kernel and number of worlds of every launch."""
+    """Collects device, kernel and number of worlds of every launch on a GPU."""
     seen: set[tuple[str, str, int]] = set()
     launch = Launcher.launch
 
@@ -45,6 +46,12 @@ def watch_launches() -> set[tuple[str, str, int]]:
 
     Launcher.launch = watched
     return seen
+
+
+def launched_on_cpu() -> np.ndarray:
+    """Launches on a CPU until now and their worlds, a row for each kernel."""
+    counts = [(plan.launches, plan.worlds) for plan in all_plans()]
+    return np.array(counts, np.int64).reshape(-1, 2)
 
 
 def perceptron(env: Any) -> tuple[int, Callable[[Any, jax.Array], jax.Array]]:
@@ -77,7 +84,12 @@ def scoring(task: Task, act: Any, length: int) -> Any:
 
 
 def compare(
-    name: str, score: Any, genotypes: jax.Array, counts: list[int], steps: int
+    name: str,
+    score: Any,
+    genotypes: jax.Array,
+    counts: list[int],
+    steps: int,
+    seen: set[tuple[str, str, int]],
 ) -> float:
     """Prints speeds; returns the largest difference over the largest return."""
     worst, first, alone = 0.0, None, 0.0
@@ -86,7 +98,12 @@ def compare(
         duration = seconds(
             lambda run=run: run(genotypes, jax.random.key(1)), REPETITIONS
         )
+        before = launched_on_cpu()
         found = [np.asarray(x) for x in run(genotypes, jax.random.key(1))[:2]]
+        # the kernel with most launches is the step
+        launches, worlds = max([0, 0], *(launched_on_cpu() - before).tolist())
+        if launches:
+            seen.add(("cpu", "step_forward", worlds // launches))
         first = found if first is None else first
         alone = alone or duration
         scale = float(np.abs(first[0]).max())
@@ -119,10 +136,12 @@ def main() -> int:
     keys = jax.random.split(jax.random.key(0))
     shape = (options.batch_size, length * task.env.action_size)
     actions = jax.random.uniform(keys[0], shape, jnp.float32, -1.0, 1.0)
-    replayed = compare("actions", scoring(task, None, length), actions, counts, length)
+    score = scoring(task, None, length)
+    replayed = compare("actions", score, actions, counts, length, seen)
     size, act = perceptron(task.env)
     weights = 0.1 * jax.random.normal(keys[1], (options.batch_size, size), jnp.float32)
-    played = compare("policies", scoring(task, act, length), weights, counts, length)
+    score = scoring(task, act, length)
+    played = compare("policies", score, weights, counts, length, seen)
     steps = {(alias, worlds) for alias, name, worlds in seen if name == "step_forward"}
     print("worlds of a step, by device:", *sorted(steps))
     share = -(-options.batch_size // count)

@@ -26,7 +26,7 @@ import pytest
 
 import newton_qd
 from newton_qd import physics
-from newton_qd.physics import interrupts
+from newton_qd.physics import bridge, interrupts
 from newton_qd.physics.warp_internals import ffi_module
 from newton_qd.robots import ANT
 
@@ -147,7 +147,12 @@ def child_moments_of_a_callback() -> None:
     print("done", flush=True)
 
 
-def start(child: Callable[[], None], errors: Path, device: jax.Device):
+def with_callbacks() -> None:
+    """Lets XLA call Python for the physics, as it does on a GPU."""
+    bridge._native = lambda device: False
+
+
+def start(child: Callable[[], None], errors: Path, device: jax.Device, callbacks: bool):
     """Starts a child; its standard error goes to a file."""
     platform = {"cpu": "cpu", "gpu": "cuda"}[device.platform]
     environment = os.environ | {
@@ -157,7 +162,7 @@ def start(child: Callable[[], None], errors: Path, device: jax.Device):
     }
     with errors.open("w", encoding="utf-8") as stderr:
         return processes.start(
-            [sys.executable, __file__, child.__name__],
+            [sys.executable, __file__, child.__name__, str(callbacks)],
             seconds=TIMEOUT_S,
             stderr=stderr,
             env=environment,
@@ -178,10 +183,11 @@ def check_end(process: subprocess.Popen, errors: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("sigint")
-def test_random_moments(tmp_path: Path, device: jax.Device) -> None:
+@pytest.mark.parametrize("callbacks", [False, True], ids=["native", "callbacks"])
+def test_random_moments(tmp_path: Path, device: jax.Device, callbacks: bool) -> None:
     rng = random.Random(5)
     errors = tmp_path / "stderr"
-    with start(child_random_moments, errors, device) as process:
+    with start(child_random_moments, errors, device, callbacks) as process:
         try:
             assert process.stdout is not None
             for line in process.stdout:
@@ -201,7 +207,7 @@ def test_random_moments(tmp_path: Path, device: jax.Device) -> None:
 @pytest.mark.usefixtures("sigint")
 def test_moments_of_a_callback(tmp_path: Path, device: jax.Device) -> None:
     errors = tmp_path / "stderr"
-    with start(child_moments_of_a_callback, errors, device) as process:
+    with start(child_moments_of_a_callback, errors, device, True) as process:
         try:
             check_end(process, errors)
         finally:
@@ -210,5 +216,7 @@ def test_moments_of_a_callback(tmp_path: Path, device: jax.Device) -> None:
 
 if __name__ == "__main__":
     warnings.filterwarnings("error", module="newton_qd|__main__")
+    if sys.argv[2] == "True":
+        with_callbacks()
     children = (child_random_moments, child_moments_of_a_callback)
     {child.__name__: child for child in children}[sys.argv[1]]()

@@ -102,25 +102,17 @@ print(json.dumps(shapes))
 @pytest.mark.slow
 def test_no_device_steps_more_worlds_than_its_share() -> None:
     code = """
-from newton_qd.physics import launch
+from newton_qd.physics.native import all_plans
 score, genotypes = problem("ant_uni", 32, 5)
-launched = []
-original = launch.Launcher.launch
-
-def recorded(self, name, worlds, *arguments, **options):
-    launched.append((name, worlds))
-    return original(self, name, worlds, *arguments, **options)
-
-launch.Launcher.launch = recorded
 mesh = device_mesh(4)
 jax.block_until_ready(
     jax.jit(shard_scoring(score, mesh))(genotypes, jax.random.key(2))
 )
-step = max(set(name for name, _ in launched), key=[n for n, _ in launched].count)
-print(json.dumps([worlds for name, worlds in launched if name == step]))
+step = max(all_plans(), key=lambda plan: plan.launches)
+print(json.dumps([step.launches, step.most_worlds, step.worlds]))
 """
     # Five steps on each of four devices.
-    assert answer(start(code, **FOUR_DEVICES)) == [8] * 20
+    assert answer(start(code, **FOUR_DEVICES)) == [20, 8, 160]
 
 
 @pytest.mark.slow

@@ -15,18 +15,21 @@ import warp as wp
 from jax.core import Tracer
 
 from newton_qd.checks import Fact, listed, message
-from newton_qd.physics import interrupts, layout
+from newton_qd.physics import layout
 from newton_qd.physics.explicit_mesh import split_as
 from newton_qd.physics.launch import Launcher, thread_count
 from newton_qd.physics.layout import Layout
+from newton_qd.physics.native import add_plan
 from newton_qd.physics.precision import SCALARS, Variant, build_kernels
 from newton_qd.physics.row_calls import (
     Differentiable,
     RowCall,
     differentiable,
+    native_row_call,
     row_call,
 )
 from newton_qd.physics.system import Kinematics, PhysicsState, System
+from newton_qd.physics.warp_internals import cpu_entry
 
 
 @functools.cache
@@ -41,6 +44,11 @@ def _default_device() -> wp.Device:
     return device
 
 
+def _native(device: wp.Device) -> bool:
+    """Returns whether XLA calls kernels of a device without Python."""
+    return device.is_cpu
+
+
 def launcher(system: System, device: wp.Device, parametric: bool = False) -> Launcher:
     """Returns the launcher of ``system`` on a Warp device. It is created once."""
     return _launcher(system, device.alias, parametric)
@@ -50,7 +58,7 @@ def launcher(system: System, device: wp.Device, parametric: bool = False) -> Lau
 def _kernel_call(
     system: System, name: str, size: int, parametric: bool = False
 ) -> RowCall:
-    """Wraps a kernel of a system as a function of rows, with ``row_call``.
+    """Wraps a kernel of a system as a function of rows.
 
     Args:
         system: The system.
@@ -58,6 +66,9 @@ def _kernel_call(
         size: Length of a row of inputs.
         parametric: Whether that row ends with the world's parameters.
     """
+    default = launcher(system, _default_device(), parametric)
+    if _native(default.device):
+        return native_row_call(default.plan(name))
 
     def launch(x: wp.array, *arrays: wp.array) -> None:
         worlds, adjoint = x.shape[0] // size, name.endswith("_backward")
@@ -65,7 +76,6 @@ def _kernel_call(
         own = launcher(system, x.device, parametric)
         own.launch(name, worlds, x, *arrays, adjoint=adjoint)
 
-    default = launcher(system, _default_device(), parametric)
     return row_call(name, system.dtype, default.prepare(name), launch)
 
 
@@ -137,7 +147,6 @@ def control_step(system: System) -> Step:
         mode, but neither second derivatives nor forward mode. Under ``vmap`` all
         worlds share one launch.
     """
-    interrupts.install()
     read, written = layout.inputs(system), layout.outputs(system)
     count = layout.parameters(system).size
     shapes = read.shapes | {"params": (count,)}
@@ -233,13 +242,28 @@ def contact_impulses(
 def _episode_call(name: str, dtype: str, steps: int, nd: int) -> RowCall:
     """Wraps a kernel of ``kernels.episodes`` as a function of one episode's row."""
     kernel = getattr(build_kernels(Variant(dtype, 1)).episodes, name)
+    device, size = _default_device(), steps * (nd + 1)
+    kernel.module.load(device)
+    if _native(device):
+        written = nd if name.startswith("final") else steps * nd
+        adjoint = name.endswith("_backward")
+        rows = [size, written, size][: 3 if adjoint else 2]
+        arrays = [wp.zeros(1, dtype=SCALARS[dtype], device=device) for _ in rows]
+        inputs = [steps, nd, *arrays]
+        recorded = wp.launch(
+            kernel, dim=nd, inputs=inputs, device=device, record_cmd=True
+        )
+        assert isinstance(recorded, wp.Launch)  # because of record_cmd
+        content = (name, dtype, steps, nd)
+        entry = cpu_entry(recorded, adjoint=False)
+        bytes_ = wp.types.type_size_in_bytes(SCALARS[dtype])
+        return native_row_call(add_plan(content, entry, rows, number_bytes=bytes_))
 
     def launch(x: wp.array, *arrays: wp.array) -> None:
-        episodes = x.shape[0] // (steps * (nd + 1))
+        episodes = x.shape[0] // size
         inputs = [steps, nd, x, *arrays]
         wp.launch(kernel, dim=episodes * nd, inputs=inputs, device=x.device)
 
-    kernel.module.load(_default_device())
     return row_call(name, dtype, kernel.module, launch)
 
 

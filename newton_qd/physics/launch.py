@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import threading
 
 import warp as wp
 
 from newton_qd.checks import listed, message
 from newton_qd.physics import buffers, layout
+from newton_qd.physics.native import Plan, Rollouts, add_plan
+from newton_qd.physics.native.library import usable_cores
 from newton_qd.physics.precision import pack_width
 from newton_qd.physics.system import System
-from newton_qd.physics.workers import Worker
+from newton_qd.physics.warp_internals import cpu_entry
 
 Arrays = tuple[wp.array, ...]
 
@@ -29,8 +30,8 @@ _MODULES = {
 _MANY_WORLDS = 8192
 _LANES = {"step_forward": (8, 8), "step_backward": (8, 4)}
 # Minimum number of packs per thread, without and with adjoint. For fewer packs, waking
-# another thread from Python takes longer than the work that it saves.
-_PACKS_PER_THREAD = {False: 16, True: 4}
+# another thread takes longer than the work that it saves.
+_PACKS_PER_THREAD = {False: 4, True: 2}
 # Threads of a block at most, and worlds of a warp, as in ``kernels.world``.
 _GPU_BLOCK = 256
 _WARP = 32
@@ -48,9 +49,7 @@ def thread_count() -> int:
     """
     text = os.environ.get("NEWTON_QD_THREADS")
     if text is None:
-        if hasattr(os, "sched_getaffinity"):  # Linux
-            return len(os.sched_getaffinity(0))
-        return os.cpu_count() or 1
+        return usable_cores()
     if not text.isdecimal() or int(text) < 1:
         raise ValueError(message("NEWTON_QD_THREADS", text, "integers from 1"))
     return int(text)
@@ -120,9 +119,10 @@ class _Command:
 class Launcher:
     """Launches the kernels of one system on one device.
 
-    Each thread (CPU) or stream (GPU) has its own scratch memory and launch commands.
-    They are created once and reused. Launches in one stream run one after the other,
-    so they can share the memory.
+    On a CPU the native code of :mod:`newton_qd.physics.native` runs them. On a GPU each
+    stream has its own scratch memory and launch commands. They are created once and
+    reused. Launches in one stream run one after the other, so they can share the
+    memory.
     """
 
     def __init__(
@@ -144,14 +144,23 @@ class Launcher:
         self._block = 1 if device.is_cpu else _GPU_BLOCK
         self._scratch: dict[tuple[bool, int], tuple[int, buffers.Memory]] = {}
         self._commands: dict[tuple[str, int, bool], _Command] = {}
-        self._workers: list[Worker] = []
-        self._lock = threading.Lock()
+        self._plans: dict[str, Plan] = {}
 
     def prepare(self, name: str) -> wp.Module:
         """Compile a kernel now, before a callback needs it. Returns its module."""
         module = self._kernel(name).module
         module.load(self.device, self._block)
         return module
+
+    def plan(self, name: str) -> Plan:
+        """Returns a kernel as XLA calls it on a CPU. It is compiled first.
+
+        Args:
+            name: Name of the kernel. If it ends in ``_backward``, its adjoint runs.
+        """
+        if name not in self._plans:
+            self._plans[name] = self._build_plan(name)
+        return self._plans[name]
 
     def forward(self, worlds: int, x: wp.array, y: wp.array) -> None:
         """Run one control step. :mod:`~newton_qd.physics.layout` defines the rows.
@@ -190,11 +199,11 @@ class Launcher:
         """
         if worlds == 0:
             return
-        kernel = self._kernel(name)
         if self.device.is_cpu:
-            with self._lock:
-                self._launch_threads(kernel, worlds, arrays, adjoint)
+            thread_count()  # raises for a wrong setting
+            self.plan(name).run(worlds, arrays)
             return
+        kernel = self._kernel(name)
         resident = min(-(-worlds // _WARP) * _WARP, _RESIDENT_WORLDS[adjoint])
         owner = wp.get_stream(self.device).cuda_stream
         commands = [self._command(kernel, owner, resident, arrays, adjoint)]
@@ -215,38 +224,38 @@ class Launcher:
     def _kernel(self, name: str) -> wp.Kernel:
         return getattr(getattr(self.kernels, _MODULES.get(name, "inspect")), name)
 
-    def _launch_threads(
-        self,
-        kernel: wp.Kernel,
-        worlds: int,
-        arrays: Arrays,
-        adjoint: bool,
-    ) -> None:
-        """Split the packs over threads. Each thread computes its packs in one slot."""
-        packs = -(-worlds // self.width)
-        threads = min(thread_count(), -(-packs // _PACKS_PER_THREAD[adjoint]))
-        bounds = [packs * n // threads * self.width for n in range(threads)] + [worlds]
-        while len(self._workers) < threads - 1:
-            self._workers.append(Worker(f"newton_qd-{len(self._workers) + 1}"))
-        # Each thread has its own memory, because shared cache lines are slow.
-        commands = [
-            self._command(kernel, thread, 1, arrays, adjoint)
-            for thread in range(threads)
-        ]
-        for n, worker in enumerate(self._workers[: threads - 1], 1):
-            first, end = bounds[n : n + 2]
-            worker.start(self._send_share, commands[n], arrays, first, end)
-        try:
-            self._send_share(commands[0], arrays, *bounds[:2])
-        finally:
-            for worker in self._workers[: threads - 1]:
-                worker.wait()
-
-    def _send_share(
-        self, command: _Command, arrays: Arrays, first: int, end: int
-    ) -> None:
-        worlds = end - first
-        command.send(arrays, first, worlds, -(-worlds // self.width), 0, 1, 1)
+    def _build_plan(self, name: str) -> Plan:
+        adjoint = name.endswith("_backward")
+        before, after = layout.rows(self.system, name, self.parametric)
+        kernel = self._kernel(name)
+        scratch = buffers.build_scratch(
+            self.system, 1, self.device, adjoint=adjoint, parametric=self.parametric
+        )
+        memory = scratch.values.memory
+        number_bytes = wp.types.type_size_in_bytes(memory.dtype)
+        rows = [before.size, after.size, before.size][: 3 if adjoint else 2]
+        empty = wp.zeros(1, dtype=memory.dtype, device=self.device)
+        arrays = tuple(empty for _ in rows)
+        launch = self._record(kernel, scratch, arrays, adjoint, False).launch
+        own = layout.parameters(self.system).size if self.parametric else 0
+        rollouts = None
+        if name.startswith("step"):
+            rollouts = Rollouts(
+                state=self.system.nq + self.system.nv,
+                control=self.system.nu,
+                parameters=own,
+                fault=after["fault"].offset,
+            )
+        return add_plan(
+            (name, self.parametric, self.system),
+            cpu_entry(launch, adjoint),
+            rows,
+            number_bytes=number_bytes,
+            width=self.width,
+            memory_bytes=memory.size * number_bytes,
+            packs_per_thread=_PACKS_PER_THREAD[adjoint],
+            rollouts=rollouts,
+        )
 
     def _command(
         self,
@@ -257,10 +266,9 @@ class Launcher:
         adjoint: bool,
         parts: bool = False,
     ) -> _Command:
-        """Returns the recorded launch of ``kernel`` in the owner's scratch memory.
+        """Returns the recorded launch of ``kernel`` in a stream's scratch memory.
 
-        The owner is a thread (CPU) or a stream (GPU). ``parts`` is for the launch that
-        runs a kernel with adjoint forward.
+        ``parts`` is for the launch that runs a kernel with adjoint forward.
         """
         held = self._scratch.get((adjoint, owner))
         if held is None or held[0] < slots:

@@ -147,6 +147,25 @@ def impulses(system: System) -> Layout:
     return Layout({"impulse": shape})
 
 
+def rows(
+    system: System, kernel: str, parametric: bool = False
+) -> tuple[Layout, Layout]:
+    """Returns the rows that a kernel reads and writes.
+
+    Args:
+        system: The system.
+        kernel: Name of the kernel. An adjoint has the rows of its kernel.
+        parametric: Whether each world has its own physical parameters.
+    """
+    name = kernel.removesuffix("_forward").removesuffix("_backward")
+    if name == "step":
+        return inputs(system, parametric), outputs(system)
+    if name == "contact_impulses":
+        return inputs(system), impulses(system)
+    written = {"kinematics": bodies, "dynamics": dynamics, "contact_gaps": gaps}
+    return coordinates(system), written[name](system)
+
+
 def scratch_parameters(system: System) -> Layout:
     """Returns the row of values that a parametric kernel computes from its parameters.
 

@@ -5,15 +5,20 @@ of one world and supports ``jit``, ``vmap`` and ``grad``. A batch is one launch,
 with nested ``vmap``.
 """
 
+import atexit
 import contextlib
+import functools
 from collections.abc import Callable, Iterator
 from typing import Protocol
 
 import jax
+import numpy as np
 import warp as wp
 
 from newton_qd.physics import interrupts
 from newton_qd.physics.explicit_mesh import over_devices
+from newton_qd.physics.native import Plan
+from newton_qd.physics.native.library import library
 from newton_qd.physics.precision import SCALARS
 from newton_qd.physics.warp_internals import ffi_callback
 
@@ -70,6 +75,7 @@ def row_call(
         argument ``output_dims`` is the length of that row. Under ``vmap`` the worlds
         share one launch.
     """
+    interrupts.install()
     real = SCALARS[dtype]
 
     def forward(x: wp.array(dtype=real), y: wp.array(dtype=real)):
@@ -97,6 +103,44 @@ def row_call(
     # jit traces once. Without jit, every eager call would be traced and compiled.
     traced = jax.jit(call, static_argnames="output_dims", inline=True)
     return over_devices(traced)
+
+
+@functools.cache
+def _register() -> None:
+    """Tells XLA the native functions, and ends them before Python ends."""
+    for name, address in library().handlers.items():
+        capsule = jax.ffi.pycapsule(address)
+        jax.ffi.register_ffi_target(name, capsule, platform="cpu")
+    atexit.register(_end)
+
+
+def _end() -> None:
+    """Cuts off the physics that is still in flight when the program ends.
+
+    XLA would wait for it, and its results are lost anyway. Programs with effects, such
+    as ``jax.debug.print``, run to their end.
+    """
+    jax.effects_barrier()
+    library().stop()
+
+
+def native_row_call(plan: Plan) -> RowCall:
+    """Wraps a kernel of a CPU as a function of contiguous rows. It needs no Python.
+
+    Args:
+        plan: The kernel.
+
+    Returns:
+        Function as :func:`row_call` returns it.
+    """
+    _register()
+
+    def call(*rows: jax.Array, output_dims: int) -> tuple[jax.Array, ...]:
+        row = jax.ShapeDtypeStruct((output_dims,), rows[0].dtype)
+        run = jax.ffi.ffi_call("newton_qd_rows", row, vmap_method="broadcast_all")
+        return (run(*rows, plan=np.int64(plan.key)),)
+
+    return over_devices(jax.jit(call, static_argnames="output_dims", inline=True))
 
 
 def differentiable(

@@ -7,10 +7,13 @@ missing, one error names the installed Warp and the versions that work.
 
 from __future__ import annotations
 
+import ctypes
+import dataclasses
 import functools
 import importlib
 from collections.abc import Callable
 from importlib import metadata
+from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar
 
@@ -26,6 +29,8 @@ _FFI = (
 )
 # Module that holds the state of the process: since Warp 1.10, and before.
 _CONTEXT = ("warp._src.context", "warp.context")
+# Module that calls the compiler.
+_BUILD = ("warp._src.build", "warp.build")
 
 
 class UnsupportedWarpError(ImportError):
@@ -108,6 +113,95 @@ def tape_is_recording() -> bool:
     if not _has(module, "runtime.tape"):
         raise _unsupported("runtime.tape", (module.__name__,))
     return module.runtime.tape is not None
+
+
+def load_native(source: Path, target: Path) -> Callable[[str], int]:
+    """Compile a C++ file with Warp's compiler, and load it into this process.
+
+    Args:
+        source: File without headers.
+        target: Object file to write. It is not needed later.
+
+    Returns:
+        Function that returns the address of an exported name.
+
+    Raises:
+        UnsupportedWarpError: The installed Warp cannot compile or load it.
+    """
+    wp.init()
+    context = _context()
+    for part in ("wp_load_obj", "wp_lookup"):
+        if not _has(context, f"runtime.llvm.{part}"):
+            raise _unsupported(f"runtime.llvm.{part}", (context.__name__,))
+    _module_with("build_cpu", _BUILD).build_cpu(str(target), str(source))
+    native, name = context.runtime.llvm, f"newton_qd_{source.stem}".encode()
+    if native.wp_load_obj(str(target).encode(), name, False) != 0:
+        raise _unsupported("working wp_load_obj", (context.__name__,))
+    return lambda symbol: native.wp_lookup(name, symbol.encode())
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class CpuEntry:
+    """A compiled kernel of a CPU and its arguments, as C functions take them.
+
+    Attributes:
+        function: Address of the kernel or of its adjoint.
+        bounds: First argument: what the kernel is launched on.
+        arguments: Second argument: a struct of the kernel's arguments.
+        adjoint_arguments: Third argument of an adjoint.
+        values: The kernel's arguments by name.
+        launch: The launch. It keeps the code in memory.
+    """
+
+    function: int
+    bounds: ctypes.Structure
+    arguments: ctypes.Structure
+    adjoint_arguments: ctypes.Structure | None
+    values: dict[str, Any]
+    launch: wp.Launch
+
+    @property
+    def offsets(self) -> dict[str, int]:
+        """Place of each argument in ``arguments`` [bytes], in the kernel's order."""
+        kind = type(self.arguments)
+        return {name: getattr(kind, name).offset for name in self.values}
+
+
+def cpu_entry(launch: wp.Launch, adjoint: bool) -> CpuEntry:
+    """Returns a recorded launch on a CPU as a C function and its arguments.
+
+    Args:
+        launch: The launch.
+        adjoint: Whether it runs the adjoint of its kernel.
+
+    Raises:
+        UnsupportedWarpError: Launches of the installed Warp do not expose them.
+    """
+    for part in ("hooks.forward", "params", "bounds", "kernel.adj.args"):
+        if not _has(launch, part):
+            raise _unsupported(part, (type(launch).__qualname__,))
+    own: Any = launch
+    names = [argument.label for argument in own.kernel.adj.args]
+    given = own.params[1:]
+    function = own.hooks.backward if adjoint else own.hooks.forward
+    address = ctypes.cast(function, ctypes.c_void_p).value
+    assert address is not None  # the launch has loaded the module
+    return CpuEntry(
+        address,
+        own.bounds,
+        _argument_struct(names, given[: len(names)]),
+        _argument_struct(names, given[len(names) :]) if adjoint else None,
+        dict(zip(names, given, strict=False)),
+        launch,
+    )
+
+
+def _argument_struct(names: list[str], values: list[Any]) -> ctypes.Structure:
+    fields = [(name, type(value)) for name, value in zip(names, values, strict=True)]
+    struct = type("Arguments", (ctypes.Structure,), {"_fields_": fields})()
+    for name, value in zip(names, values, strict=True):
+        setattr(struct, name, value)
+    return struct
 
 
 def field_type(struct: Any, name: str) -> Any:

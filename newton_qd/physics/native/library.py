@@ -1,0 +1,121 @@
+"""Builds ``handler.cpp`` with Warp's own compiler, and loads it into the process."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import os
+import tempfile
+from pathlib import Path
+
+from newton_qd.physics.warp_internals import load_native
+
+_SOURCE = Path(__file__).with_name("handler.cpp")
+# Functions of the operating system, in the order of `System` in the source.
+_FUNCTIONS = (
+    "pthread_create",
+    "pthread_mutex_lock",
+    "pthread_mutex_unlock",
+    "pthread_cond_wait",
+    "pthread_cond_signal",
+    "sched_yield",
+    "getenv",
+)
+_INITIALIZERS = ("pthread_mutex_init", "pthread_cond_init")
+
+
+def usable_cores() -> int:
+    """Returns the number of cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):  # Linux
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+class _System(ctypes.Structure):
+    _fields_ = (
+        *((name, ctypes.c_void_p) for name in _FUNCTIONS),
+        ("cores", ctypes.c_int64),
+    )
+
+
+class Library:
+    """The functions of ``handler.cpp``.
+
+    Attributes:
+        handlers: Address of each function that XLA calls, by its name.
+    """
+
+    def __init__(self) -> None:
+        """Compiles the source, which takes some hundredths of a second.
+
+        Raises:
+            UnsupportedWarpError: The installed Warp cannot compile it.
+        """
+        with tempfile.TemporaryDirectory() as folder:
+            find = load_native(_SOURCE, Path(folder) / "handler.o")
+        self.handlers = {
+            name: find(name) for name in ("newton_qd_rows", "newton_qd_rollout")
+        }
+        pointer, integer = ctypes.c_void_p, ctypes.c_int64
+        self._run = ctypes.CFUNCTYPE(ctypes.c_int, pointer, integer, pointer)(
+            find("newton_qd_run")
+        )
+        self._add = ctypes.CFUNCTYPE(None, pointer)(find("newton_qd_add"))
+        self._stop = ctypes.CFUNCTYPE(None)(find("newton_qd_stop"))
+        functions, initializers = _threading_functions()
+        system = _System(*functions, usable_cores())
+        begin = ctypes.CFUNCTYPE(None, pointer, pointer, pointer)
+        begin(find("newton_qd_start"))(ctypes.addressof(system), *initializers)
+
+    def run(self, plan: int, worlds: int, arrays: list[int]) -> int:
+        """Runs the plan at an address on arrays of rows.
+
+        Args:
+            plan: Address of the plan.
+            worlds: Number of worlds.
+            arrays: Addresses of the arrays.
+
+        Returns:
+            0, or the code of an error.
+        """
+        addresses = (ctypes.c_void_p * len(arrays))(*arrays)
+        return self._run(plan, worlds, ctypes.addressof(addresses))
+
+    def add(self, plan: int) -> None:
+        """Lets XLA find the plan at an address by its key."""
+        self._add(plan)
+
+    def stop(self) -> None:
+        """Lets all kernels that run, and all later calls, end soon with an error."""
+        self._stop()
+
+
+def _threading_functions() -> tuple[list[int | None], list[int | None]]:
+    """Returns addresses in the C library; all are 0 where it lacks one of them.
+
+    Kernels then run in one thread, as on Windows.
+    """
+    process = ctypes.CDLL(None) if os.name == "posix" else None
+    found = [
+        [_address(process, name) for name in names]
+        for names in (_FUNCTIONS, _INITIALIZERS)
+    ]
+    if any(address is None for addresses in found for address in addresses):
+        return [None] * len(_FUNCTIONS), [None] * len(_INITIALIZERS)
+    return found[0], found[1]
+
+
+def _address(process: ctypes.CDLL | None, name: str) -> int | None:
+    if process is None or not hasattr(process, name):
+        return None
+    return ctypes.cast(getattr(process, name), ctypes.c_void_p).value
+
+
+@functools.cache
+def library() -> Library:
+    """Returns the functions. The first call compiles them.
+
+    Raises:
+        UnsupportedWarpError: The installed Warp cannot compile them.
+    """
+    return Library()
