@@ -54,20 +54,25 @@ def main(argv: Sequence[str] | None = None) -> None:
     moments = optimizer.init(weights)
 
     def cost(weights, keys):
-        return -jax.vmap(episode, (None, 0))(weights, keys).fitness.mean()
+        found = jax.vmap(episode, (None, 0))(weights, keys)
+        # A world with a fault has the fitness -inf: it counts as a failure, and only
+        # the other worlds are in the mean.
+        sound = jnp.where(found.faulty, 0.0, found.fitness)
+        mean = sound.sum() / jnp.maximum((~found.faulty).sum(), 1)
+        return -mean, found.faulty.sum()
 
     @jax.jit
     def improve(weights, moments, key):
         resets = jax.random.split(key, arguments.worlds)
-        value, slope = jax.value_and_grad(cost)(weights, resets)
+        (value, faults), slope = jax.value_and_grad(cost, has_aux=True)(weights, resets)
         change, moments = optimizer.update(slope, moments)
-        return optax.apply_updates(weights, change), moments, -value
+        return optax.apply_updates(weights, change), moments, -value, faults
 
     for iteration in range(arguments.iterations + 1):
         key = jax.random.fold_in(keys[2], iteration)
-        weights, moments, fitness = improve(weights, moments, key)
+        weights, moments, mean, faults = improve(weights, moments, key)
         if iteration % max(arguments.iterations // 10, 1) == 0:
-            print(f"iteration {iteration:3d}: mean return {fitness:6.1f}")
+            print(f"iteration {iteration:3d}: mean return {mean:6.1f}, faulty {faults}")
 
 
 if __name__ == "__main__":

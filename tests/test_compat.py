@@ -19,6 +19,7 @@ import newton_qd
 import newton_qd.compat
 from newton_qd.compat import finder
 from newton_qd.compat.contents import CONTENTS
+from newton_qd.compat.scoring import evaluate
 from newton_qd.errors import MissingExtra
 
 TESTS = Path(__file__).resolve().parent
@@ -137,6 +138,26 @@ def test_a_policy_scores_the_same_in_every_batch() -> None:
         again = task.score(few, jax.random.key(9))
         np.testing.assert_array_equal(again[0], fitnesses[:count])
         np.testing.assert_array_equal(again[1], descriptors[:count])
+
+
+def test_no_fault_pays_in_a_scoring_function() -> None:
+    """An action of 1e4 ended the episode with the return 0; the others are below."""
+    env = newton_qd.create("pointmaze", episode_length=5)
+
+    def play(state: Any, actions: jax.Array) -> tuple:
+        after = env.step(state, actions)
+        names = {"rewards": after.reward, "dones": after.done, "obs": state.obs}
+        return after, actions, Steps(**names)
+
+    class Steps(NamedTuple):
+        rewards: jax.Array
+        dones: jax.Array
+        obs: jax.Array
+
+    states = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 2))
+    actions = jnp.array([[0.1, 0.1], [jnp.nan, 0.0]])
+    found = evaluate(play, (states, actions), (0, 0), 5, lambda data, _: data.obs[:, 0])
+    assert np.isfinite(found[0][0]) and found[0][1] == -np.inf
 
 
 def test_mask_begins_after_the_end() -> None:

@@ -119,6 +119,25 @@ def test_scores(line: Any) -> None:
     assert jax.jit(mixed)(plans, KEY)[2]["gradients"].shape == (3, STEPS, 1, 2)
 
 
+def test_no_fault_pays(line: Any) -> None:
+    """The fitness is -inf, and has no gradient; the flag says which world it is."""
+    episode, plans = line
+    plans = -plans.at[1, 0].set(-2000.0)  # the others have rewards below 0
+
+    @jax.jit
+    @functools.partial(jax.value_and_grad, has_aux=True)
+    def mean(plans: jax.Array) -> tuple[jax.Array, Any]:
+        found = jax.vmap(episode, (0, None))(plans, KEY)
+        sound = jnp.where(found.faulty, 0.0, found.fitness)
+        return sound.sum() / (~found.faulty).sum(), found
+
+    (value, found), slope = mean(plans)
+    np.testing.assert_array_equal(found.faulty, [False, True, False])
+    assert found.fitness[1] == -np.inf == found.admitted_fitness[1]
+    assert np.isfinite(found.fitness[::2]).all() and value < 0
+    assert not slope[1].any() and np.isfinite(slope).all() and slope[::2].all()
+
+
 def test_it_is_immutable_and_its_own_key(line: Any) -> None:
     episode, plans = line
     with pytest.raises(dataclasses.FrozenInstanceError):

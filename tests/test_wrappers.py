@@ -258,6 +258,29 @@ def test_completed_eval_counts_each_step_once() -> None:
     assert running == [0, 1, 2, 0, 1, 2, 0, 1, 2]
 
 
+class Fragile(Line):
+    """A line with rewards below 0, until a fault beyond 5 ends the episode."""
+
+    def step(self, state: State, action: jax.Array, params: Params = None) -> State:
+        state = super().step(state, action, params)
+        fault = state.pipeline_state > 5
+        return state.replace(
+            reward=jnp.where(fault, jnp.float32(0), jnp.float32(-1)),
+            done=fault.astype(np.float32),
+            info={**state.info, "fault": fault.astype(np.int32)},
+        )
+
+
+@pytest.mark.parametrize("wrapper", [EvalWrapper, CompletedEvalWrapper])
+def test_no_fault_pays_in_an_evaluation(wrapper: type[Wrapper]) -> None:
+    env = wrapper(AutoResetWrapper(EpisodeWrapper(Fragile(), 3, 1)))
+    name = "episode_metrics" if wrapper is EvalWrapper else "completed_episodes_metrics"
+    key = "eval_metrics" if wrapper is EvalWrapper else "completed_eval_metrics"
+    for action, total in ((1.0, -3.0), (9.0, -np.inf)):
+        sums = getattr(play(env, 3, action)[-1].info[key], name)
+        assert float(sums["reward"]) == total and np.isfinite(sums["moved"])
+
+
 @pytest.mark.parametrize("wrapper", [EvalWrapper, CompletedEvalWrapper])
 def test_eval_refuses_what_it_cannot_sum(
     wrapper: type[EvalWrapper] | type[CompletedEvalWrapper],

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from newton_qd import registry
 from newton_qd.envs.base import Env
-from newton_qd.envs.state import State
+from newton_qd.envs.state import State, at_fault
 from newton_qd.extractors import folded_sum
 from newton_qd.types import DescriptorExtractor, ExtraScores, Genotype, PyTree, RNGKey
 
@@ -96,7 +96,8 @@ def evaluate(
 
     Returns:
         Fitnesses (N,), descriptors (N, D), and ``{"transitions": ...}``. The order of
-        the sums does not depend on N.
+        the sums does not depend on N. The fitness is ``-inf`` if the world had a fault
+        before the episode ended; the carry begins with the state.
     """
 
     def episode(*carry: PyTree) -> PyTree:
@@ -104,13 +105,14 @@ def evaluate(
             carry: tuple[PyTree, ...], _: None
         ) -> tuple[tuple[PyTree, ...], PyTree]:
             *carry_list, transition = play_step(*carry)
-            return tuple(carry_list), transition
+            return tuple(carry_list), (transition, at_fault(carry_list[0]))
 
         return jax.lax.scan(body, carry, None, length=episode_length)[1]
 
-    data = jax.vmap(episode, in_axes=in_axes)(*carry)
+    data, faults = jax.vmap(episode, in_axes=in_axes)(*carry)
     mask = get_mask_from_transitions(data)
     fitnesses = folded_sum(data.rewards * (1.0 - mask), 1)
+    fitnesses = jnp.where((faults & (mask == 0)).any(axis=1), -jnp.inf, fitnesses)
     return fitnesses, descriptor_extractor(data, mask), {"transitions": data}
 
 

@@ -13,7 +13,7 @@ from jax.core import Tracer
 
 from newton_qd.checks import Fact, message
 from newton_qd.errors import FaultError
-from newton_qd.types import Info, Metrics, Observation, PyTree
+from newton_qd.types import Info, Metrics, Observation, PyTree, StateLike
 
 Tree = TypeVar("Tree")
 
@@ -99,6 +99,13 @@ def per_world(read: Callable[[PyTree], Tree], state: State) -> Tree:
     for _ in range(jnp.ndim(state.done)):
         read = jax.vmap(read)
     return read(state.pipeline_state)
+
+
+def at_fault(state: StateLike) -> jax.Array:
+    """Returns whether the world of a state has a fault, ()."""
+    if "fault" in getattr(state, "info", {}):
+        return state.info["fault"] != 0
+    return jnp.zeros((), bool)
 
 
 def check(state: State) -> None:

@@ -165,7 +165,8 @@ class Episode:
             data, mask = Trajectories(readings[None]), over[None].astype(readings.dtype)
             descriptor = self.descriptor_extractor(data, mask)[0]
         bad = bad | ~jnp.isfinite(fitness) | ~jnp.all(jnp.isfinite(descriptor))
-        return Outcome(fitness, descriptor, bad, taken)
+        admitted = jnp.where(bad, -jnp.inf, fitness)
+        return Outcome(admitted, descriptor, bad, taken, fitness)
 
     def gradient(
         self, genotypes: Genotype, start: Start, params: Params = None

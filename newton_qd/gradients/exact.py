@@ -81,7 +81,7 @@ def differentiate(
     sound = finite_rows(gradients)
     zeros = jax.tree.map(jnp.zeros_like, gradients)
     return EpisodeGradients(
-        fitnesses=outcome.admitted_fitness,
+        fitnesses=outcome.fitness,
         descriptors=outcome.descriptor,
         gradients=select(sound & ~outcome.faulty, gradients, zeros),
         faulty=outcome.faulty,

@@ -143,7 +143,7 @@ def _combined(
     few = (sound.sum() < 2) | (lost & jnp.isinf(mixed.zeroth_variance))
     zeros = jax.tree.map(jnp.zeros_like, mixed.gradients)
     return MixedGradients(
-        fitnesses=centre.admitted_fitness,
+        fitnesses=centre.fitness,
         descriptors=centre.descriptor,
         gradients=select(~few & ~centre.faulty, mixed.gradients, zeros),
         faulty=centre.faulty,

@@ -5,9 +5,11 @@ from __future__ import annotations
 import dataclasses
 
 import jax
-import jax.numpy as jnp
 
+from newton_qd.envs.state import at_fault
 from newton_qd.types import Action, StateLike
+
+__all__ = ["Outcome", "at_fault", "transition"]
 
 
 @jax.tree_util.register_dataclass
@@ -16,23 +18,28 @@ class Outcome:
     """The result of an episode.
 
     Attributes:
-        fitness: () sum of the rewards up to the first ``done``.
-        descriptor: (D,) descriptor of the episode.
-        faulty: () whether the world had a fault before the episode ended, or fitness or
-            descriptor are not finite. They have no meaning then.
+        fitness: () sum of the rewards up to the first ``done``; ``-inf`` if ``faulty``,
+            so that no fault pays and no archive takes it. Leave faulty worlds out of a
+            mean.
+        descriptor: (D,) descriptor of the episode. It has no meaning if ``faulty``.
+        faulty: () whether the world had a fault before the episode ended, or the sum of
+            the rewards or the descriptor is not finite.
         transitions: Empty, or the fields of QDax's ``QDTransition`` by name,
             (T, ...) each.
+        reward_sum: () sum of the rewards as they came. It tells why a world is faulty,
+            and is no fitness.
     """
 
     fitness: jax.Array
     descriptor: jax.Array
     faulty: jax.Array
     transitions: dict[str, jax.Array] = dataclasses.field(default_factory=dict)
+    reward_sum: jax.Array | None = None
 
     @property
     def admitted_fitness(self) -> jax.Array:
-        """() fitness, or ``-inf`` if ``faulty``, so that no archive takes it."""
-        return jnp.where(self.faulty, -jnp.inf, self.fitness)
+        """() the fitness, by the name that it had when ``fitness`` was finite."""
+        return self.fitness
 
 
 def transition(
@@ -55,10 +62,3 @@ def transition(
         "state_desc": begin.info["state_descriptor"],
         "next_state_desc": end.info["state_descriptor"],
     }
-
-
-def at_fault(state: StateLike) -> jax.Array:
-    """Returns whether the world of a state has a fault, ()."""
-    if "fault" in state.info:
-        return state.info["fault"] != 0
-    return jnp.zeros((), bool)

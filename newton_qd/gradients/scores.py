@@ -15,7 +15,7 @@ def scores(outcome: Outcome) -> tuple[jax.Array, jax.Array, ExtraScores]:
     """Returns scores of N episodes; the dictionary has their transitions, if any."""
     steps = outcome.transitions
     extra = {"transitions": steps} if steps else {}
-    return outcome.admitted_fitness, outcome.descriptor, extra
+    return outcome.fitness, outcome.descriptor, extra
 
 
 def gradient_scores(

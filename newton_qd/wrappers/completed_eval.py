@@ -7,7 +7,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from newton_qd.envs.state import State
+from newton_qd.envs.state import State, at_fault
 from newton_qd.types import Action, Metrics, Params, RNGKey
 from newton_qd.wrappers.base import Wrapper
 from newton_qd.wrappers.evaluation import require_steps, with_reward_metric
@@ -34,6 +34,7 @@ class CompletedEvalMetrics:
 class CompletedEvalWrapper(Wrapper):
     """Sums the metrics of every episode that ends.
 
+    The sum of the rewards is ``-inf`` from a fault on, so that no fault pays.
     Each world has its own sums. For the totals of a batch, add them over the batch
     axis, which is the first axis of every leaf.
     """
@@ -71,10 +72,14 @@ class CompletedEvalWrapper(Wrapper):
         state = with_reward_metric(self.env.step(state, action, params))
         done = state.done
         current = jax.tree.map(jnp.add, sums.current_episode_metrics, state.metrics)
+        reward = jnp.where(at_fault(state), -jnp.inf, current["reward"])
+        current = {**current, "reward": reward}
         sums = CompletedEvalMetrics(
-            current_episode_metrics=jax.tree.map(lambda x: x * (1 - done), current),
+            current_episode_metrics=jax.tree.map(
+                lambda x: jnp.where(done > 0, jnp.zeros_like(x), x), current
+            ),
             completed_episodes_metrics=jax.tree.map(
-                lambda total, value: total + value * done,
+                lambda total, value: jnp.where(done > 0, total + value, total),
                 sums.completed_episodes_metrics,
                 current,
             ),

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from newton_qd.checks import Fact, message
-from newton_qd.envs.state import State
+from newton_qd.envs.state import State, at_fault
 from newton_qd.types import Action, Metrics, Params, RNGKey
 from newton_qd.wrappers.base import Wrapper
 
@@ -30,7 +30,10 @@ class EvalMetrics:
 
 
 class EvalWrapper(Wrapper):
-    """Sums the metrics of the first episode after a reset."""
+    """Sums the metrics of the first episode after a reset.
+
+    The sum of the rewards is ``-inf`` from a fault on, so that no fault pays.
+    """
 
     STATE_INFO_KEY = "eval_metrics"
 
@@ -63,12 +66,15 @@ class EvalWrapper(Wrapper):
             raise ValueError(f"Incorrect type for state_metrics: {type(sums)}")
         state = with_reward_metric(self.env.step(state, action, params))
         active = sums.active_episodes
+        totals = jax.tree.map(
+            lambda total, value: total + value * active,
+            sums.episode_metrics,
+            state.metrics,
+        )
+        lost = at_fault(state) & (active > 0)
+        totals = {**totals, "reward": jnp.where(lost, -jnp.inf, totals["reward"])}
         sums = EvalMetrics(
-            episode_metrics=jax.tree.map(
-                lambda total, value: total + value * active,
-                sums.episode_metrics,
-                state.metrics,
-            ),
+            episode_metrics=totals,
             active_episodes=active * (1 - state.done),
             episode_steps=jnp.where(
                 active > 0, state.info["steps"], sums.episode_steps

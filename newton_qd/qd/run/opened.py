@@ -275,7 +275,7 @@ class Run:
 
         def pairs(genotypes: jax.Array, keys: jax.Array) -> tuple:
             found = jax.vmap(episode)(genotypes, keys)
-            return found.admitted_fitness, found.descriptor
+            return found.fitness, found.descriptor
 
         return jax.jit(pairs)
 

@@ -203,7 +203,7 @@ class Search:
         length = self._config.episode_length
         episode = episode_of(self._task, self._policy, length)
         found = jax.jit(jax.vmap(episode, (0, None)))(genotypes, self._key_reset)
-        returns = ~np.isfinite(found.fitness)
+        returns = ~np.isfinite(found.reward_sum)
         descriptors = ~np.isfinite(found.descriptor).all(axis=-1)
         faults = np.asarray(found.faulty) & ~returns & ~descriptors
         return (
