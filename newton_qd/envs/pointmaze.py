@@ -260,6 +260,21 @@ class PointMaze(QDEnv):
         return self._goal
 
     @property
+    def zone_width(self) -> float:
+        """Width and height of the goal zone."""
+        return 2 * self._half_zone
+
+    @property
+    def walls(self) -> tuple[tuple[float, float, float, float], ...]:
+        """Lowest x, lowest y, highest x and highest y of the lower and upper wall."""
+        (left, _), (right, _) = self._low, self._high
+        lower, upper = self._lower, self._upper
+        return (
+            (self._lower_begins, lower, right, lower + _WALL_THICKNESS),
+            (left, upper, self._upper_ends, upper + _WALL_THICKNESS),
+        )
+
+    @property
     def observation_size(self) -> int:
         """Length of an observation."""
         return 2

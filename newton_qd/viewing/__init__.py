@@ -1,0 +1,64 @@
+"""See it: trajectories, and pages that show them in a browser.
+
+- ``record(env, policy, key)``: runs episodes and returns a ``Trajectory``
+- ``write_replay(trajectory, path)``: one HTML file that shows it, without a network
+- ``show(trajectory)``: the same in a notebook
+- ``joined([...])``: trajectories of one robot as one, to see them together
+
+Importing this package imports no other module of it. Each name is loaded when it is
+first used. Pages need no extra.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from newton_qd.viewing.drawing import Drawing, DrawnShape, drawing_of
+    from newton_qd.viewing.recording import record
+    from newton_qd.viewing.replay import replay_html, show, write_replay
+    from newton_qd.viewing.trajectory import Contacts, Trajectory, joined
+
+__all__ = [
+    "Contacts",
+    "Drawing",
+    "DrawnShape",
+    "Trajectory",
+    "drawing_of",
+    "joined",
+    "record",
+    "replay_html",
+    "show",
+    "write_replay",
+]
+
+_HOME = {
+    "Contacts": "trajectory",
+    "Drawing": "drawing",
+    "DrawnShape": "drawing",
+    "Trajectory": "trajectory",
+    "drawing_of": "drawing",
+    "joined": "trajectory",
+    "record": "recording",
+    "replay_html": "replay",
+    "show": "replay",
+    "write_replay": "replay",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Loads a name of this package when it is first used.
+
+    Raises:
+        AttributeError: The package has no such name.
+    """
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -1,0 +1,352 @@
+// The three-dimensional view: worlds of one robot, the ground, a camera.
+//
+// Every shape is one instanced mesh with an instance for each world, so that the work
+// of a frame grows slowly with the number of worlds.
+"use strict";
+
+(function () {
+  const FIELD = 40; // vertical field of view of the camera [degrees]
+  const TRAIL = 2000; // most points of a trail
+  const LINES = 60; // lines of the grid on each side of the camera's target
+
+  const THEMES = {
+    light: { sky: "#e8edf2", ground: "#dfe5ea", minor: "#a3afba", major: "#66747f" },
+    dark: { sky: "#12161b", ground: "#1a2027", minor: "#46525e", major: "#7d8b99" },
+  };
+
+  function geometry(shape) {
+    const s = shape.size;
+    if (shape.kind === "sphere") return new THREE.SphereGeometry(s[0], 32, 20);
+    if (shape.kind === "box") {
+      return new THREE.BoxGeometry(2 * s[0], 2 * s[1], 2 * s[2]);
+    }
+    if (shape.kind === "mesh") {
+      const made = new THREE.BufferGeometry();
+      const points = NQD.decode(shape.vertices).data.slice();
+      for (let i = 0; i < points.length; i++) points[i] *= s[i % 3];
+      made.setAttribute("position", new THREE.BufferAttribute(points, 3));
+      const faces = new Uint32Array(NQD.decode(shape.faces).data);
+      made.setIndex(new THREE.BufferAttribute(faces, 1));
+      made.computeVertexNormals();
+      return made;
+    }
+    const made = shape.kind === "capsule"
+      ? new THREE.CapsuleGeometry(s[0], 2 * s[1], 10, 24)
+      : new THREE.CylinderGeometry(s[0], s[0], 2 * s[1], 32);
+    return made.rotateX(Math.PI / 2); // three.js has the axis along y, we along z
+  }
+
+  // Writes a frame as a matrix of column vectors, moved along y.
+  function writeMatrix(frame, i, shift, out, k) {
+    const x = frame[i + 3], y = frame[i + 4], z = frame[i + 5], w = frame[i + 6];
+    out[k] = 1 - 2 * (y * y + z * z);
+    out[k + 1] = 2 * (x * y + w * z);
+    out[k + 2] = 2 * (x * z - w * y);
+    out[k + 3] = 0;
+    out[k + 4] = 2 * (x * y - w * z);
+    out[k + 5] = 1 - 2 * (x * x + z * z);
+    out[k + 6] = 2 * (y * z + w * x);
+    out[k + 7] = 0;
+    out[k + 8] = 2 * (x * z + w * y);
+    out[k + 9] = 2 * (y * z - w * x);
+    out[k + 10] = 1 - 2 * (x * x + y * y);
+    out[k + 11] = 0;
+    out[k + 12] = frame[i];
+    out[k + 13] = frame[i + 1] + shift;
+    out[k + 14] = frame[i + 2];
+    out[k + 15] = 1;
+  }
+
+  // Makes a view inside an element, for a number of worlds.
+  NQD.View = function (container, drawing, worlds) {
+    const view = this;
+    view.drawing = drawing;
+    view.worlds = worlds;
+    view.tree = NQD.tree(drawing);
+    view.frames = new Float64Array(7 * view.tree.size * worlds);
+    view.shift = new Float64Array(worlds);
+    view.container = container;
+    view.scene = new THREE.Scene();
+    view.camera = new THREE.PerspectiveCamera(
+      FIELD, 1, 0.02 * drawing.radius, 400 * drawing.radius);
+    view.camera.up.set(0, 0, 1);
+    view.renderer = new THREE.WebGLRenderer({ antialias: true });
+    view.renderer.shadowMap.enabled = true;
+    view.renderer.setPixelRatio(Math.min(window.devicePixelRatio || 1, 2));
+    container.appendChild(view.renderer.domElement);
+    view.controls = new THREE.OrbitControls(view.camera, view.renderer.domElement);
+    view.controls.maxPolarAngle = 0.497 * Math.PI; // not below the ground
+    view.controls.minDistance = 0.3 * drawing.radius;
+    view.controls.maxDistance = 60 * drawing.radius;
+    view.lights();
+    view.ground();
+    view.meshes();
+    view.marks();
+    view.home();
+    view.theme("light");
+    view.resize();
+  };
+
+  const View = NQD.View.prototype;
+
+  View.lights = function () {
+    const r = this.drawing.radius;
+    this.scene.add(new THREE.HemisphereLight(0xffffff, 0xb0a898, 1.7));
+    this.sun = new THREE.DirectionalLight(0xffffff, 1.9);
+    this.sun.castShadow = true;
+    this.sun.shadow.mapSize.set(1024, 1024);
+    const box = this.sun.shadow.camera;
+    box.left = box.bottom = -4 * r;
+    box.right = box.top = 4 * r;
+    box.near = 0.1 * r;
+    box.far = 24 * r;
+    this.sun.shadow.bias = -0.0005;
+    this.sun.shadow.normalBias = 0.02 * r;
+    this.scene.add(this.sun, this.sun.target);
+  };
+
+  // The ground and its grid move with the camera, in whole steps of the grid.
+  View.ground = function () {
+    const r = this.drawing.radius;
+    this.step = r > 0.6 ? 1 : 0.1; // [m]
+    const far = 300 * r;
+    this.plane = new THREE.Mesh(
+      new THREE.PlaneGeometry(far, far),
+      new THREE.MeshStandardMaterial({
+        roughness: 1, polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 4,
+      }));
+    this.plane.receiveShadow = true;
+    this.scene.add(this.plane);
+    this.minor = this.lines(1);
+    this.major = this.lines(5);
+    this.scene.add(this.minor, this.major);
+  };
+
+  View.lines = function (every) {
+    const points = [], end = LINES * this.step, z = 0.0008 * this.drawing.radius * every;
+    for (let i = -LINES; i <= LINES; i += every) {
+      const at = i * this.step;
+      points.push(at, -end, z, at, end, z, -end, at, z, end, at, z);
+    }
+    const made = new THREE.BufferGeometry();
+    made.setAttribute(
+      "position", new THREE.BufferAttribute(new Float32Array(points), 3));
+    return new THREE.LineSegments(made, new THREE.LineBasicMaterial());
+  };
+
+  View.meshes = function () {
+    const drawing = this.drawing;
+    this.shapes = drawing.shapes.map((shape) => {
+      const color = shape.color;
+      const clear = color[3] < 1;
+      const material = new THREE.MeshStandardMaterial({
+        roughness: 0.65, transparent: clear, opacity: color[3],
+      });
+      if (!shape.visual) {
+        material.wireframe = true;
+        material.transparent = true;
+        material.opacity = 0.35;
+      }
+      const mesh = new THREE.InstancedMesh(geometry(shape), material, this.worlds);
+      mesh.instanceMatrix.setUsage(THREE.DynamicDrawUsage);
+      mesh.castShadow = mesh.receiveShadow = shape.visual;
+      mesh.frustumCulled = false;
+      mesh.visible = shape.visual;
+      this.scene.add(mesh);
+      return { mesh: mesh, body: shape.body, frame: shape.frame, shape: shape };
+    });
+    this.paint();
+  };
+
+  // Gives worlds their colours: the first has those of the files if it is alone.
+  View.paint = function () {
+    const own = new THREE.Color(), mark = new THREE.Color();
+    for (const each of this.shapes) {
+      const c = each.shape.color;
+      for (let w = 0; w < this.worlds; w++) {
+        own.setRGB(c[0], c[1], c[2], "srgb");
+        if (this.worlds > 1 && each.body >= 0) {
+          own.lerp(mark.set(NQD.palette[w % NQD.palette.length]), 0.6);
+        }
+        each.mesh.setColorAt(w, own);
+      }
+      each.mesh.instanceColor.needsUpdate = true;
+    }
+  };
+
+  // Trails, link origins and contact impulses.
+  View.marks = function () {
+    this.trails = [];
+    for (let w = 0; w < this.worlds; w++) {
+      const made = new THREE.BufferGeometry();
+      made.setAttribute(
+        "position", new THREE.BufferAttribute(new Float32Array(3 * TRAIL), 3));
+      made.setDrawRange(0, 0);
+      const color = NQD.palette[w % NQD.palette.length];
+      const line = new THREE.Line(made, new THREE.LineBasicMaterial({ color: color }));
+      line.frustumCulled = false;
+      this.scene.add(line);
+      this.trails.push(line);
+    }
+    const count = this.tree.size * this.worlds;
+    const origins = new THREE.BufferGeometry();
+    origins.setAttribute(
+      "position", new THREE.BufferAttribute(new Float32Array(3 * count), 3));
+    this.origins = new THREE.Points(origins, new THREE.PointsMaterial({
+      color: 0xff00ff, size: 7, sizeAttenuation: false, depthTest: false,
+      toneMapped: false, fog: false, transparent: true,
+    }));
+    this.origins.frustumCulled = false;
+    this.origins.visible = false;
+    this.origins.renderOrder = 10;
+    this.scene.add(this.origins);
+    this.arrows = new THREE.LineSegments(
+      new THREE.BufferGeometry(),
+      new THREE.LineBasicMaterial({ color: 0xd1242f, depthTest: false, fog: false }));
+    this.arrows.frustumCulled = false;
+    this.arrows.renderOrder = 9;
+    this.arrows.visible = false;
+    this.scene.add(this.arrows);
+  };
+
+  // Puts worlds on one place, or beside each other along y.
+  View.arrange = function (apart, spacing) {
+    this.apart = apart;
+    for (let w = 0; w < this.worlds; w++) this.shift[w] = apart ? -w * spacing : 0;
+    for (const each of this.shapes) {
+      if (each.body < 0) each.mesh.count = apart ? this.worlds : 1;
+    }
+    this.scene.updateMatrixWorld(true);
+    this.place();
+  };
+
+  // Shows the coordinates q[at] of a world; `place` then moves the meshes.
+  View.pose = function (world, q, at) {
+    const size = 7 * this.tree.size;
+    NQD.kinematics(
+      this.tree, q, at, this.frames.subarray(size * world, size * (world + 1)));
+  };
+
+  const placed = new Float64Array(7);
+
+  View.place = function () {
+    const size = 7 * this.tree.size;
+    for (const each of this.shapes) {
+      if (!each.mesh.visible) continue;
+      const out = each.mesh.instanceMatrix.array;
+      for (let w = 0; w < each.mesh.count; w++) {
+        if (each.body < 0) {
+          writeMatrix(each.frame, 0, this.shift[w], out, 16 * w);
+        } else {
+          NQD.compose(this.frames, size * w + 7 * each.body, each.frame, 0, placed, 0);
+          writeMatrix(placed, 0, this.shift[w], out, 16 * w);
+        }
+      }
+      each.mesh.instanceMatrix.needsUpdate = true;
+    }
+    if (this.origins.visible) {
+      const array = this.origins.geometry.attributes.position;
+      for (let i = 0; i < this.worlds * this.tree.size; i++) {
+        const w = Math.floor(i / this.tree.size);
+        array.array[3 * i] = this.frames[7 * i];
+        array.array[3 * i + 1] = this.frames[7 * i + 1] + this.shift[w];
+        array.array[3 * i + 2] = this.frames[7 * i + 2];
+      }
+      array.needsUpdate = true;
+    }
+  };
+
+  // Position of a world's torso, in the scene.
+  View.torso = function (world, out) {
+    const i = 7 * (this.tree.size * world + this.drawing.torso);
+    return out.set(
+      this.frames[i], this.frames[i + 1] + this.shift[world], this.frames[i + 2]);
+  };
+
+  // Draws the way of a world: `points` holds three numbers for each frame up to `last`.
+  View.trail = function (world, points, last) {
+    const line = this.trails[world], array = line.geometry.attributes.position;
+    const stride = Math.max(1, Math.ceil((last + 1) / TRAIL));
+    let n = 0;
+    for (let k = 0; k <= last && n < TRAIL; k += stride, n++) {
+      array.array[3 * n] = points[3 * k];
+      array.array[3 * n + 1] = points[3 * k + 1] + this.shift[world];
+      array.array[3 * n + 2] = points[3 * k + 2];
+    }
+    array.needsUpdate = true;
+    line.geometry.setDrawRange(0, n);
+  };
+
+  // Draws arrows: six numbers each, start and end.
+  View.impulses = function (points) {
+    const array = new THREE.BufferAttribute(new Float32Array(points), 3);
+    this.arrows.geometry.dispose();
+    this.arrows.geometry = new THREE.BufferGeometry();
+    this.arrows.geometry.setAttribute("position", array);
+  };
+
+  // Looks at the robot from the side and above.
+  View.home = function () {
+    const c = this.drawing.centre, r = this.drawing.radius;
+    const distance = 1.15 * r / Math.sin((FIELD / 2) * Math.PI / 180);
+    const flat = this.drawing.follow ? 0.45 : 1.1; // a fixed scene is seen from above
+    const side = this.drawing.follow ? 0.42 : 0.2;
+    const level = distance / Math.hypot(1, flat);
+    this.controls.target.set(c[0], c[1], c[2]);
+    this.camera.position.set(
+      c[0] - side * level, c[1] - Math.sqrt(1 - side * side) * level,
+      c[2] + flat * level);
+    this.controls.update();
+  };
+
+  // Moves camera and target by the same vector, to a new target.
+  View.lookAt = function (x, y, z) {
+    const t = this.controls.target;
+    this.camera.position.x += x - t.x;
+    this.camera.position.y += y - t.y;
+    this.camera.position.z += z - t.z;
+    t.set(x, y, z);
+  };
+
+  View.theme = function (name) {
+    const t = THEMES[name], r = this.drawing.radius;
+    this.scene.background = new THREE.Color(t.sky);
+    this.scene.fog = new THREE.Fog(t.sky, 12 * r, 70 * r);
+    this.plane.material.color.set(t.ground);
+    this.minor.material.color.set(t.minor);
+    this.major.material.color.set(t.major);
+  };
+
+  View.resize = function () {
+    const width = Math.max(1, this.container.clientWidth);
+    const height = Math.max(1, this.container.clientHeight);
+    this.renderer.setSize(width, height, false);
+    this.camera.aspect = width / height;
+    this.camera.updateProjectionMatrix();
+  };
+
+  View.render = function () {
+    const t = this.controls.target, r = this.drawing.radius;
+    const x = Math.round(t.x / (5 * this.step)) * 5 * this.step;
+    const y = Math.round(t.y / (5 * this.step)) * 5 * this.step;
+    this.minor.position.set(x, y, 0);
+    this.major.position.set(x, y, 0);
+    this.plane.position.set(x, y, 0);
+    this.sun.position.set(t.x - 3 * r, t.y - 4 * r, t.z + 8 * r);
+    this.sun.target.position.copy(t);
+    this.controls.update();
+    this.renderer.render(this.scene, this.camera);
+  };
+
+  // Pixel of a link's origin in the canvas, from the matrices that draw it.
+  View.project = function (world, body) {
+    const i = 7 * (this.tree.size * world + body);
+    const point = new THREE.Vector3(
+      this.frames[i], this.frames[i + 1] + this.shift[world], this.frames[i + 2]);
+    point.project(this.camera);
+    return [
+      (point.x + 1) / 2 * this.container.clientWidth,
+      (1 - point.y) / 2 * this.container.clientHeight,
+    ];
+  };
+})();
