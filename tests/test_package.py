@@ -53,8 +53,8 @@ LAYERS = (
 LEAVES: dict[str, set[str]] = {
     "compat": set(),
     "qd": {"compat"},
-    "viewers": set(),
-    "cli": {"qd", "compat", "viewers"},
+    "viewing": {"qd"},
+    "cli": {"qd", "compat", "viewing"},
     "__main__": {"cli"},
 }
 # The rooms of `qd`: a module may import those of its own room and those before it.
@@ -63,10 +63,10 @@ MOVED = {"actor_critic", "gradient_options", "ribs", "sharding"}  # old names
 # Where a package that is not of the standard library may be imported.
 EVERYWHERE = {"jax", "numpy", "newton_qd"}
 HOMES = {
-    "warp": ("physics/", "viewers/"),
-    "newton": ("physics/model/build.py", "physics/solver.py", "viewers/"),
+    "warp": ("physics/", "viewing/"),
+    "newton": ("physics/model/build.py", "physics/solver.py", "viewing/"),
 }
-LEAF_HOMES = ("qd/", "viewers/", "compat/", "cli/")
+LEAF_HOMES = ("qd/", "viewing/", "compat/", "cli/")
 # the gradient doctor's report draws itself
 HOMES["matplotlib"] = (*LEAF_HOMES, "gradients/report.py")
 # Never loaded by `import newton_qd`.
@@ -152,7 +152,7 @@ def test_packages_stay_in_their_home(name: str) -> None:
             continue
         if not path.startswith(HOMES.get(root, LEAF_HOMES)):
             wrong.append(f"{name}:{line} imports {target}")
-        if root == "newton" and ".viewer" in target and not path.startswith("viewers/"):
+        if root == "newton" and ".viewer" in target and not path.startswith("viewing/"):
             wrong.append(f"{name}:{line} imports {target}")
     if path.startswith("physics/kernels/"):
         wrong += [

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-from newton_qd.cli import algorithms, doctor, envs, evolve, runs
+from newton_qd.cli import algorithms, doctor, envs, evolve, runs, viewing
 from newton_qd.cli.arguments import BAD_ARGUMENTS, FAILED, OK, complain
 from newton_qd.cli.modules import import_modules
 from newton_qd.cli.version import ShowVersion
@@ -53,6 +53,7 @@ def main(
     for command in (envs, algorithms, evolve, doctor):
         command.add_parser(commands)
     runs.add_parsers(commands)
+    viewing.add_parsers(commands)
     arguments = parser.parse_args(argv)
     try:
         code = _run(arguments, task_factory)
@@ -75,7 +76,7 @@ def _run(
     """
     try:
         import_modules(arguments.modules)
-        if arguments.command in ("evolve", "eval", "plot"):
+        if arguments.command in ("evolve", "eval", "plot", "replay"):
             return arguments.run(arguments, task_factory)
         return arguments.run(arguments)
     except UnknownEnvironment as error:

@@ -45,7 +45,7 @@ def add_parsers(commands: Commands) -> None:
     which.add_argument("--best", type=int, metavar="N", help="the N fittest elites")
     which.add_argument(
         "--near",
-        type=_numbers,
+        type=numbers,
         metavar="X,X",
         help="the elite with the nearest descriptor; write --near=-3,2 if the first "
         "number is negative",
@@ -79,7 +79,7 @@ def add_parsers(commands: Commands) -> None:
     parser.set_defaults(run=plot)
 
 
-def _numbers(text: str) -> tuple[float, ...]:
+def numbers(text: str) -> tuple[float, ...]:
     """Parses numbers with commas between them.
 
     Raises:
@@ -92,7 +92,7 @@ def _numbers(text: str) -> tuple[float, ...]:
         raise argparse.ArgumentTypeError(given) from error
 
 
-def _opened(folder: Path, task_factory: TaskFactory) -> Run:
+def opened(folder: Path, task_factory: TaskFactory) -> Run:
     """Opens a run; says what differs from the machine that made it."""
     from newton_qd.physics.precision import quiet
     from newton_qd.qd.run.opened import load_run
@@ -116,7 +116,7 @@ def evaluate(arguments: argparse.Namespace, task_factory: TaskFactory = None) ->
     checks.integer("--seed", arguments.seed, least=0, error=ConfigError)
     if arguments.best is not None:
         checks.integer("--best", arguments.best, error=ConfigError)
-    run = _opened(arguments.folder, task_factory)
+    run = opened(arguments.folder, task_factory)
     try:
         elites = _chosen(run, arguments)
     except (LookupError, ValueError) as error:
@@ -235,7 +235,7 @@ def plot(arguments: argparse.Namespace, task_factory: TaskFactory = None) -> int
     if out.exists() and not out.is_dir():
         refused = f"--out: got {out}, a file; allowed: a folder, or a new name"
         return complain(arguments, refused, BAD_ARGUMENTS)
-    run = _opened(arguments.folder, task_factory)
+    run = opened(arguments.folder, task_factory)
     out.mkdir(parents=True, exist_ok=True)
     for name, figure in (
         ("archive.png", run.plot()),

@@ -1,6 +1,7 @@
 """See it: trajectories, and pages that show them in a browser.
 
 - ``record(env, policy, key)``: runs episodes and returns a ``Trajectory``
+- ``record_elites(run, cells)``: the same for elites of ``newton_qd.qd.load_run(DIR)``
 - ``write_replay(trajectory, path)``: one HTML file that shows it, without a network
 - ``show(trajectory)``: the same in a notebook
 - ``joined([...])``: trajectories of one robot as one, to see them together
@@ -15,8 +16,9 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from newton_qd.viewing.drawing import Drawing, DrawnShape, drawing_of
-    from newton_qd.viewing.recording import record
+    from newton_qd.viewing.drawing import Drawing, DrawnShape, can_draw, drawing_of
+    from newton_qd.viewing.elites import record_elites
+    from newton_qd.viewing.recording import Recorder, record
     from newton_qd.viewing.replay import replay_html, show, write_replay
     from newton_qd.viewing.trajectory import Contacts, Trajectory, joined
 
@@ -24,10 +26,13 @@ __all__ = [
     "Contacts",
     "Drawing",
     "DrawnShape",
+    "Recorder",
     "Trajectory",
+    "can_draw",
     "drawing_of",
     "joined",
     "record",
+    "record_elites",
     "replay_html",
     "show",
     "write_replay",
@@ -37,10 +42,13 @@ _HOME = {
     "Contacts": "trajectory",
     "Drawing": "drawing",
     "DrawnShape": "drawing",
+    "Recorder": "recording",
     "Trajectory": "trajectory",
+    "can_draw": "drawing",
     "drawing_of": "drawing",
     "joined": "trajectory",
     "record": "recording",
+    "record_elites": "elites",
     "replay_html": "replay",
     "show": "replay",
     "write_replay": "replay",

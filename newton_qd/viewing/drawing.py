@@ -41,7 +41,7 @@ class DrawnShape:
         size: (3,) sphere: radius; capsule and cylinder, along local z: radius, half
             length of the straight part; box: half extents [m]; mesh: scale [-].
         color: (4,) red, green, blue and opacity, 0 to 1, sRGB.
-        visual: Whether it is drawn by default. The others are colliders of a robot that
+        visual: Whether it is drawn by default. The others are colliders of a body that
             has visuals.
         vertices: (n, 3) vertices of a mesh [m], empty otherwise.
         faces: (m, 3) indices of the corners of its triangles.
@@ -114,6 +114,11 @@ class Drawing:
     rest_q: np.ndarray
 
 
+def can_draw(env: object) -> bool:
+    """Returns whether an environment can be drawn."""
+    return isinstance(getattr(env, "unwrapped", None), (PhysicsEnv, PointMaze))
+
+
 def drawing_of(env: Env) -> Drawing:
     """Returns what is drawn of an environment.
 
@@ -173,9 +178,7 @@ def _travels(system: System) -> bool:
     return False
 
 
-def _bounds(
-    system: System, shapes: tuple[DrawnShape, ...]
-) -> tuple[np.ndarray, float]:
+def _bounds(system: System, shapes: tuple[DrawnShape, ...]) -> tuple[np.ndarray, float]:
     """Returns centre (3,) and radius [m] of the robot in its default pose."""
     frames = reference.body_frames(system, system.rest_q)
     moving = [shape for shape in shapes if shape.body >= 0 and shape.visual]
@@ -224,6 +227,11 @@ def _shapes(system: System) -> Iterator[DrawnShape]:
         GeoType.CONVEX_MESH: "mesh",
     }
     for builder in system_builder(system):
+        seen = {
+            builder.shape_body[index]
+            for index in range(builder.shape_count)
+            if builder.shape_flags[index] & ShapeFlags.VISIBLE
+        }
         for index in range(builder.shape_count):
             kind = kinds.get(GeoType(builder.shape_type[index]))
             if kind is None:
@@ -240,7 +248,9 @@ def _shapes(system: System) -> Iterator[DrawnShape]:
                 frame=np.array(list(builder.shape_transform[index]), np.float64),
                 size=np.array(list(builder.shape_scale[index]), np.float64),
                 color=(red, green, blue, float(builder.shape_opacity[index])),
-                visual=bool(builder.shape_flags[index] & ShapeFlags.VISIBLE),
+                # Newton hides the colliders of a robot if one link has a visual
+                visual=bool(builder.shape_flags[index] & ShapeFlags.VISIBLE)
+                or builder.shape_body[index] not in seen,
                 **points,
             )
 
@@ -251,7 +261,9 @@ def _maze(env: PointMaze) -> Drawing:
     centre, half = ends.mean(axis=0), (ends[1] - ends[0]) / 2
     thickness = min(wall[3] - wall[1] for wall in env.walls)
     shapes = [
-        DrawnShape(1, "sphere", _IDENTITY, np.array([_POINT_RADIUS, 0, 0]), (*_POINT, 1))
+        DrawnShape(
+            1, "sphere", _IDENTITY, np.array([_POINT_RADIUS, 0, 0]), (*_POINT, 1)
+        )
     ]
     boxes = [(np.array(wall), _WALL) for wall in env.walls]
     for axis, side in itertools.product((0, 1), (-1, 1)):

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from newton_qd.checks import Fact, message
 from newton_qd.viewing.drawing import Drawing, DrawnShape
 from newton_qd.viewing.trajectory import Trajectory
 
@@ -54,7 +55,7 @@ def page(title: str, body: str, scripts: Sequence[str], data: dict[str, Any]) ->
         OSError: The package was installed without its pages.
         ValueError: A number in ``data`` is not finite.
     """
-    codes = [_script(page_file(name)) for name in (*_SHARED, *scripts)]
+    codes = [_script(name) for name in (*_SHARED, *scripts)]
     style = page_file("style.css")
     allowed = " ".join(_hash(code) for code in codes)
     policy = (
@@ -76,14 +77,16 @@ def page(title: str, body: str, scripts: Sequence[str], data: dict[str, Any]) ->
     return "\n".join(parts) + "\n"
 
 
-def _script(code: str) -> str:
-    """Returns a script that can be inside of HTML.
+def _script(name: str) -> str:
+    """Returns a script of the package that can be inside of HTML.
 
     Raises:
         ValueError: It has text that ends a script.
     """
+    code = page_file(name)
     if "</script" in code.lower() or "<!--" in code:
-        raise ValueError("a script of the package has text that ends it in a page")
+        given = Fact("text that ends a script in a page")
+        raise ValueError(message(f"pages/{name}", given, "none of it"))
     return code
 
 
@@ -104,6 +107,11 @@ def json_text(data: Any) -> str:
     """
     text = json.dumps(data, allow_nan=False, separators=(",", ":"), ensure_ascii=True)
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
+
+def short(value: float) -> str:
+    """Returns a number with four digits."""
+    return f"{value:.4g}"
 
 
 def encode(array: np.ndarray, kind: str = "float32") -> dict[str, Any]:

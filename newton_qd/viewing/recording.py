@@ -15,7 +15,7 @@ import numpy as np
 from newton_qd import checks, physics
 from newton_qd.checks import Fact, message
 from newton_qd.envs.base import Env, PhysicsEnv
-from newton_qd.types import Action, Observation, Params, RNGKey
+from newton_qd.types import Action, Observation, Params, PyTree, RNGKey
 from newton_qd.viewing.drawing import Drawing, drawing_of
 from newton_qd.viewing.trajectory import Contacts, Trajectory
 
@@ -71,12 +71,60 @@ def record(
         steps = _episode_steps(env)
     worlds = 1 if worlds is None else worlds
     keys = key[None] if worlds == 1 else jax.random.split(key, worlds)
-    run = functools.partial(
-        _run, env, policy if callable(policy) else None, params, contacts, steps
-    )
-    seen = jax.jit(jax.vmap(run))(keys, None if plan is None else plan[:, :steps])
+    acts = (lambda _, observation: policy(observation)) if callable(policy) else None
+    run = functools.partial(_run, env, acts, params, contacts, steps)
+    if plan is not None:
+        plan = plan[:, :steps]
+    seen = jax.jit(jax.vmap(run))(keys, None, plan)
     seen = jax.tree.map(np.asarray, seen)
     return _trajectory(env, drawing, seen, labels)
+
+
+class Recorder:
+    """Records many policies of one shape from one start, batch by batch.
+
+    A batch is compiled once.
+    """
+
+    def __init__(
+        self,
+        env: Env,
+        policy: Callable[[PyTree, Observation], Action],
+        steps: int,
+        *,
+        contacts: bool = False,
+    ) -> None:
+        """Prepares the recording.
+
+        Args:
+            env: Environment of one world.
+            policy: Function of the parameters of a policy and an observation (no,)
+                that returns an action (nu,).
+            steps: Control steps.
+            contacts: Whether to record the impulse of every contact.
+
+        Raises:
+            TypeError: The environment cannot be drawn.
+            RobotDescriptionError: A URDF file is malformed.
+            OSError: A URDF file cannot be read.
+        """
+        self.env = env
+        self.drawing = drawing_of(env)
+        run = functools.partial(_run, env, policy, None, contacts, steps)
+        self._batch = jax.jit(jax.vmap(run, (None, 0, None)))
+
+    def __call__(
+        self, parameters: PyTree, key: RNGKey, labels: Sequence[str]
+    ) -> Trajectory:
+        """Records a batch of policies; all worlds start as after ``env.reset(key)``.
+
+        Args:
+            parameters: Parameters, leaves (worlds, ...).
+            key: Key of the reset.
+            labels: Name of each world.
+        """
+        seen = jax.tree.map(np.asarray, self._batch(key, parameters, None))
+        return _trajectory(self.env, self.drawing, seen, labels)
 
 
 def _episode_steps(env: Env) -> int:
@@ -112,14 +160,19 @@ def _checked_plan(
 
 def _run(
     env: Env,
-    policy: Callable[[Observation], Action] | None,
+    policy: Callable[[PyTree, Observation], Action] | None,
     params: Params,
     contacts: bool,
     steps: int,
     key: RNGKey,
+    parameters: PyTree,
     plan: jax.Array | None,
 ) -> tuple[dict[str, jax.Array], dict[str, jax.Array]]:
-    """Runs one world; returns what is seen after the reset, and after each step."""
+    """Runs one world; returns what is seen after the reset, and after each step.
+
+    Raises:
+        ValueError: The environment has a batch.
+    """
     first = env.reset(key)
     if jnp.ndim(first.done):
         given = Fact(f"an environment of {jnp.shape(first.done)[0]} worlds")
@@ -128,11 +181,13 @@ def _run(
 
     def body(state: Any, action: jax.Array | None) -> tuple[Any, dict[str, jax.Array]]:
         if policy is not None:
-            action = policy(state.obs)
+            action = policy(parameters, state.obs)
         assert action is not None
         action = jnp.asarray(action, env.dtype)
         begin = state.pipeline_state
-        after = env.step(state, action, params)
+        # the step of a user's environment may have no parameters
+        step: Callable[..., Any] = env.step
+        after = step(state, action) if params is None else step(state, action, params)
         seen = _seen(env, after)
         if contacts:
             seen["impulse"] = _impulses(env, begin, action)

@@ -169,9 +169,7 @@ def joined(trajectories: list[Trajectory]) -> Trajectory:
             missing = [(0, 0), (0, steps - one.steps), (0, 0), (0, 0)]
             impulses.append(np.pad(one.contacts.impulse, missing))
         assert first.contacts is not None
-        contacts = dataclasses.replace(
-            first.contacts, impulse=np.concatenate(impulses)
-        )
+        contacts = dataclasses.replace(first.contacts, impulse=np.concatenate(impulses))
     return dataclasses.replace(
         first,
         q=rows("q"),

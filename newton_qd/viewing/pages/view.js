@@ -7,7 +7,22 @@
 (function () {
   const FIELD = 40; // vertical field of view of the camera [degrees]
   const TRAIL = 2000; // most points of a trail
-  const LINES = 60; // lines of the grid on each side of the camera's target
+
+  const GRID = `
+    varying vec2 vGrid;
+    uniform float gridStep;
+    uniform vec3 gridMinor, gridMajor;
+    float gridLine(float step, float pixels) {
+      vec2 at = vGrid / step, size = fwidth(at);
+      vec2 away = abs(fract(at - 0.5) - 0.5) / size;
+      float line = 1.0 - clamp(min(away.x, away.y) - 0.5 * pixels + 0.5, 0.0, 1.0);
+      return line * clamp(1.0 - 3.0 * max(size.x, size.y), 0.0, 1.0);
+    }
+  `;
+  const GRID_LINES = `
+    diffuseColor.rgb = mix(diffuseColor.rgb, gridMinor, gridLine(gridStep, 1.0));
+    diffuseColor.rgb = mix(diffuseColor.rgb, gridMajor, gridLine(5.0 * gridStep, 2.0));
+  `;
 
   const THEMES = {
     light: { sky: "#e8edf2", ground: "#dfe5ea", minor: "#a3afba", major: "#66747f" },
@@ -105,33 +120,28 @@
     this.scene.add(this.sun, this.sun.target);
   };
 
-  // The ground and its grid move with the camera, in whole steps of the grid.
+  // The ground moves with the camera. Its material draws the grid at world positions,
+  // so lines have no depth of their own and fade where they are finer than a pixel.
   View.ground = function () {
-    const r = this.drawing.radius;
+    const r = this.drawing.radius, far = 300 * r;
     this.step = r > 0.6 ? 1 : 0.1; // [m]
-    const far = 300 * r;
-    this.plane = new THREE.Mesh(
-      new THREE.PlaneGeometry(far, far),
-      new THREE.MeshStandardMaterial({
-        roughness: 1, polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 4,
-      }));
+    this.grid = {
+      gridStep: { value: this.step },
+      gridMinor: { value: new THREE.Color() },
+      gridMajor: { value: new THREE.Color() },
+    };
+    const material = new THREE.MeshStandardMaterial({ roughness: 1 });
+    material.onBeforeCompile = (shader) => {
+      Object.assign(shader.uniforms, this.grid);
+      shader.vertexShader = "varying vec2 vGrid;\n" + shader.vertexShader.replace(
+        "#include <project_vertex>",
+        "#include <project_vertex>\nvGrid = (modelMatrix * vec4(transformed, 1.0)).xy;");
+      shader.fragmentShader = GRID + shader.fragmentShader.replace(
+        "#include <color_fragment>", "#include <color_fragment>\n" + GRID_LINES);
+    };
+    this.plane = new THREE.Mesh(new THREE.PlaneGeometry(far, far), material);
     this.plane.receiveShadow = true;
     this.scene.add(this.plane);
-    this.minor = this.lines(1);
-    this.major = this.lines(5);
-    this.scene.add(this.minor, this.major);
-  };
-
-  View.lines = function (every) {
-    const points = [], end = LINES * this.step, z = 0.0008 * this.drawing.radius * every;
-    for (let i = -LINES; i <= LINES; i += every) {
-      const at = i * this.step;
-      points.push(at, -end, z, at, end, z, -end, at, z, end, at, z);
-    }
-    const made = new THREE.BufferGeometry();
-    made.setAttribute(
-      "position", new THREE.BufferAttribute(new Float32Array(points), 3));
-    return new THREE.LineSegments(made, new THREE.LineBasicMaterial());
   };
 
   View.meshes = function () {
@@ -313,8 +323,8 @@
     this.scene.background = new THREE.Color(t.sky);
     this.scene.fog = new THREE.Fog(t.sky, 12 * r, 70 * r);
     this.plane.material.color.set(t.ground);
-    this.minor.material.color.set(t.minor);
-    this.major.material.color.set(t.major);
+    this.grid.gridMinor.value.set(t.minor);
+    this.grid.gridMajor.value.set(t.major);
   };
 
   View.resize = function () {
@@ -327,11 +337,7 @@
 
   View.render = function () {
     const t = this.controls.target, r = this.drawing.radius;
-    const x = Math.round(t.x / (5 * this.step)) * 5 * this.step;
-    const y = Math.round(t.y / (5 * this.step)) * 5 * this.step;
-    this.minor.position.set(x, y, 0);
-    this.major.position.set(x, y, 0);
-    this.plane.position.set(x, y, 0);
+    this.plane.position.set(t.x, t.y, 0);
     this.sun.position.set(t.x - 3 * r, t.y - 4 * r, t.z + 8 * r);
     this.sun.target.position.copy(t);
     this.controls.update();

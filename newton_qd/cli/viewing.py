@@ -1,0 +1,196 @@
+"""``newton-qd replay``: pages that show what a run has found."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from newton_qd import checks
+from newton_qd.checks import Fact, message
+from newton_qd.cli.arguments import BAD_ARGUMENTS, FAILED, OK, Commands, complain
+from newton_qd.cli.runs import numbers, opened
+from newton_qd.qd.config import ConfigError, EvolveConfig
+
+if TYPE_CHECKING:
+    from newton_qd.qd.run.opened import Run
+    from newton_qd.qd.scoring.task import Task
+    from newton_qd.viewing.trajectory import Trajectory
+
+    TaskFactory = Callable[[EvolveConfig], Task] | None
+
+_MOST_WORLDS = 50  # that a page shows at once
+_RANDOM_STEPS = 250  # of an environment without a policy
+
+
+def add_parsers(commands: Commands) -> None:
+    """Adds the commands to the subparsers of ``newton-qd``."""
+    parser = commands.add_parser(
+        "replay",
+        help="write a page that shows elites of a run, or an environment, moving",
+        description="Writes one HTML file that opens in any browser, without a "
+        "network: elites of a results folder, or an environment with random actions.",
+    )
+    _add_choice(parser)
+    parser.add_argument(
+        "--out",
+        type=Path,
+        metavar="FILE",
+        help="HTML file (default: replay.html in the results folder, or ENV.html)",
+    )
+    parser.set_defaults(run=replay)
+
+
+def _add_choice(parser: argparse.ArgumentParser) -> None:
+    """Adds the arguments that choose what is shown."""
+    parser.add_argument(
+        "what", metavar="DIR|ENV", help="results folder, or environment"
+    )
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument("--cell", type=int, metavar="N", help="the elite of one cell")
+    which.add_argument(
+        "--best",
+        type=int,
+        metavar="N",
+        help="the N fittest elites (default: 1); of an environment, N worlds",
+    )
+    which.add_argument(
+        "--near",
+        type=numbers,
+        metavar="X,X",
+        help="the elite with the nearest descriptor; write --near=-3,2 if the first "
+        "number is negative",
+    )
+    parser.add_argument(
+        "--steps",
+        type=int,
+        metavar="N",
+        help="control steps (default: an episode of the run, or "
+        f"{_RANDOM_STEPS} of an environment)",
+    )
+    parser.add_argument(
+        "--seed",
+        type=int,
+        default=0,
+        metavar="N",
+        help="seed of an environment's start and actions (default: 0)",
+    )
+    parser.add_argument(
+        "--contacts", action="store_true", help="record the impulse of each contact"
+    )
+
+
+def replay(arguments: argparse.Namespace, task_factory: TaskFactory = None) -> int:
+    """Writes a replay page. Returns the exit code.
+
+    Raises:
+        ConfigError: An argument is not allowed, or the archive cannot be read.
+        UnknownEnvironment: There is neither a folder nor an environment of this name.
+    """
+    out = _target(arguments, "replay.html", ".html")
+    from newton_qd.qd.run.archive import ArchiveError
+    from newton_qd.viewing import write_replay
+
+    try:
+        trajectory, title = _trajectory(arguments, task_factory)
+    except (LookupError, ValueError) as error:
+        return complain(arguments, error, BAD_ARGUMENTS)
+    except ArchiveError as error:
+        return complain(arguments, error, FAILED)
+
+    write_replay(trajectory, out, title)
+    print(f"written: {out}\nopen it in a browser: {out.absolute().as_uri()}")
+    return OK
+
+
+def _target(arguments: argparse.Namespace, name: str, ending: str) -> Path:
+    """Returns the file to write: ``name`` in a results folder, or ENV with an ending.
+
+    Raises:
+        ConfigError: It is a folder.
+    """
+    folder = Path(arguments.what)
+    out = arguments.out
+    if out is None:
+        out = folder / name if folder.is_dir() else Path(f"{arguments.what}{ending}")
+    if out.is_dir():
+        why = "which is a folder"
+        raise ConfigError(message("--out", str(out), "a file", why=why))
+    return out
+
+
+def _trajectory(
+    arguments: argparse.Namespace, task_factory: TaskFactory
+) -> tuple[Trajectory, str]:
+    """Records what the arguments choose; returns it with a title.
+
+    Raises:
+        ConfigError: A number is not allowed, or the environment cannot be drawn.
+        UnknownEnvironment: There is neither a folder nor an environment of this name.
+    """
+    checks.integer("--steps", arguments.steps, optional=True, error=ConfigError)
+    checks.integer("--seed", arguments.seed, least=0, error=ConfigError)
+    checks.integer(
+        "--best", arguments.best, most=_MOST_WORLDS, optional=True, error=ConfigError
+    )
+    if not Path(arguments.what).is_dir():
+        return _random_trajectory(arguments), f"{arguments.what}, random actions"
+    from newton_qd.viewing import can_draw, record_elites
+
+    run = opened(Path(arguments.what), task_factory)
+    if not can_draw(run.task.env):
+        given = Fact(type(run.task.env).__name__)
+        raise ConfigError(message("env", given, "simulated robots, and pointmaze"))
+    return (
+        record_elites(
+            run,
+            _cells(run, arguments),
+            steps=arguments.steps,
+            contacts=arguments.contacts,
+        ),
+        f"{run.config.env_name}, {run.path}",
+    )
+
+
+def _cells(run: Run, arguments: argparse.Namespace) -> list[int]:
+    """Returns the cells that the arguments choose.
+
+    Raises:
+        ConfigError: The archive is empty.
+        LookupError: There is no such cell, or it is empty.
+        ValueError: ``--near`` has a wrong length.
+    """
+    if not len(run.cells):
+        raise ConfigError(message(str(run.path), Fact("no elite"), "at least one"))
+    if arguments.cell is not None:
+        return [run.elite(arguments.cell).cell]
+    if arguments.near is not None:
+        return [run.nearest(arguments.near)[0].cell]
+    return [elite.cell for elite in run.best(arguments.best or 1)]
+
+
+def _random_trajectory(arguments: argparse.Namespace) -> Trajectory:
+    """Records an environment with random actions.
+
+    Raises:
+        ConfigError: An option needs a results folder.
+        UnknownEnvironment: No environment has this name.
+    """
+    for name in ("cell", "near"):
+        if getattr(arguments, name) is not None:
+            allowed = "a results folder in the place of the environment"
+            raise ConfigError(message(f"--{name}", getattr(arguments, name), allowed))
+    import jax
+
+    import newton_qd
+    from newton_qd.physics.precision import quiet
+    from newton_qd.viewing import record
+
+    quiet()
+    steps, worlds = arguments.steps or _RANDOM_STEPS, arguments.best or 1
+    env = newton_qd.create(arguments.what, episode_length=steps, auto_reset=False)
+    start, noise = jax.random.split(jax.random.key(arguments.seed))
+    shape = (worlds, steps, env.action_size)
+    actions = jax.random.uniform(noise, shape, env.dtype, -1, 1)
+    return record(env, actions, start, contacts=arguments.contacts)

@@ -1,0 +1,62 @@
+"""Trajectories of the elites of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from newton_qd.viewing.html import short
+from newton_qd.viewing.recording import Recorder
+from newton_qd.viewing.trajectory import Trajectory, joined
+
+if TYPE_CHECKING:
+    from newton_qd.qd.run.opened import Run
+
+_BATCH = 64  # elites that are recorded together
+
+
+def record_elites(
+    run: Run,
+    cells: Sequence[int] | np.ndarray,
+    *,
+    steps: int | None = None,
+    contacts: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> Trajectory:
+    """Records elites of a run, each from the start of the run's evaluations.
+
+    Args:
+        run: The run, from ``newton_qd.qd.load_run(DIR)``.
+        cells: (N,) rows of the archive, with at least one.
+        steps: Control steps; ``None``: the episode length of the run.
+        contacts: Whether to record the impulse of every contact.
+        progress: Called after each batch with the number of recorded elites and N.
+
+    Raises:
+        TypeError: The environment cannot be drawn.
+        ValueError: There are no cells.
+        IndexError: A cell does not exist.
+        LookupError: A cell is empty.
+    """
+    elites = [run.elite(int(cell)) for cell in cells]
+    steps = run.config.episode_length if steps is None else steps
+    policy = run.policy
+    record = Recorder(run.task.env, policy.apply, steps, contacts=contacts)
+    unravel = jax.jit(jax.vmap(policy.unravel))
+    size = min(_BATCH, max(1, len(elites)))
+    parts = []
+    for begin in range(0, len(elites), size):
+        some = elites[begin : begin + size]
+        # the last batch is as large as the others, so that it needs no compiling
+        filled = [*some, *[some[-1]] * (size - len(some))]
+        genotypes = jnp.asarray(np.stack([elite.genotype for elite in filled]))
+        labels = [f"cell {e.cell}, fitness {short(e.fitness)}" for e in filled]
+        part = record(unravel(genotypes), run.start_key, labels)
+        parts.append(part.select(list(range(len(some)))))
+        if progress is not None:
+            progress(min(begin + size, len(elites)), len(elites))
+    return joined(parts)

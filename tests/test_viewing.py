@@ -1,0 +1,204 @@
+"""Trajectories, what is drawn of a robot, and the text of pages."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from point_runs import compile_once, point_task, reference
+
+import newton_qd
+from newton_qd import cli
+from newton_qd.assets import find_urdf
+from newton_qd.physics.model import build_system
+from newton_qd.robots import ROBOTS
+from newton_qd.scenes import SCENES
+from newton_qd.viewing import drawing_of, html, joined, record, replay_html
+from newton_qd.viewing.drawing import drawing_of_system
+from newton_qd.viewing.trajectory import Trajectory
+
+__all__ = ["compile_once", "reference"]  # fixtures
+PAGES = Path(newton_qd.__file__).parent / "viewing" / "pages"
+
+
+@pytest.fixture(scope="module")
+def ant() -> Any:
+    return newton_qd.create("ant_uni", episode_length=5, auto_reset=False)
+
+
+@pytest.fixture(scope="module")
+def walk(ant: Any) -> Trajectory:
+    actions = jnp.linspace(-1, 1, 2 * 6 * 8, dtype=jnp.float32).reshape(2, 6, 8)
+    return record(ant, actions, jax.random.key(0), contacts=True)
+
+
+def test_a_trajectory_is_that_of_the_steps(ant: Any, walk: Trajectory) -> None:
+    actions = jnp.linspace(-1, 1, 2 * 6 * 8, dtype=jnp.float32).reshape(2, 6, 8)
+    step = jax.jit(ant.step)
+    for world, key in enumerate(jax.random.split(jax.random.key(0), 2)):
+        state = jax.jit(ant.reset)(key)
+        for k in range(6):
+            assert np.allclose(walk.q[world, k], state.pipeline_state.q, atol=1e-5)
+            state = step(state, actions[world, k])
+            assert np.allclose(walk.rewards[world, k], state.reward, atol=1e-3)
+            contact = state.info["state_descriptor"]
+            assert np.array_equal(walk.descriptors[world, k + 1], contact)
+            assert np.array_equal(walk.feet[world, k + 1], contact)
+    # the episode has 5 steps, the plan 6
+    assert walk.lengths.tolist() == [5, 5] and walk.steps == 6
+    assert np.allclose(walk.returns, walk.rewards[:, :5].sum(axis=1))
+    assert walk.descriptor_names[0] == "foot_1 contact" and walk.dt == ant.dt
+
+
+def test_contacts_are_those_of_the_bodies(ant: Any, walk: Trajectory) -> None:
+    assert walk.contacts is not None
+    impulse = walk.contacts.impulse
+    touching = impulse[..., 2] > 0
+    assert touching.any() and walk.contacts.ground.all()
+    feet = [ant.system.body_names.index(name) for name in walk.drawing.feet]
+    carried = np.stack(
+        [impulse[:, :, walk.contacts.body == foot, 2].sum(axis=2) for foot in feet], -1
+    )
+    threshold = 0.01 * ant.system.total_mass * 9.81 * ant.dt
+    assert np.array_equal(carried > threshold, walk.feet[:, 1:] > 0)
+
+
+def test_a_policy_and_auto_reset() -> None:
+    env = newton_qd.create("pointmaze", episode_length=4)
+    up = record(env, lambda obs: jnp.ones_like(obs), jax.random.key(1), worlds=3)
+    assert up.q.shape == (3, 5, 2) and up.labels == ("world 1", "world 2", "world 3")
+    # the wrapper has returned to the first state where the last would be
+    assert up.lengths.tolist() == [3, 3, 3]
+    assert np.all(np.diff(up.q[:, :4], axis=1) > 0)
+    whole = joined([up, record(env, jnp.zeros((2, 2)), jax.random.key(2))])
+    assert whole.worlds == 4 and whole.select([3]).labels == ("world 1",)
+    assert np.array_equal(whole.q[3, 2], whole.q[3, 4])
+
+
+def test_wrong_arguments_are_named(ant: Any) -> None:
+    key = jax.random.key(0)
+    for wrong in (jnp.zeros((3, 7)), jnp.zeros(8), jnp.zeros((2, 0, 8))):
+        with pytest.raises(ValueError, match=r"policy: got .*; allowed: a function"):
+            record(ant, wrong, key)
+    with pytest.raises(TypeError, match="policy: got 'walk'"):
+        record(ant, "walk", key)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="worlds: got 0"):
+        record(ant, jnp.zeros((3, 8)), key, worlds=0)
+    with pytest.raises(TypeError, match="env: got str; allowed: environments"):
+        record("ant", jnp.zeros((3, 8)), key)  # type: ignore[arg-type]
+    batch = newton_qd.create("pointmaze", batch_size=2)
+    with pytest.raises(ValueError, match="env: got an environment of 2 worlds"):
+        record(batch, jnp.zeros((3, 2)), key)
+    with pytest.raises(ValueError, match="trajectories: got none"):
+        joined([])
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_every_shape_is_one_of_the_files(name: str) -> None:
+    """Drawn shapes are the visuals of the URDF files, on the bodies of the system."""
+    # without the warning that a fast robot passes through the walls
+    system = build_system(ROBOTS[name], "float32", SCENES["maze"])
+    drawing = drawing_of_system(system)
+    text = "".join(
+        find_urdf(file).read_text(encoding="utf-8")
+        for file in (system.robot.urdf, "maze.urdf")
+    )
+    for tag, visual in (("visual", True), ("collision", False)):
+        count = len(re.findall(rf"<{tag}[ >]", text))
+        assert sum(shape.visual is visual for shape in drawing.shapes) == count
+    assert {shape.body for shape in drawing.shapes} <= set(range(-1, system.nb))
+    assert drawing.radius > 0
+    target = [s for s in drawing.shapes if s.body < 0 and s.color[3] < 1]
+    assert len(target) == 1  # of the maze, which one can see through
+
+
+def test_the_maze_is_that_of_the_environment() -> None:
+    env: Any = newton_qd.create("pointmaze")
+    drawing = drawing_of(env)
+    goal = drawing.shapes[-1]
+    assert goal.frame[:2].tolist() == list(env.goal)
+    assert goal.size[0] == env.zone_width / 2
+    boxes = [s for s in drawing.shapes if s.kind == "box"]
+    assert len(boxes) == 7  # two walls, four borders, the goal
+    low, high = (
+        [float(s.frame[1] + sign * s.size[1]) for s in boxes[:2]] for sign in (-1, 1)
+    )
+    assert np.allclose(low, [-0.5, 0.2]) and np.allclose(high, [-0.49, 0.21])
+
+
+def test_arrays_are_encoded() -> None:
+    array = np.linspace(-3, 5, 24).reshape(2, 4, 3)
+    exact = html.encode(array)
+    raw = np.frombuffer(base64.b64decode(exact["data"]), "<f4")
+    assert np.array_equal(raw.reshape(exact["shape"]), array.astype(np.float32))
+    short = html.encode(array, "int16")
+    raw = np.frombuffer(base64.b64decode(short["data"]), "<i2")
+    back = raw.reshape(-1, 3) * short["scale"] + short["offset"]
+    assert np.abs(back - array.reshape(-1, 3)).max() < 8 / 65_535
+
+
+def test_names_cannot_end_a_page(walk: Trajectory) -> None:
+    title = "</script><script>alert(1)</script><!-- \u202e & '\""
+    text = replay_html(walk, title)
+    assert text.count("</script>") == text.count("<script")
+    assert "<script>alert" not in text and "<!--" not in text.replace("<!doctype", "")
+    (found,) = re.findall(r'<script type="application/json" id="data">(.*?)</s', text)
+    assert json.loads(found)["title"] == title
+    (policy,) = re.findall(r'Policy" content="([^"]*)"', text)
+    assert policy.startswith("default-src 'none'; script-src 'sha256-")
+    assert "unsafe" not in policy and "http" not in policy
+    with pytest.raises(ValueError, match="Out of range float values"):
+        html.json_text({"reward": float("nan")})
+
+
+def test_a_page_is_small(walk: Trajectory) -> None:
+    """1,000 steps of ten ants are below 2 MB."""
+    many = joined([walk] * 5)
+    frames = np.repeat(many.q[:, :1], 1001, axis=1)
+    long = Trajectory(
+        drawing=many.drawing,
+        q=frames,
+        lengths=np.full(10, 1000),
+        dt=many.dt,
+        rewards=np.zeros((10, 1000)),
+        descriptors=np.zeros((10, 1001, 4)),
+        descriptor_names=many.descriptor_names,
+        feet=np.zeros((10, 1001, 4)),
+        labels=many.labels,
+    )
+    assert len(replay_html(long)) < 2e6
+
+
+def test_the_bundled_script_has_the_hash_of_its_build() -> None:
+    lines = (PAGES / "three.sha256").read_text(encoding="utf-8").splitlines()
+    stored = {name: digest for digest, name in map(str.split, lines)}
+    assert set(stored) == {"three.min.js", "three.LICENSE"}
+    for name, digest in stored.items():
+        assert hashlib.sha256((PAGES / name).read_bytes()).hexdigest() == digest
+    assert "MIT License" in (PAGES / "three.LICENSE").read_text(encoding="utf-8")
+
+
+@pytest.mark.slow
+def test_an_environment_that_cannot_be_drawn(
+    reference: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The points of the tests are no robots: the command says so."""
+    assert cli.main(["replay", str(reference)], task_factory=point_task) == 2
+    assert "env: got PointEnv; allowed: simulated robots" in capsys.readouterr().err
+
+
+def test_wrong_arguments_of_replay(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["replay", "antt"]) == 2
+    assert "does not exist" in capsys.readouterr().err
+    assert cli.main(["replay", "ant", "--cell", "3"]) == 2
+    assert "--cell: got 3; allowed: a results folder" in capsys.readouterr().err
+    assert cli.main(["replay", "ant", "--best", "0"]) == 2
+    assert "--best: got 0; allowed: None, or integers" in capsys.readouterr().err
