@@ -40,6 +40,7 @@ def walk() -> Trajectory:
     return record(env, actions, jax.random.key(0), contacts=True)
 
 
+@pytest.mark.slow
 def test_replay_page(walk: Trajectory, pages: Pages, tmp_path: Path) -> None:
     page = pages.open(write_replay(walk, tmp_path / "walk.html"))
     assert page.inner_text("h1") == "ant"
@@ -73,6 +74,7 @@ def test_replay_page(walk: Trajectory, pages: Pages, tmp_path: Path) -> None:
     until(page, "NQD.player.time > 0.12")
 
 
+@pytest.mark.slow
 def test_kinematics_are_those_of_the_physics(
     walk: Trajectory, pages: Pages, tmp_path: Path
 ) -> None:

@@ -80,6 +80,8 @@
       if (event.buttons) this.seekChart(event);
     });
     window.addEventListener("resize", () => this.resize());
+    // the charts take their place from the view
+    new ResizeObserver(() => this.view.resize()).observe(this.stage);
     document.addEventListener("keydown", (event) => {
       if (event.ctrlKey || event.altKey || event.metaKey) return;
       const field = event.target.tagName;
