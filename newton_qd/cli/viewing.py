@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 from newton_qd import checks
 from newton_qd.checks import Fact, message
-from newton_qd.cli.arguments import BAD_ARGUMENTS, FAILED, OK, Commands, complain
+from newton_qd.cli import modules
+from newton_qd.cli.arguments import BAD_ARGUMENTS, OK, Commands, complain
 from newton_qd.cli.runs import numbers, opened
 from newton_qd.qd.config import ConfigError, EvolveConfig
 
@@ -33,6 +34,7 @@ def add_parsers(commands: Commands) -> None:
         "network: elites of a results folder, or an environment with random actions.",
     )
     _add_choice(parser)
+    modules.add_argument(parser)
     parser.add_argument(
         "--out",
         type=Path,
@@ -89,15 +91,12 @@ def replay(arguments: argparse.Namespace, task_factory: TaskFactory = None) -> i
         UnknownEnvironment: There is neither a folder nor an environment of this name.
     """
     out = _target(arguments, "replay.html", ".html")
-    from newton_qd.qd.run.archive import ArchiveError
     from newton_qd.viewing import write_replay
 
     try:
         trajectory, title = _trajectory(arguments, task_factory)
     except (LookupError, ValueError) as error:
         return complain(arguments, error, BAD_ARGUMENTS)
-    except ArchiveError as error:
-        return complain(arguments, error, FAILED)
 
     write_replay(trajectory, out, title)
     print(f"written: {out}\nopen it in a browser: {out.absolute().as_uri()}")
