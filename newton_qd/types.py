@@ -120,6 +120,7 @@ INFO_KEYS: Mapping[str, str] = types.MappingProxyType(
         "first_obs": "(no,) observation to which an auto-reset returns",
         "first_state_descriptor": "(nd,) descriptor to which an auto-reset returns",
         "first_xy_position": "(2,) position to which an auto-reset returns [m]",
+        "params": "physical parameters of the world, drawn at the reset",
         "eval_metrics": "EvalMetrics: sums over the first episode",
         "completed_eval_metrics": "CompletedEvalMetrics: sums over ended episodes",
     }

@@ -292,6 +292,14 @@ EXCEPTIONS = {
         "{path} has format": "about a file, not a value",
         "{path}: {error}": "repeats an error in this grammar",
     },
+    "qd/run/evolution.py": {
+        "_other_start(config": "that function calls message",
+        "str(error)": "repeats an error in this grammar",
+    },
+    "qd/scoring/task.py": {
+        "env_options: {error}": "repeats an error in this grammar",
+        "randomize: {error}": "repeats an error in this grammar",
+    },
     "qd/emitters/arborescence.py": {
         "extra_scores['gradients'] or the scores": "about a result, not a value",
     },

@@ -264,6 +264,10 @@ CHANGES = {
     "algorithm": "cma-me",
     "reevaluations": 2,
     "env_options": {"healthy_reward": 2.0},
+    "starts": 2,
+    "statistic": "median",
+    "new_starts": True,
+    "randomize": {"friction": (0.5, 1.5)},
     "warm_start": "0" * 64,
 }
 

@@ -116,6 +116,7 @@ def _add_setting_arguments(parser: argparse.ArgumentParser) -> None:
         ("iso_sigma", float, "standard deviation of the isotropic variation"),
         ("line_sigma", float, "standard deviation of the step to a second parent"),
         ("reevaluations", int, "evaluations of each elite at the end; 0: none"),
+        ("starts", int, "start states from which each individual is evaluated"),
     ):
         group.add_argument(
             f"--{name.replace('_', '-')}",
@@ -148,6 +149,26 @@ def _add_setting_arguments(parser: argparse.ArgumentParser) -> None:
         "or material.friction=0.8; may be repeated",
     )
     group.add_argument(
+        "--statistic",
+        metavar="NAME",
+        help="mean or median of the results of several start states (default: "
+        f"{_DEFAULTS.statistic})",
+    )
+    group.add_argument(
+        "--new-starts",
+        action="store_const",
+        const=True,
+        help="other start states in each generation",
+    )
+    group.add_argument(
+        "--randomize",
+        type=_range,
+        action="append",
+        metavar="NAME=LOW,HIGH",
+        help="range of a physical parameter, for example friction=0.5,1.5; each start "
+        "state has its own; may be repeated",
+    )
+    group.add_argument(
         "--hidden",
         type=widths,
         metavar="N,N",
@@ -178,6 +199,17 @@ def _option(text: str) -> tuple[str, Any]:
         pass
     raise argparse.ArgumentTypeError(
         f"got {text!r}; allowed: a name and a value like discount=0.95"
+    )
+
+
+def _range(text: str) -> tuple[str, Any]:
+    name, separator, value = text.partition("=")
+    with contextlib.suppress(ValueError):
+        low, high = (float(part) for part in value.split(","))
+        if name and separator:
+            return name, (low, high)
+    raise argparse.ArgumentTypeError(
+        f"got {text!r}; allowed: a name and two numbers like friction=0.5,1.5"
     )
 
 
@@ -235,6 +267,8 @@ def settle(arguments: argparse.Namespace) -> tuple[EvolveConfig, Path]:
         base = base.replace(grid=None)
     if "options" in given:
         given["options"] = {**dict(base.options), **dict(given["options"])}
+    if "randomize" in given:
+        given["randomize"] = {**dict(base.randomize), **dict(given["randomize"])}
     if "env_options" in given:
         given["env_options"] = _merged(dict(base.env_options), given["env_options"])
     return base.replace(**given), out

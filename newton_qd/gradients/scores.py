@@ -29,14 +29,20 @@ def gradient_scores(
         ``normalized_grads``, the same with Euclidean norm 1 over a genotype (0 stays
         0); ``faulty`` (N,) and ``overflowed`` (N, 1 + D).
     """
-    unit = jax.vmap(jax.vmap(_unit))(found.gradients)
+    gradients = _rows_last(found.gradients)
     extra: ExtraScores = {
-        "gradients": _rows_last(found.gradients),
-        "normalized_grads": _rows_last(unit),
+        "gradients": gradients,
+        "normalized_grads": unit_rows(gradients),
         "faulty": found.faulty,
         "overflowed": found.overflowed,
     }
     return found.fitnesses, found.descriptors, extra
+
+
+def unit_rows(gradients: Genotype) -> Genotype:
+    """Returns gradients (N, ..., R) with norm 1 over a genotype; 0 stays 0."""
+    rows = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 1), gradients)
+    return _rows_last(jax.vmap(jax.vmap(_unit))(rows))
 
 
 def _unit(gradient: Genotype) -> Genotype:

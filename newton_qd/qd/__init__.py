@@ -11,6 +11,7 @@
 - ``episode_of(task, policy, length)``: the same as a ``newton_qd.Episode``;
   ``episode.scoring(episode.gradient)`` has gradients
   (``make_gradient_scoring_function`` is deprecated)
+- ``robust_scoring(score, starts=4)``: each individual from several start states
 - ``device_mesh``, ``shard_scoring``: evaluation on several devices
 - ``make_ribs_evaluation``, ``to_ribs``, ``from_ribs``: pyribs with these tasks
 
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from newton_qd.qd.run.search import SearchError
     from newton_qd.qd.scoring.gradient_scoring import make_gradient_scoring_function
     from newton_qd.qd.scoring.ribs import from_ribs, make_ribs_evaluation, to_ribs
+    from newton_qd.qd.scoring.robust import robust_scoring
     from newton_qd.qd.scoring.rollout import (
         Policy,
         episode_of,
@@ -79,6 +81,7 @@ __all__ = [
     "make_task",
     "plot_archive",
     "register_algorithm",
+    "robust_scoring",
     "shard_scoring",
     "to_ribs",
 ]
@@ -113,6 +116,7 @@ _HOME = {
     "make_task": "scoring.task",
     "plot_archive": "run.plot",
     "register_algorithm": "algorithms",
+    "robust_scoring": "scoring.robust",
     "shard_scoring": "scoring.sharding",
     "to_ribs": "scoring.ribs",
 }

@@ -20,6 +20,9 @@ MAX_CELLS = 1_000_000
 DEFAULT_GRIDS = {1: (64,), 2: (32, 32), 3: (9, 9, 9), 4: (5, 5, 5, 5)}
 """Default number of cells per descriptor dimension."""
 
+STATISTICS = ("mean", "median")
+"""Ways to join the results of several start states."""
+
 _PACKAGES = (
     "newton_qd",
     "newton",
@@ -65,6 +68,12 @@ class EvolveConfig:
             is a table with the fields of ``Material`` that differ from the robot's;
             ``scene`` is a name in ``newton_qd.scenes.SCENES``, a URDF file, or a table
             with the fields of ``Scene``.
+        starts: Start states from which each individual is evaluated.
+        statistic: ``"mean"`` or ``"median"`` of fitness and descriptor over them.
+        new_starts: Whether every generation has other start states.
+        randomize: Ranges of physical parameters, as ``(name, (lowest, highest))`` or
+            as a dictionary; each start state has its own parameters
+            (:func:`~newton_qd.randomize_params`).
         warm_start: SHA-256 of the genotypes that the run starts from; ``None``: random
             ones. ``evolve`` sets it from ``start_from``.
 
@@ -86,6 +95,10 @@ class EvolveConfig:
     algorithm: str = "me"
     options: tuple[tuple[str, Any], ...] = ()
     env_options: tuple[tuple[str, Any], ...] = ()
+    starts: int = 1
+    statistic: str = "mean"
+    new_starts: bool = False
+    randomize: tuple[tuple[str, Any], ...] = ()
     warm_start: str | None = None
 
     def __post_init__(self) -> None:
@@ -95,11 +108,12 @@ class EvolveConfig:
             if isinstance(value, list):
                 object.__setattr__(self, name, tuple(value))
         object.__setattr__(self, "options", _pairs("options", self.options))
-        frozen = tuple(
-            (name, plain_value(f"env_options: {name}", value))
-            for name, value in _pairs("env_options", self.env_options)
-        )
-        object.__setattr__(self, "env_options", frozen)
+        for name in ("env_options", "randomize"):
+            frozen = tuple(
+                (key, plain_value(f"{name}: {key}", value))
+                for key, value in _pairs(name, getattr(self, name))
+            )
+            object.__setattr__(self, name, frozen)
         self._check()
         for name in ("iso_sigma", "line_sigma"):
             object.__setattr__(self, name, float(getattr(self, name)))
@@ -111,6 +125,12 @@ class EvolveConfig:
         check_integer("seed", self.seed, 0, 2**32 - 1)
         check_integer("iterations", self.iterations, 0)
         check_integer("batch_size", self.batch_size, 1)
+        check_integer("starts", self.starts, 1)
+        if self.statistic not in STATISTICS:
+            raise ConfigError(message("statistic", self.statistic, listed(STATISTICS)))
+        checks.instance(
+            "new_starts", self.new_starts, bool, "True, False", error=ConfigError
+        )
         check_integer("reevaluations", self.reevaluations, 0)
         check_integer("episode_length", self.episode_length, 1)
         check_integers("hidden", self.hidden)

@@ -16,6 +16,7 @@ from newton_qd.wrappers.maze import MazeWrapper
 from newton_qd.wrappers.no_forward_reward import NoForwardRewardWrapper
 from newton_qd.wrappers.offset_reward import OffsetRewardWrapper
 from newton_qd.wrappers.qd import QDWrapper
+from newton_qd.wrappers.random_params import RandomParamsWrapper
 from newton_qd.wrappers.state_descriptor_reset import StateDescriptorResetWrapper
 from newton_qd.wrappers.trap import TrapWrapper
 from newton_qd.wrappers.vector import VectorWrapper
@@ -36,6 +37,7 @@ __all__ = [
     "NoForwardRewardWrapper",
     "OffsetRewardWrapper",
     "QDWrapper",
+    "RandomParamsWrapper",
     "StateDescriptorResetWrapper",
     "TrapWrapper",
     "VectorWrapper",

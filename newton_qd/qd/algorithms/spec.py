@@ -25,8 +25,9 @@ class EmitterContext:
         config: Settings.
         task: Environment and descriptor.
         policy: Policy whose weights are the genotypes.
-        score: Scoring function of genotypes (N, size) and a key. The key has no effect:
-            all evaluations of a run begin in the same state.
+        score: Scoring function of genotypes (N, size) and a key. The key has no effect
+            unless each generation has new start states: all evaluations of a run begin
+            in the same states.
         reset_key: Key of the reset to this state.
         centroids: (cells, D) centres of the cells.
     """

@@ -32,7 +32,7 @@ from newton_qd.qd.run.tensorboard import EventLog
 from newton_qd.qd.run.warm_start import StartFrom, digest_of, start_genotypes
 from newton_qd.qd.scoring.rollout import make_policy
 from newton_qd.qd.scoring.sharding import device_mesh, device_named
-from newton_qd.qd.scoring.task import Task, make_task
+from newton_qd.qd.scoring.task import Task, make_task, randomized
 
 
 @dataclasses.dataclass(frozen=True)
@@ -131,6 +131,9 @@ def evolve(
         task = task_factory(config)
         config = config.resolve(task.descriptor_length)
         config, start = _started(config, start_from, task, folder)
+        if folder is not None and folder.has_config:
+            folder.compare(config)  # before the slow part
+        task = randomized(config, task)
         search = Search(config, task, mesh)
         display = Progress(config.env_name, config.iterations, enabled=progress)
         stack.callback(display.close)

@@ -170,6 +170,26 @@ class RunFolder:
         except DAMAGE as error:
             raise CheckpointError(f"{path} is damaged: {error}") from error
 
+    def compare(self, config: EvolveConfig) -> tuple[EvolveConfig, dict[str, object]]:
+        """Checks that settings are those of the run here, or have more generations.
+
+        Returns:
+            The settings of the run, and the facts of the machine that began it.
+
+        Raises:
+            ConfigError: A setting differs from the run's.
+        """
+        stored, facts = read_config(self.path / CONFIG)
+        for name, old, new in stored.differences(config):
+            longer = name == "iterations" and config.iterations > stored.iterations
+            if longer:
+                continue
+            old = f"{old!r} or more" if name == "iterations" else repr(old)
+            allowed = f"{old}, as the run in {self.path} has; or start a new run in "
+            allowed += "another folder"
+            raise ConfigError(message(name, new, allowed))
+        return stored, facts
+
     def restore(
         self, config: EvolveConfig, facts: dict[str, object]
     ) -> tuple[Checkpoint | None, list[str]]:
@@ -188,15 +208,7 @@ class RunFolder:
             ConfigError: A setting differs from the run's.
             CheckpointError: The checkpoint is damaged or belongs to another run.
         """
-        stored, old_facts = read_config(self.path / CONFIG)
-        for name, old, new in stored.differences(config):
-            longer = name == "iterations" and config.iterations > stored.iterations
-            if longer:
-                continue
-            old = f"{old!r} or more" if name == "iterations" else repr(old)
-            allowed = f"{old}, as the run in {self.path} has; or start a new run in "
-            allowed += "another folder"
-            raise ConfigError(message(name, new, allowed))
+        stored, old_facts = self.compare(config)
         warnings = []
         for name, old, new in changed_facts(old_facts, facts):
             if name == "x64":

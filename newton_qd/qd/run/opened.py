@@ -33,13 +33,13 @@ from newton_qd.qd.run.folder import (
 from newton_qd.qd.run.plot import grid_indices
 from newton_qd.qd.run.reevaluation import Reevaluated
 from newton_qd.qd.run.search import start_key
+from newton_qd.qd.scoring.robust import run_scoring
 from newton_qd.qd.scoring.rollout import (
     Policy,
     episode_of,
     make_policy,
-    make_scoring_function,
 )
-from newton_qd.qd.scoring.task import Task, make_task
+from newton_qd.qd.scoring.task import Task, make_task, randomized
 from newton_qd.types import Repertoire, RNGKey
 
 if TYPE_CHECKING:
@@ -264,8 +264,7 @@ class Run:
     @functools.cached_property
     def _score(self) -> Callable[[jax.Array, jax.Array], tuple]:
         """The scoring function of the loop, compiled: genotypes and their keys."""
-        length = self.config.episode_length
-        score = jax.jit(make_scoring_function(self.task, self.policy, length))
+        score = jax.jit(run_scoring(self.config, self.task, self.policy))
         return lambda genotypes, _: score(genotypes, self.start_key)[:2]
 
     @functools.cached_property
@@ -343,7 +342,7 @@ def load_run(
     config, facts = read_config(path / CONFIG)
     algorithm_named(config.algorithm)
     archive, metrics = read_results(path)
-    task = task_factory(config)
+    task = randomized(config, task_factory(config))
     config = config.resolve(task.descriptor_length)
     policy = make_policy(task.env, config.hidden)
     if archive.genotypes.shape[1] != policy.size:

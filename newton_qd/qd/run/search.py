@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -22,6 +23,7 @@ from newton_qd.qd.run.checkpoint import Checkpoint, CheckpointError
 from newton_qd.qd.run.folder import COLUMNS
 from newton_qd.qd.run.generation import Generation
 from newton_qd.qd.run.reevaluation import Reevaluated, reevaluate
+from newton_qd.qd.scoring.robust import robust_scoring, run_scoring
 from newton_qd.qd.scoring.rollout import (
     episode_of,
     make_policy,
@@ -105,7 +107,7 @@ class Search:
                     config,
                     task,
                     self._policy,
-                    lambda genotypes, _: score(genotypes, self._key_reset),
+                    lambda genotypes, key: score(genotypes, self._own_start(key)),
                     self._key_reset,
                     self._centroids,
                 ),
@@ -145,17 +147,18 @@ class Search:
         iteration = state.iteration + 1
         if iteration == 0:
             genotypes, repertoire, evaluations, rejected = self._settled(state)
-            scores = self._score(genotypes, self._key_reset)
+            evaluations *= self._config.starts
+            scores = self._score(genotypes, self._start(0))
             repertoire, emitter, metrics = self._begin(repertoire, genotypes, scores)
             metrics["rejected"] += rejected
         else:
             key = jax.random.fold_in(self._key_generations, iteration)
             genotypes, remembered = self._ask(state.repertoire, state.emitter, key)
-            scores = self._score(genotypes, self._key_reset)
+            scores = self._score(genotypes, self._start(iteration))
             repertoire, emitter, metrics = self._tell(
                 state.repertoire, state.emitter, genotypes, remembered, scores
             )
-            each = self._algorithm.evaluations(self._config, self.options)
+            each = self._episodes
             before = state.metrics[-1][COLUMNS.index("evaluations")]
             evaluations = int(before) + each
         row = {
@@ -190,12 +193,34 @@ class Search:
         for begin in range(size, len(start), size):
             rows = np.minimum(np.arange(begin, begin + size), len(start) - 1)
             some = jnp.asarray(start[rows])
-            scores = self._score(some, self._key_reset)
+            scores = self._score(some, self._start(0))
             repertoire = self._enter(repertoire, some, scores)
             rejected += int((~np.isfinite(scores[0])[: len(start) - begin]).sum())
         best = start[:size]
         population = population.at[: len(best)].set(jnp.asarray(best))
         return population, repertoire, max(size, len(start)), rejected
+
+    def _start(self, iteration: int) -> jax.Array:
+        """Returns the key of the start states of a generation."""
+        if not self._config.new_starts:
+            return self._key_reset
+        # the first of these keys is that of the re-evaluations
+        return jax.random.fold_in(self._key_reset, iteration + 2)
+
+    def _own_start(self, key: jax.Array) -> jax.Array:
+        """Returns the key of the start states of an emitter's own evaluations."""
+        return key if self._config.new_starts else self._key_reset
+
+    @functools.cached_property
+    def _episodes(self) -> int:
+        """Episodes of one generation."""
+        spec = self._algorithm
+        episodes = spec.evaluations(self._config, self.options)
+        alone = 0
+        if spec.gradients is not None and spec.scoring is None:
+            # gradients of an emitter follow one episode
+            alone = spec.gradients(self._config, self.options)
+        return (episodes - alone) * self._config.starts + alone
 
     def _emptiness(self, genotypes: jax.Array) -> str:
         """Returns the text of the error about genotypes that no archive takes."""
@@ -304,21 +329,24 @@ class Search:
     def _scoring(self) -> ScoringFunction:
         """Returns the scoring function of the loop, split over the mesh."""
         if self._algorithm.scoring is None:
-            return self._plain_scoring(self._algorithm.transitions)
-        return self._split(
-            self._algorithm.scoring(
-                self._config, self.options, self._task, self._policy
+            return self._split(
+                run_scoring(
+                    self._config,
+                    self._task,
+                    self._policy,
+                    transitions=self._algorithm.transitions,
+                )
             )
+        score = self._algorithm.scoring(
+            self._config, self.options, self._task, self._policy
         )
+        starts, statistic = self._config.starts, self._config.statistic
+        return self._split(robust_scoring(score, starts=starts, statistic=statistic))
 
-    def _plain_scoring(self, transitions: bool = False) -> ScoringFunction:
-        """Returns a scoring function without gradients, split over the mesh."""
+    def _plain_scoring(self) -> ScoringFunction:
+        """Returns a scoring function of one start state, split over the mesh."""
         length = self._config.episode_length
-        return self._split(
-            make_scoring_function(
-                self._task, self._policy, length, transitions=transitions
-            )
-        )
+        return self._split(make_scoring_function(self._task, self._policy, length))
 
     def _split(self, score: ScoringFunction) -> ScoringFunction:
         return score if self._mesh is None else shard_scoring(score, self._mesh)

@@ -93,6 +93,23 @@ def make_task(config: EvolveConfig) -> Task:
     )
 
 
+def randomized(config: EvolveConfig, task: Task) -> Task:
+    """Returns the task of a run, with random physical parameters if it wants them.
+
+    Raises:
+        ConfigError: A setting does not fit the environment.
+    """
+    if not config.randomize:
+        return task
+    from newton_qd.wrappers import RandomParamsWrapper
+
+    try:
+        env = RandomParamsWrapper(task.env, **dict(config.randomize))
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"randomize: {error}") from error
+    return dataclasses.replace(task, env=env)
+
+
 def _environment(config: EvolveConfig) -> Any:
     """Creates the environment of a configuration.
 

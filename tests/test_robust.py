@@ -1,0 +1,210 @@
+"""Evaluations from several start states, and in worlds with random parameters."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from point_runs import SMALL, compile_once, interrupt_after, point_task, run
+
+import newton_qd
+from newton_qd.qd import (
+    EvolveConfig,
+    load_run,
+    make_policy,
+    make_scoring_function,
+    robust_scoring,
+)
+from newton_qd.qd.config import ConfigError
+from newton_qd.qd.run.search import Search
+from newton_qd.wrappers import RandomParamsWrapper
+
+__all__ = ["compile_once"]  # fixtures
+
+# QDax and what it imports warn about their own use of other packages.
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
+
+KEY = jax.random.key(3)
+
+
+def some_scores(genotypes: jax.Array, key: jax.Array) -> Any:
+    """Scores with known gradients (N, 2, 1 + 2), transitions, and a fault."""
+    shift = jax.random.normal(key, (3,), jnp.float32)
+    rows = jnp.sin(genotypes[:, :1] * (1 + shift) + genotypes[:, 1:])
+    gradients = jax.vmap(
+        jax.jacrev(lambda x: jnp.sin(x[0] * (1 + shift) + x[1])), 0, 0
+    )(genotypes)
+    faulty = (genotypes[:, 0] > 5) & (shift[1] > 0)
+    return (
+        jnp.where(faulty, -jnp.inf, rows[:, 0]),
+        rows[:, 1:],
+        {
+            "gradients": jnp.moveaxis(gradients, 1, -1),
+            "normalized_grads": jnp.zeros_like(jnp.moveaxis(gradients, 1, -1)),
+            "faulty": faulty,
+            "overflowed": jnp.zeros(rows.shape, bool),
+            "transitions": {"obs": rows[:, None] + jnp.arange(2.0)[:, None]},
+        },
+    )
+
+
+@pytest.mark.parametrize("starts", [2, 3, 4, 5])
+@pytest.mark.parametrize("statistic", ["mean", "median"])
+def test_results_are_joined(starts: int, statistic: str) -> None:
+    genotypes = jnp.asarray([[0.3, 0.1], [1.2, -0.7], [9.0, 0.0]], jnp.float32)
+    score = jax.jit(robust_scoring(some_scores, starts=starts, statistic=statistic))
+    fitness, found, extra = score(genotypes, KEY)
+    each = [some_scores(genotypes, key) for key in jax.random.split(KEY, starts)]
+    rows = np.stack([np.column_stack([f, d]) for f, d, _ in each])
+    function = np.mean if statistic == "mean" else np.median
+    bad = np.isneginf(rows[..., 0]).any(axis=0)
+    assert bad.tolist() == [False, False, True] == extra["faulty"].tolist()
+    expected = function(rows[:, :2], axis=0)
+    assert np.allclose(fitness[:2], expected[:, 0], atol=1e-6)
+    assert np.isneginf(fitness[2])
+    assert np.allclose(found[:2], expected[:, 1:], atol=1e-6)
+    steps = extra["transitions"]["obs"]
+    assert steps.shape == (3, 2 * starts, 3)
+    assert np.array_equal(steps[:, 2:4], each[1][2]["transitions"]["obs"])
+    # the gradient is that of the mean or median, by central differences
+    for axis in range(2):
+        moved = genotypes.at[:, axis].add(1e-2), genotypes.at[:, axis].add(-1e-2)
+        (up, above, _), (down, below, _) = (score(x, KEY) for x in moved)
+        slopes = np.column_stack([up - down, above - below])[:2] / 2e-2
+        assert np.allclose(extra["gradients"][:2, axis], slopes, atol=2e-3)
+    unit = np.linalg.norm(extra["normalized_grads"][:2], axis=1)
+    assert np.allclose(unit, 1, atol=1e-5)
+    assert not np.any(extra["gradients"][2])
+
+
+def test_what_cannot_be_joined() -> None:
+    assert robust_scoring(some_scores, starts=1) is some_scores
+    with pytest.raises(ValueError, match="starts: got 0"):
+        robust_scoring(some_scores, starts=0)
+    with pytest.raises(
+        ValueError, match="statistic: got 'mode'; allowed: mean, median"
+    ):
+        robust_scoring(some_scores, starts=2, statistic="mode")
+    with pytest.raises(TypeError, match="score: got 3; allowed: a function of genoty"):
+        robust_scoring(3, starts=2)  # type: ignore[arg-type]
+    odd = robust_scoring(lambda g, k: (g[:, 0], g, {"colour": g}), starts=2)
+    with pytest.raises(ValueError, match="extra scores: got 'colour'; allowed: trans"):
+        odd(jnp.zeros((2, 2)), KEY)
+    for changes, text in (
+        ({"starts": 0}, "starts: got 0"),
+        ({"statistic": "mode"}, "statistic: got 'mode'; allowed: mean, median"),
+        ({"new_starts": 1}, "new_starts: got 1; allowed: True, False"),
+    ):
+        with pytest.raises(ConfigError, match=text):
+            SMALL.replace(**changes)
+    with pytest.raises(ConfigError, match="randomize: env: got <point_runs"):
+        run(SMALL.replace(randomize={"friction": (1, 2)}))
+
+
+def test_a_run_from_several_starts(tmp_path: Path) -> None:
+    config = SMALL.replace(starts=3, iterations=2)
+    result = run(config, out=tmp_path / "run")
+    assert result.metrics["evaluations"].tolist() == [48, 96, 144]
+    assert result.metrics["env_steps"][-1] == 144 * config.episode_length
+    opened = load_run(tmp_path / "run", task_factory=point_task)
+    again = opened.evaluate()
+    filled = result.archive.filled
+    assert np.array_equal(again.fitnesses, result.archive.fitnesses[filled])
+    assert np.array_equal(again.descriptors, result.archive.descriptors[filled])
+    alone = opened.evaluate(keys=jax.random.split(opened.start_key, 3))
+    mean = alone.fitnesses.mean(axis=1)
+    assert np.allclose(mean, again.fitnesses, rtol=1e-5)
+
+
+@pytest.mark.usefixtures("sigint")
+def test_new_starts_in_each_generation(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = SMALL.replace(new_starts=True, iterations=4)
+    search = Search(config, point_task(config))
+    keys = [search._start(i) for i in (0, 1, 2)]
+    assert len({str(jax.random.key_data(key)) for key in keys}) == 3
+    fixed = Search(SMALL, point_task(SMALL))
+    assert fixed._start(0) is fixed._start(7)
+    whole = run(config)
+    with monkeypatch.context() as patch:
+        interrupt_after(patch, 2)
+        run(config, out=tmp_path / "run")
+    parts = run(config, out=tmp_path / "run", resume=True)
+    assert np.array_equal(whole.archive.genotypes, parts.archive.genotypes)
+
+
+# --- physics ---------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_worlds_with_random_parameters() -> None:
+    env = newton_qd.create("hopper_uni", episode_length=5)
+    wrapped = RandomParamsWrapper(env, friction=(0.5, 1.5), mass_scale=(0.8, 1.2))
+    states = jax.jit(jax.vmap(wrapped.reset))(jax.random.split(KEY, 16))
+    params = states.info["params"]
+    assert np.ptp(params.friction) > 0.3 and 0.5 <= params.friction.min() <= 1.0
+    assert np.ptp(params.mass_scale) > 0.2
+    assert np.all(params.gravity == env.default_params.gravity)
+    actions = jnp.full((16, 3), 0.5, jnp.float32)
+    step = jax.jit(jax.vmap(wrapped.step))
+    moved = step(states, actions)
+    expected = jax.jit(jax.vmap(env.step))(states, actions, params)
+    assert np.array_equal(moved.obs, expected.obs)
+    for _ in range(6):  # beyond the end of the episode
+        moved = step(moved, actions)
+    assert np.array_equal(moved.info["params"].friction, params.friction)
+    with pytest.raises(TypeError, match="colour"):
+        RandomParamsWrapper(env, colour=(1, 2))
+    with pytest.raises(ValueError, match="friction: got"):
+        RandomParamsWrapper(env, friction=(2, 1))
+
+
+@pytest.mark.slow
+def test_a_run_in_random_worlds_repeats_bitwise(tmp_path: Path) -> None:
+    config = EvolveConfig(
+        env_name="hopper_uni",
+        iterations=1,
+        batch_size=16,
+        episode_length=5,
+        hidden=(4,),
+        starts=2,
+        reevaluations=2,
+        randomize={"friction": (0.5, 1.5)},  # type: ignore[arg-type]
+    )
+    from newton_qd.qd import evolve
+
+    result = evolve(config, out=tmp_path / "run", progress=False)
+    again = load_run(tmp_path / "run").evaluate()
+    filled = result.archive.filled
+    assert np.array_equal(again.fitnesses, result.archive.fitnesses[filled])
+
+
+@pytest.mark.slow
+def test_map_elites_low_spread_of_qdax() -> None:
+    from qdax.core.mels import MELS
+
+    from newton_qd.qd.algorithms.variation import isoline_emitter
+
+    task = point_task(SMALL)
+    policy = make_policy(task.env, (4,))
+    score = make_scoring_function(task, policy, 9)
+    axis = (jnp.arange(4) + 0.5) / 4
+    centroids = jnp.stack(jnp.meshgrid(axis, axis), -1).reshape(-1, 2)
+    mels = MELS(
+        scoring_function=score,
+        emitter=isoline_emitter(SMALL, 16),
+        metrics_function=lambda repertoire: {"best": repertoire.fitnesses.max()},
+        num_samples=4,
+    )
+    genotypes = jax.vmap(policy.init)(jax.random.split(KEY, 16))
+    repertoire, state, _ = mels.init(genotypes, centroids, KEY)
+    for key in jax.random.split(KEY, 3):
+        repertoire, state, metrics = mels.update(repertoire, state, key)
+    assert np.isfinite(metrics["best"])
+    filled = np.isfinite(np.asarray(repertoire.fitnesses).reshape(-1))
+    assert np.all(np.isfinite(np.asarray(repertoire.spreads).reshape(-1)[filled]))
