@@ -213,6 +213,20 @@ def text(
         raise error(message(name, value, f"{_none(optional)}text that is not empty"))
 
 
+def identifier(
+    name: str, value: object, *, optional: bool = False, error: Error = ValueError
+) -> None:
+    """Checks that a value is a name as Python's variables have, so never a path.
+
+    Raises:
+        ValueError: The value is not text, is empty, or has other characters.
+    """
+    text(name, value, optional=optional, error=error)
+    if isinstance(value, str) and not value.isidentifier():
+        allowed = "letters, digits and _, not beginning with a digit"
+        raise error(message(name, value, allowed))
+
+
 def choice(name: str, value: object, allowed: Collection[str]) -> None:
     """Checks that a value is one of several names.
 

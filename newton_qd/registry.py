@@ -11,7 +11,7 @@ import jax
 
 from newton_qd import brax_views as brax
 from newton_qd import checks, tasks
-from newton_qd.checks import Fact, listed, message
+from newton_qd.checks import Fact, listed, message, shown
 from newton_qd.envs.base import Env
 from newton_qd.envs.methods import check_methods, random_key
 from newton_qd.errors import UnknownEnvironment
@@ -67,8 +67,9 @@ def register(
     """Adds an environment to the names that ``create`` knows.
 
     Args:
-        env_name: A new name.
-        base: Class or function that makes the environment without wrappers.
+        env_name: A new name: letters, digits and ``_``, not beginning with a digit.
+        base: Class of environments, or function that makes one, without wrappers. A
+            function is called once, if it needs no other arguments than ``options``.
         base_name: Name that the wrappers receive; ``None``: ``env_name``.
         wrappers: Wrappers, from the inside to the outside.
         descriptor: Wrapper that writes the state descriptor, outside of ``wrappers``:
@@ -82,12 +83,14 @@ def register(
         **options: Keyword arguments of ``base``. ``create`` may replace them.
 
     Raises:
-        TypeError: An argument has the wrong type, or ``base`` does not take an option.
-        ValueError: The name is in use, a name is not text or is empty, or
-            ``reward_offset`` is not finite.
+        TypeError: An argument has the wrong type, or ``base`` does not take an option
+            or makes no environment.
+        ValueError: The name is in use, a name is not text, is empty or has characters
+            that are not allowed, or ``reward_offset`` is not finite.
     """
     _check_names(env_name, base_name)
     checks.function("base", base, "a class or a function")
+    _check_class(base)
     allowed = "a function of (data, mask)"
     checks.function(
         "descriptor_extractor", descriptor_extractor, allowed, optional=True
@@ -105,6 +108,7 @@ def register(
         options = {"robot": robot, **options}
     if options:
         _require_keywords(env_name, base, options)
+    _check_made(base, options)
     tasks.ENVIRONMENTS[env_name] = EnvironmentSpec(
         functools.partial(base, **options) if options else base,
         env_name if base_name is None else base_name,
@@ -119,14 +123,50 @@ def _check_names(env_name: object, base_name: object) -> None:
     """Checks the names of ``register``.
 
     Raises:
-        ValueError: A name is not text, is empty, or is in use.
+        ValueError: A name is not text, is empty, is in use, or has characters that are
+            not allowed.
     """
-    checks.text("env_name", env_name)
+    # A results folder has the name of the environment, so it must not be a path.
+    checks.identifier("env_name", env_name)
     if env_name in tasks.ENVIRONMENTS:
         allowed = f"any name but {listed(registered_envs())}"
         raise ValueError(message("env_name", env_name, allowed, why="which is taken"))
     # Every table reads every spec, so one wrong spec would break all tables.
-    checks.text("base_name", base_name, optional=True)
+    checks.identifier("base_name", base_name, optional=True)
+
+
+_ENVIRONMENT = "a subclass of newton_qd's Env, or a function that makes an environment"
+
+
+def _check_class(base: Callable[..., Env]) -> None:
+    """Checks that a class is one of environments.
+
+    Raises:
+        TypeError: It is not.
+    """
+    kind: object = base
+    while isinstance(kind, functools.partial):
+        kind = kind.func
+    if isinstance(kind, type) and not issubclass(kind, Env):
+        raise TypeError(message("base", base, _ENVIRONMENT))
+
+
+def _check_made(base: Callable[..., Env], options: Mapping[str, Any]) -> None:
+    """Checks that a function makes an environment, if it needs no other arguments.
+
+    Raises:
+        TypeError: It does not.
+    """
+    if isinstance(base, type):
+        return
+    try:
+        inspect.signature(base).bind(**options)
+    except TypeError:  # arguments are missing, which ``create`` may give
+        return
+    made = base(**options)
+    if not isinstance(made, Env):
+        why = f"which makes {shown(made)}"
+        raise TypeError(message("base", base, _ENVIRONMENT, why=why))
 
 
 def _descriptor_specs(
@@ -283,6 +323,9 @@ def _base(
         allowed = "a newton_qd.robots.RobotSpec, as robot=... of register or of create"
         raise TypeError(message("robot", None, allowed, why=why))
     env = spec.base(**options)
+    if not isinstance(env, Env):
+        why = f"which {env_name!r} makes"
+        raise TypeError(message("base", env, _ENVIRONMENT, why=why))
     check_methods(env)
     return env if material is None else env.with_material(material)
 

@@ -76,6 +76,27 @@ def test_default_folder_and_resume(
     assert {entry.name: entry.read_bytes() for entry in out.iterdir()} == before
 
 
+def test_files_of_others_are_never_a_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "cat.png").touch()
+    monkeypatch.chdir(tmp_path / "photos")
+    for more in ([], ["--resume"]):
+        assert call(*POINT, "--out", ".", *more) == cli.BAD_ARGUMENTS
+        error = capsys.readouterr().err
+        assert "which is not empty and has no config.json" in error
+        assert "allowed: an empty or another folder" in error
+        assert "add --resume" not in error
+    path = tmp_path / "evil.toml"
+    path.write_text('env_name = "../../evil"\n', encoding="utf-8")
+    for given in (["--config", path], ["../../evil"]):
+        assert call("evolve", *given, "--quiet") == cli.BAD_ARGUMENTS
+        assert "env_name: got '../../evil'; allowed: letters" in capsys.readouterr().err
+    found = sorted(path.name for path in tmp_path.rglob("*"))
+    assert found == ["cat.png", "evil.toml", "photos"]
+
+
 @pytest.mark.slow
 def test_resume_starts_a_run_that_was_killed_too_early(tmp_path: Path) -> None:
     out = tmp_path / "run"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import importlib
 import pickle
 import tomllib
@@ -346,6 +347,34 @@ def test_register_refuses_before_it_stores(
         newton_qd.register("mine", Ant, **options)
     assert "mine" not in newton_qd.registered_envs()
     assert "ant" in list(newton_qd.tables.FEET_NAMES)
+
+
+@pytest.mark.parametrize("name", ["../../evil", "a/b", "a b", "1st", "a-b", ".", "a\n"])
+def test_a_name_is_never_a_path(name: str, rows: None) -> None:
+    for names in ({"env_name": name}, {"env_name": "mine", "base_name": name}):
+        wrong = list(names)[-1]
+        with pytest.raises(
+            ValueError, match=f"^{wrong}: got .*; allowed: .*letters, d"
+        ):
+            newton_qd.register(base=Ant, **names)  # pyright: ignore
+    assert "mine" not in newton_qd.registered_envs()
+
+
+def test_a_base_makes_an_environment(rows: None) -> None:
+    allowed = "allowed: a subclass of newton_qd's Env, or a function that makes an env"
+    for base in (int, functools.partial(dict, a=1)):
+        with pytest.raises(TypeError, match=f"^base: got .*{allowed}"):
+            newton_qd.register("mine", base)  # pyright: ignore
+    with pytest.raises(TypeError, match=f"^base: got .*, which makes 3; {allowed}"):
+        newton_qd.register("mine", lambda **k: 3)  # pyright: ignore
+    assert "mine" not in newton_qd.registered_envs()
+    newton_qd.register("later", lambda size: size)  # needs an argument of create
+    with pytest.raises(
+        TypeError, match=f"^base: got 3, which 'later' makes; {allowed}"
+    ):
+        newton_qd.create("later", size=3)
+    newton_qd.register("maze", lambda **options: PointMaze(**options))
+    assert isinstance(newton_qd.create("maze").unwrapped, PointMaze)
 
 
 def test_register_takes_numbers_of_numpy(rows: None) -> None:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from newton_qd import checks
 from newton_qd.checks import message
 from newton_qd.cli import modules
 from newton_qd.cli.arguments import Commands, integers, warn_of_changes, widths
@@ -252,6 +253,8 @@ def settle(arguments: argparse.Namespace) -> tuple[EvolveConfig, Path]:
         named = (base or _DEFAULTS).replace(**given)
         if base is None and "env_name" not in given:
             raise ConfigError(_UNNAMED)
+        # the name becomes a folder, so it must not be a path
+        checks.identifier("env_name", named.env_name, error=ConfigError)
         out = Path("results") / f"{named.env_name}-seed{named.seed}"
     folder = RunFolder(out)
     folder.check(resume=arguments.resume)

@@ -92,14 +92,17 @@ class RunFolder:
             raise self._refused("which is a file", "a folder")
         if not self._occupied():
             return
+        if not self.has_config:
+            why = f"which is not empty and has no {CONFIG}"
+            allowed = "an empty or another folder"
+            if resume:
+                allowed += ", or a folder that holds a run to resume"
+            raise self._refused(why, allowed)
         if not resume:
             allowed = (
                 "an empty or another folder; add --resume to continue the run in it"
             )
             raise self._refused("which is not empty", allowed)
-        if not self.has_config:
-            why = f"which has no {CONFIG}"
-            raise self._refused(why, "a folder that holds a run to resume")
 
     def _refused(self, why: str, allowed: str) -> ConfigError:
         return ConfigError(message("out", Fact(self.path), allowed, why=why))
