@@ -27,7 +27,11 @@ REQUIREMENTS = sorted(
     }
 )
 # Distributions that are not named as what they install.
-DISTRIBUTIONS = {"warp": "warp-lang"}
+DISTRIBUTIONS = {
+    "PIL": "pillow",
+    "imageio_ffmpeg": "imageio-ffmpeg",
+    "warp": "warp-lang",
+}
 FOLDERS = ("newton_qd", "tests", "benchmarks", "examples", "docs")
 
 
@@ -82,7 +86,7 @@ def test_every_import_is_declared(folder: str) -> None:
 
 
 def test_the_package_needs_no_extra_of_developers() -> None:
-    names = declared("qd", "ribs", "tensorboard", "viz")
+    names = declared("qd", "ribs", "tensorboard", "viz", "video")
     missing = {
         f"{path}: {root}"
         for path, root in imported(ROOT / "newton_qd")

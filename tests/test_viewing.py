@@ -19,10 +19,11 @@ import newton_qd
 from newton_qd import cli
 from newton_qd.assets import find_urdf
 from newton_qd.physics.model import build_system
+from newton_qd.physics.reference import body_frames as reference_frames
 from newton_qd.robots import ROBOTS
 from newton_qd.scenes import SCENES
-from newton_qd.viewing import drawing_of, html, joined, record, replay_html
-from newton_qd.viewing.drawing import drawing_of_system
+from newton_qd.viewing import drawing_of, html, joined, record, render, replay_html
+from newton_qd.viewing.drawing import body_frames, drawing_of_system
 from newton_qd.viewing.trajectory import Trajectory
 
 __all__ = ["compile_once", "reference"]  # fixtures
@@ -202,3 +203,44 @@ def test_wrong_arguments_of_replay(capsys: pytest.CaptureFixture[str]) -> None:
     assert "--cell: got 3; allowed: a results folder" in capsys.readouterr().err
     assert cli.main(["replay", "ant", "--best", "0"]) == 2
     assert "--best: got 0; allowed: None, or integers" in capsys.readouterr().err
+
+
+def test_frames_of_bodies_are_those_of_the_reference() -> None:
+    rng = np.random.default_rng(0)
+    for name in ("ant", "walker2d", "pusher"):
+        system = build_system(ROBOTS[name], "float32")
+        drawing = drawing_of_system(system)
+        q = system.rest_q + rng.uniform(-1, 1, (2, 3, system.nq))
+        found = body_frames(drawing, q)
+        assert np.allclose(found[1, 2], reference_frames(system, q[1, 2]))
+
+
+@pytest.mark.slow
+def test_pictures(walk: Trajectory, tmp_path: Path) -> None:
+    from PIL import Image
+
+    seen: list[tuple[int, int]] = []
+    size: Any = {"width": 64, "height": 48}
+    path = render(walk, tmp_path / "two.png", **size, time=0.1)
+    with Image.open(path) as image:
+        picture = np.asarray(image.convert("RGB"), int)
+    assert picture.shape == (48, 128, 3)  # a sheet of two worlds
+    brown = picture[..., 0] > picture[..., 2] + 40
+    rows, columns = np.nonzero(brown[:, :64])
+    # the robot is in the middle of its picture
+    assert 0.02 < brown.mean() < 0.5 and abs(columns.mean() - 32) < 8
+    assert abs(rows.mean() - 24) < 10
+    one = walk.world(0)
+    path = render(one, tmp_path / "one.gif", **size, progress=lambda *a: seen.append(a))
+    with Image.open(path) as image:
+        assert getattr(image, "n_frames", 1) == 6 and image.info["duration"] == 50
+    assert seen == [(k, 6) for k in range(1, 7)]
+    path = render(one, tmp_path / "one.mp4", **size)
+    assert path.read_bytes()[4:8] == b"ftyp"
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        "one.gif",
+        "one.mp4",
+        "two.png",
+    ]
+    with pytest.raises(ValueError, match=r"path: got .*; allowed: files with .png"):
+        render(one, tmp_path / "one.webm")

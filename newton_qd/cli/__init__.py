@@ -76,7 +76,14 @@ def _run(
     """
     try:
         import_modules(arguments.modules)
-        if arguments.command in ("evolve", "eval", "plot", "replay"):
+        if arguments.command in (
+            "evolve",
+            "eval",
+            "plot",
+            "replay",
+            "render",
+            "explore",
+        ):
             return arguments.run(arguments, task_factory)
         return arguments.run(arguments)
     except UnknownEnvironment as error:

@@ -1,4 +1,4 @@
-"""``newton-qd replay``: pages that show what a run has found."""
+"""``newton-qd replay`` and ``render``: pages and pictures of what a run has found."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 from newton_qd import checks
 from newton_qd.checks import Fact, message
 from newton_qd.cli import modules
-from newton_qd.cli.arguments import BAD_ARGUMENTS, OK, Commands, complain
+from newton_qd.cli.arguments import BAD_ARGUMENTS, OK, Commands, complain, integers
+from newton_qd.cli.progress import Progress
 from newton_qd.cli.runs import numbers, opened
 from newton_qd.qd.config import ConfigError, EvolveConfig
 
@@ -42,6 +43,60 @@ def add_parsers(commands: Commands) -> None:
         help="HTML file (default: replay.html in the results folder, or ENV.html)",
     )
     parser.set_defaults(run=replay)
+
+    parser = commands.add_parser(
+        "render",
+        help="write a picture, a GIF or a video of elites, without a screen",
+        description="Writes a picture, a GIF or a video of elites of a results folder, "
+        "or of an environment with random actions. Several worlds make a sheet.",
+    )
+    _add_choice(parser)
+    modules.add_argument(parser)
+    kinds = parser.add_mutually_exclusive_group()
+    for kind, text in (
+        ("png", "a picture of the middle of the episode, or of --time"),
+        ("gif", "a moving picture (default)"),
+        ("mp4", "a video; needs the extra video"),
+    ):
+        kinds.add_argument(f"--{kind}", action="store_true", help=text)
+    parser.add_argument(
+        "--out",
+        type=Path,
+        metavar="FILE",
+        help="file; its ending may choose the kind (default: elites.gif in the results "
+        "folder, or ENV.gif)",
+    )
+    parser.add_argument(
+        "--size",
+        type=_size,
+        default=(480, 360),
+        metavar="WxH",
+        help="size of the picture of one world [px] (default: 480x360)",
+    )
+    parser.add_argument(
+        "--time", type=float, metavar="S", help="moment of a picture [s]"
+    )
+    parser.add_argument(
+        "--rate",
+        type=float,
+        default=20.0,
+        metavar="N",
+        help="pictures per second (default: 20)",
+    )
+    parser.set_defaults(run=render)
+
+
+def _size(text: str) -> tuple[int, int]:
+    """Parses a width and a height.
+
+    Raises:
+        argparse.ArgumentTypeError: The text is not two integers from 16 to 4096.
+    """
+    size = integers(text, "x")
+    if len(size) != 2 or not all(16 <= each <= 4096 for each in size):
+        given = f"got {text!r}; allowed: two integers from 16 to 4096, like 480x360"
+        raise argparse.ArgumentTypeError(given)
+    return size[0], size[1]
 
 
 def _add_choice(parser: argparse.ArgumentParser) -> None:
@@ -100,6 +155,38 @@ def replay(arguments: argparse.Namespace, task_factory: TaskFactory = None) -> i
 
     write_replay(trajectory, out, title)
     print(f"written: {out}\nopen it in a browser: {out.absolute().as_uri()}")
+    return OK
+
+
+def render(arguments: argparse.Namespace, task_factory: TaskFactory = None) -> int:
+    """Writes a picture, a GIF or a video. Returns the exit code.
+
+    Raises:
+        ConfigError: An argument is not allowed, or the archive cannot be read.
+        MissingExtra: Pillow or imageio-ffmpeg is not installed.
+        UnknownEnvironment: There is neither a folder nor an environment of this name.
+    """
+    checks.number("--time", arguments.time, least=0, optional=True, error=ConfigError)
+    checks.number("--rate", arguments.rate, above=0, error=ConfigError)
+    chosen = [kind for kind in ("png", "gif", "mp4") if getattr(arguments, kind)]
+    ending = f".{chosen[0]}" if chosen else ".gif"
+    out = _target(arguments, f"elites{ending}", ending)
+    from newton_qd.viewing import render as write
+    from newton_qd.viewing.video import FORMATS, require
+
+    if out.suffix not in FORMATS or (chosen and out.suffix != ending):
+        allowed = f"files that end with {ending if chosen else ', '.join(FORMATS)}"
+        raise ConfigError(message("--out", str(out), allowed))
+    require(out.suffix)  # before the slow part
+    try:
+        trajectory, _ = _trajectory(arguments, task_factory)
+    except (LookupError, ValueError) as error:
+        return complain(arguments, error, BAD_ARGUMENTS)
+    width, height = arguments.size
+    options = {"width": width, "height": height, "rate": arguments.rate}
+    with Progress("pictures") as progress:
+        write(trajectory, out, time=arguments.time, progress=progress, **options)
+    print(f"written: {out}")
     return OK
 
 

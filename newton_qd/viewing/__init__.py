@@ -4,10 +4,11 @@
 - ``record_elites(run, cells)``: the same for elites of ``newton_qd.qd.load_run(DIR)``
 - ``write_replay(trajectory, path)``: one HTML file that shows it, without a network
 - ``show(trajectory)``: the same in a notebook
+- ``render(trajectory, path)``: a picture, a GIF or a video, without a screen
 - ``joined([...])``: trajectories of one robot as one, to see them together
 
 Importing this package imports no other module of it. Each name is loaded when it is
-first used. Pages need no extra.
+first used. Pages need no extra, pictures and GIFs need ``viz``, videos ``video``.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from newton_qd.viewing.recording import Recorder, record
     from newton_qd.viewing.replay import replay_html, show, write_replay
     from newton_qd.viewing.trajectory import Contacts, Trajectory, joined
+    from newton_qd.viewing.video import render
 
 __all__ = [
     "Contacts",
@@ -33,6 +35,7 @@ __all__ = [
     "joined",
     "record",
     "record_elites",
+    "render",
     "replay_html",
     "show",
     "write_replay",
@@ -49,6 +52,7 @@ _HOME = {
     "joined": "trajectory",
     "record": "recording",
     "record_elites": "elites",
+    "render": "video",
     "replay_html": "replay",
     "show": "replay",
     "write_replay": "replay",

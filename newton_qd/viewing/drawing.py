@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 _POINT, _WALL, _GOAL = (0.2, 0.4, 0.8), (0.55, 0.58, 0.62), (0.2, 0.65, 0.3)
 _POINT_RADIUS = 0.02  # of the point of a maze, which has no size of its own
+_SMALL = 0.6  # largest radius of a robot on a fine grid [m]
 _IDENTITY = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
 
 
@@ -112,6 +113,56 @@ class Drawing:
     radius: float
     follow: bool
     rest_q: np.ndarray
+
+    @property
+    def grid(self) -> float:
+        """Distance of the lines on the ground [m]."""
+        return 1.0 if self.radius > _SMALL else 0.1
+
+
+def body_frames(drawing: Drawing, q: np.ndarray) -> np.ndarray:
+    """Returns the world frames of the bodies.
+
+    Args:
+        drawing: The kinematic tree.
+        q: (..., nq) coordinates [m or rad].
+
+    Returns:
+        (..., nb, 7) positions [m] and quaternions xyzw.
+    """
+    q = np.asarray(q, np.float64)
+    shape = q.shape[:-1]
+    frames = np.empty((*shape, len(drawing.parent), 7))
+    for body, parent in enumerate(drawing.parent):
+        start, axis = drawing.q_start[body], drawing.joint_axis[body]
+        motion = np.zeros((*shape, 7))
+        motion[..., 6] = 1.0
+        kind = drawing.joint_kind[body]
+        if kind == JointKind.FREE:
+            motion[:] = q[..., start : start + 7]
+            motion[..., 3:] /= np.linalg.norm(motion[..., 3:], axis=-1, keepdims=True)
+        elif kind == JointKind.REVOLUTE:
+            half = q[..., start, None] / 2
+            motion[..., 3:6], motion[..., 6:] = np.sin(half) * axis, np.cos(half)
+        else:
+            motion[..., :3] = q[..., start, None] * axis
+        frame = composed(drawing.parent_frame[body], motion)
+        if parent >= 0:
+            frame = composed(frames[..., parent, :], frame)
+        back = reference.inverse(drawing.child_frame[body])
+        frames[..., body, :] = composed(frame, back)
+    return frames
+
+
+def composed(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Returns frames ``b`` (..., 7), given in frames ``a`` (..., 7), in their frame."""
+    axis, w = a[..., 3:6], a[..., 6:]
+    other, v = b[..., 3:6], b[..., 6:]
+    turned = 2.0 * np.cross(axis, b[..., :3])
+    position = a[..., :3] + b[..., :3] + w * turned + np.cross(axis, turned)
+    vector = w * other + v * axis + np.cross(axis, other)
+    scalar = w * v - (axis * other).sum(axis=-1, keepdims=True)
+    return np.concatenate([position, vector, scalar], axis=-1)
 
 
 def can_draw(env: object) -> bool:

@@ -155,6 +155,7 @@ def drawing_data(drawing: Drawing) -> dict[str, Any]:
         "centre": drawing.centre.tolist(),
         "radius": drawing.radius,
         "follow": drawing.follow,
+        "grid": drawing.grid,
     }
 
 

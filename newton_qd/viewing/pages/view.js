@@ -124,7 +124,7 @@
   // so lines have no depth of their own and fade where they are finer than a pixel.
   View.ground = function () {
     const r = this.drawing.radius, far = 300 * r;
-    this.step = r > 0.6 ? 1 : 0.1; // [m]
+    this.step = this.drawing.grid;
     this.grid = {
       gridStep: { value: this.step },
       gridMinor: { value: new THREE.Color() },

@@ -1,0 +1,148 @@
+"""Writes pictures, GIFs and videos."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from newton_qd import checks
+from newton_qd.checks import listed, message
+from newton_qd.files import temporary_name
+from newton_qd.qd.extras import require_extra
+from newton_qd.viewing.camera import pictures, times
+from newton_qd.viewing.trajectory import Trajectory
+
+FORMATS = (".png", ".gif", ".mp4")
+_RATE = 20.0  # pictures per second of a GIF or video
+_COLORS = 64  # of a GIF
+
+
+def require(ending: str) -> None:
+    """Checks that the package that writes files with an ending is installed.
+
+    Args:
+        ending: One of ``FORMATS``.
+
+    Raises:
+        MissingExtra: It is not installed.
+    """
+    if ending == ".mp4":
+        require_extra("imageio_ffmpeg", "video")
+    else:
+        require_extra("PIL", "viz")
+
+
+def render(
+    trajectory: Trajectory,
+    path: str | os.PathLike[str],
+    *,
+    width: int = 640,
+    height: int = 480,
+    time: float | None = None,
+    rate: float = _RATE,
+    progress: Callable[[int, int], None] | None = None,
+) -> Path:
+    """Renders a trajectory to a file, without a screen. Several worlds make a sheet.
+
+    Args:
+        trajectory: The trajectory.
+        path: A file that ends with ``.png``, ``.gif`` or ``.mp4``.
+        width: Width of the picture of one world [px].
+        height: Height of the picture of one world [px].
+        time: Moment of a picture [s]; ``None``: the middle.
+        rate: Pictures per second of a GIF or a video [1/s].
+        progress: Called after each picture with its number from 1 and their count.
+
+    Returns:
+        The path of the file.
+
+    Raises:
+        ValueError: The path has another ending, or a number is not allowed.
+        MissingExtra: Pillow (for ``.png`` and ``.gif``) or imageio-ffmpeg (for
+            ``.mp4``) is not installed.
+        OSError: The file cannot be written.
+    """
+    target = Path(path)
+    ending = target.suffix.lower()
+    if ending not in FORMATS:
+        raise ValueError(message("path", str(path), f"files with {listed(FORMATS)}"))
+    checks.number("rate", rate, above=0)
+    checks.number("time", time, least=0, optional=True)
+    require(ending)
+    last = int(trajectory.lengths.max())
+    if ending == ".png":
+        middle = last // 2 if time is None else round(time / trajectory.dt)
+        frames = np.array([min(middle, last)])
+    else:
+        frames = times(trajectory, rate)
+    found = pictures(trajectory, frames, width=width, height=height, progress=progress)
+    temporary = temporary_name(target)
+    try:
+        if ending == ".mp4":
+            _write_video(found, temporary, rate)
+        else:
+            _write_images(found, temporary, rate, ending)
+        os.replace(temporary, target)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return target
+
+
+def _write_images(
+    found: Iterable[np.ndarray], path: Path, rate: float, ending: str
+) -> None:
+    """Writes a picture, or a GIF."""
+    from PIL import Image
+
+    images = [Image.fromarray(image) for image in found]
+    if ending == ".png":
+        images[0].save(path, format="PNG", optimize=True)
+        return
+    # one palette for all pictures: without dithering, still parts do not change
+    middle = images[len(images) // 2].quantize(_COLORS)
+    small = [
+        image.quantize(palette=middle, dither=Image.Dither.NONE) for image in images
+    ]
+    small[0].save(
+        path,
+        format="GIF",
+        save_all=True,
+        append_images=small[1:],
+        duration=round(1000 / rate),
+        loop=0,
+        optimize=True,
+    )
+
+
+def _write_video(found: Iterable[np.ndarray], path: Path, rate: float) -> None:
+    """Writes a video in H.264."""
+    import imageio_ffmpeg
+
+    write: Any = imageio_ffmpeg.write_frames  # takes fractions, too
+    writer = None
+    try:
+        for image in found:
+            height, width = (size - size % 2 for size in image.shape[:2])
+            if writer is None:
+                writer = write(
+                    path,
+                    (width, height),
+                    fps=rate,
+                    macro_block_size=2,
+                    quality=7,
+                    output_params=["-f", "mp4"],
+                    ffmpeg_log_level="error",
+                )
+                with warnings.catch_warnings():
+                    # the forked process starts another program at once
+                    warnings.filterwarnings("ignore", r"os.fork\(\) was called")
+                    writer.send(None)
+            writer.send(np.ascontiguousarray(image[:height, :width]).tobytes())
+    finally:
+        if writer is not None:
+            writer.close()
