@@ -101,6 +101,13 @@ def test_both_bounds_are_stated(requirement: str) -> None:
     assert both or "==" in requirement
 
 
+@pytest.mark.parametrize("extra", ["cuda12", "cuda13"])
+def test_extras_for_gpus_have_the_bounds_of_the_core(extra: str) -> None:
+    (core,) = [one for one in PROJECT["dependencies"] if distribution(one) == "jax"]
+    assert EXTRAS[extra] == [core.replace("jax", f"jax[{extra}]")]
+    assert not any("cuda" in one for one in EXTRAS["all"])
+
+
 def test_qdax_is_a_release_that_compat_accepts() -> None:
     (requirement,) = [one for one in REQUIREMENTS if distribution(one) == "qdax"]
     assert requirement == f"qdax=={SUPPORTED[-1]}" and len(SUPPORTED) == 1

@@ -43,9 +43,9 @@ class RandomParamsWrapper(Wrapper):
             ValueError: The environment has no physical parameters, or a range is wrong.
         """
         del env_name
-        jax.eval_shape(lambda: randomize_params(jax.random.key(0), env, **ranges))
         super().__init__(env)
         self.ranges = dict(ranges)
+        jax.eval_shape(lambda: self._drawn(jax.random.key(0)))
 
     def reset(self, rng: RNGKey) -> State:
         """Begins an episode in a world with new parameters.
@@ -54,8 +54,7 @@ class RandomParamsWrapper(Wrapper):
             ValueError: The environment is float64 and JAX x64 is off.
         """
         state = self.env.reset(rng)
-        ranges: dict[str, Any] = self.ranges
-        drawn = randomize_params(jax.random.fold_in(rng, _OWN_KEY), self.env, **ranges)
+        drawn = self._drawn(jax.random.fold_in(rng, _OWN_KEY))
         return state.replace(info={**state.info, "params": drawn})
 
     def step(self, state: State, action: Action, params: Params = None) -> State:
@@ -69,3 +68,8 @@ class RandomParamsWrapper(Wrapper):
         require_state(state, "params")
         own = state.info["params"]
         return self.env.step(state, action, own if params is None else params)
+
+    def _drawn(self, key: RNGKey) -> Params:
+        """Draws the parameters of a world, or of the worlds of a batch."""
+        ranges: dict[str, Any] = self.ranges
+        return randomize_params(key, self.env, **ranges)
