@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from typing import Protocol, Self
 
 import jax
 import jax.numpy as jnp
 
+from newton_qd.checks import Fact, listed, message
 from newton_qd.types import Descriptor, Mask, Observation, PyTree, StateDescriptors
 
 
@@ -90,6 +91,36 @@ def get_mean_state_descriptor(data: StateDescriptors, mask: Mask) -> Descriptor:
         (n, nd) means.
     """
     return get_feet_contact_proportion(data, mask)
+
+
+_READS = {
+    get_final_xy_position: "xy_position",
+    get_feet_contact_proportion: "feet_contact",
+}
+"""Name of the state descriptor that an extractor of this module is for."""
+
+
+def check_extractor(env: object, extractor: object) -> None:
+    """Checks that an extractor of this module fits the environment's state descriptor.
+
+    Extractors of others, and state descriptors of others, may be combined freely.
+
+    Args:
+        env: The environment.
+        extractor: Computes descriptors of episodes; ``None``: nothing does.
+
+    Raises:
+        ValueError: It reads another state descriptor than the environment writes.
+    """
+    reads = _READS.get(extractor) if isinstance(extractor, Hashable) else None  # type: ignore[call-overload]
+    writes = getattr(env, "state_descriptor_name", None)
+    if reads is None or writes == reads or writes not in _READS.values():
+        return
+    fitting = [one.__name__ for one, name in _READS.items() if name == writes]
+    why = f"which reads {reads}, and the environment writes {writes}"
+    allowed = listed([*fitting, get_mean_state_descriptor.__name__, "your own"])
+    given = Fact(getattr(extractor, "__name__", repr(extractor)))
+    raise ValueError(message("descriptor_extractor", given, allowed, why=why))
 
 
 class Encoder(Protocol):

@@ -10,13 +10,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import newton_qd
+import newton_qd.gradients
 from newton_qd import physics
+from newton_qd.compat.env_creators import create_brax_scoring_fn
 from newton_qd.extractors import (
     AuroraExtraInfo,
     AuroraExtraInfoNormalization,
+    check_extractor,
     get_aurora_encoding,
     get_feet_contact_proportion,
     get_final_xy_position,
+    get_mean_state_descriptor,
 )
 
 
@@ -35,6 +40,38 @@ class Linear:
     def apply(self, variables: Any, *args: Any, method: Any) -> jax.Array:
         assert method == self.encode
         return (args[0].mean(axis=1) @ variables["params"])[:, None, :]
+
+
+class Written:
+    """An environment that writes a state descriptor."""
+
+    def __init__(self, name: str) -> None:
+        self.state_descriptor_name = name
+
+
+def test_extractors_know_what_they_need() -> None:
+    """The last contact of two feet, [1, 1], was taken for a position."""
+    position, contact = get_final_xy_position, get_feet_contact_proportion
+    text = "descriptor_extractor: got get_final_xy_position, which reads xy_position, "
+    text += "and the environment writes feet_contact; allowed: get_feet_contact_propor"
+    with pytest.raises(ValueError, match=text):
+        check_extractor(Written("feet_contact"), position)
+    with pytest.raises(ValueError, match="allowed: get_final_xy_position, get_mean_st"):
+        check_extractor(Written("xy_position"), contact)
+    check_extractor(Written("feet_contact"), contact)
+    for extractor in (position, contact, get_mean_state_descriptor, None, [].append):
+        check_extractor(Written("ArmAngles"), extractor)
+        check_extractor(object(), extractor)
+    check_extractor(Written("feet_contact"), get_mean_state_descriptor)
+
+
+def test_an_episode_checks_its_extractor() -> None:
+    env = newton_qd.create("walker2d_uni")
+    extractor = newton_qd.tables.descriptor_extractor["ant_omni"]
+    with pytest.raises(ValueError, match="the environment writes feet_contact"):
+        newton_qd.gradients.Episode(env, None, extractor, episode_length=2)
+    with pytest.raises(ValueError, match="the environment writes feet_contact"):
+        create_brax_scoring_fn(env, None, extractor, jax.random.key(0))  # pyright: ignore
 
 
 OBSERVATIONS = jax.random.normal(jax.random.key(0), (5, 7, 3), np.float32)

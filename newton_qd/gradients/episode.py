@@ -15,7 +15,7 @@ import numpy as np
 from newton_qd import checks
 from newton_qd.checks import Fact, message
 from newton_qd.envs.state import select
-from newton_qd.extractors import Trajectories
+from newton_qd.extractors import Trajectories, check_extractor
 from newton_qd.gradients.exact import EpisodeGradient, EpisodeGradients, differentiate
 from newton_qd.gradients.flow import EXACT, GradientOptions, passed_back, scan_keeping
 from newton_qd.gradients.mixed import (
@@ -100,7 +100,8 @@ class Episode:
 
     Raises:
         TypeError: An argument has the wrong type.
-        ValueError: ``episode_length`` is not an integer from 1.
+        ValueError: ``episode_length`` is not an integer from 1, or the extractor is for
+            another state descriptor than that of the environment.
     """
 
     env: Environment
@@ -123,6 +124,7 @@ class Episode:
         ):
             optional = name != "unravel"
             checks.function(name, getattr(self, name), needed, optional=optional)
+        check_extractor(self.env, self.descriptor_extractor)
         checks.instance("options", self.options, GradientOptions, "GradientOptions")
         checks.flag("transitions", self.transitions)
 
