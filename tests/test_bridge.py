@@ -216,6 +216,8 @@ def test_no_forward_mode(transform: Any) -> None:
     message = r"can't apply forward-mode autodiff \(jvp\) to a custom_vjp function"
     with pytest.raises(TypeError, match=message):
         transform(lambda a: advance(a).sum())(jnp.asarray(ACTIONS[0, 0]))
+    with pytest.raises(TypeError, match=r"use jax.grad, jax.vjp or jax.jacrev instead"):
+        jax.jit(transform(lambda a: advance(a).sum()))(jnp.asarray(ACTIONS[0, 0]))
 
 
 def test_no_second_derivative() -> None:

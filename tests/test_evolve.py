@@ -241,6 +241,32 @@ def test_equal_individuals_of_a_cell_do_not_compete() -> None:
     np.testing.assert_array_equal(kept, [1.0, 1.0, -np.inf, 2.0])
 
 
+def test_what_cannot_be_settings_is_named() -> None:
+    with pytest.raises(ConfigError, match="config: got 'point'; allowed: an Evolve"):
+        evolve("point")  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize(
+    "sizes", [{"batch_size": 2_000_000_000}, {"hidden": (1_000_000, 1_000_000)}]
+)
+def test_sizes_that_cannot_fit_are_refused(sizes: dict[str, Any]) -> None:
+    """Before anything allocates, with the memory that they need."""
+    wanted = (
+        r"batch_size, hidden, cells: got \(.*, which needs at least [\d.,]+ [GT]B; "
+    )
+    with pytest.raises(ConfigError, match=f"{wanted}allowed: sizes that fit in the"):
+        run(SMALL.replace(**sizes))
+
+
+@pytest.mark.parametrize("count", [0, 2])
+def test_elites_are_put_to_a_new_test_only_if_they_are(
+    count: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = SMALL.replace(iterations=1, reevaluations=count)
+    evolve(config, task_factory=point_task)
+    assert ("evaluating the elites again" in capsys.readouterr().err) == bool(count)
+
+
 def test_quiet_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     run()
     captured = capsys.readouterr()

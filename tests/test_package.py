@@ -32,6 +32,7 @@ LAYERS = (
     "checks",
     "errors",
     "files",
+    "memory",
     "moved",
     "types",
     "assets",

@@ -212,6 +212,18 @@ def test_what_cannot_be_converted(monkeypatch: pytest.MonkeyPatch) -> None:
         TypeError, match=r"solution_dim: got \(2, 3\); allowed: integer"
     ):
         from_ribs(matrices)
+    broken = GridArchive(solution_dim=2, dims=(4, 4), ranges=ranges)
+    broken.add(np.zeros((1, 2)), np.zeros(1), np.zeros((1, 2)))
+    nothing = from_ribs(broken)
+    damaged = nothing.replace(fitnesses=nothing.fitnesses.at[3].set(np.nan))
+    with pytest.raises(ValueError, match="fitnesses: got NaN in 1 of 16 cells; allow"):
+        to_ribs(damaged, LIMITS, (4, 4))
+    read = broken.data(["solution", "objective", "measures", "index"])
+    monkeypatch.setattr(
+        broken, "data", lambda names: {**read, "objective": np.full(1, np.nan)}
+    )
+    with pytest.raises(ValueError, match="objectives of archive: got NaN in 1 of 1"):
+        from_ribs(broken)
     monkeypatch.setitem(sys.modules, "ribs", None)
     with pytest.raises(MissingExtra, match=r"newton_qd\[ribs\]"):
         to_ribs(None, LIMITS)

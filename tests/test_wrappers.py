@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import newton_qd
+from newton_qd import memory
 from newton_qd.envs.ant import Ant
 from newton_qd.envs.base import Env
 from newton_qd.envs.state import State
@@ -118,6 +119,23 @@ def test_wrapper_forwards_everything() -> None:
     assert pickle.loads(pickle.dumps(env)).env.env.dt == 0.5
 
 
+class Broken(Wrapper):
+    """A property of it has a spelling mistake."""
+
+    @property
+    def colour(self) -> str:
+        return self._paint.name
+
+
+def test_an_error_inside_a_property_names_its_cause() -> None:
+    for env in (Broken(Line()), Wrapper(Broken(Line()))):
+        with pytest.raises(AttributeError) as caught:
+            env.colour  # noqa: B018
+        assert "inside of the property Broken.colour: " in str(caught.value)
+        assert "has no attribute '_paint'" in str(caught.value)
+        assert not hasattr(env, "colour")
+
+
 def test_params_reach_the_environment_through_every_wrapper() -> None:
     env = EpisodeWrapper(StateDescriptorResetWrapper(Wrapper(Line())), 9, 2)
     env = CompletedEvalWrapper(EvalWrapper(AutoResetWrapper(VectorWrapper(env, 2))))
@@ -177,6 +195,14 @@ def test_counts_must_be_positive_integers(value: int) -> None:
         EpisodeWrapper(Line(), 5, value)
     with pytest.raises(ValueError, match=r"batch_size: got .*integers from 1"):
         VectorWrapper(Line(), value)
+
+
+def test_worlds_that_cannot_fit_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "limit", lambda device: 10**10)
+    text = "batch_size: got 2000000000, which needs at least 56 GB; allowed: sizes that"
+    with pytest.raises(ValueError, match=f"{text} fit in the 10 GB of memory here"):
+        VectorWrapper(Line(), 2_000_000_000)
+    assert VectorWrapper(Line(), 200_000).batch_size == 200_000
 
 
 def test_vector_makes_worlds_and_steps_any_number() -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import abc
+import functools
+import inspect
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -130,7 +132,28 @@ class Env(abc.ABC):
             Raises:
                 AttributeError: Always. Python calls this for missing attributes only.
             """
+            raise_own_error(self, name)
             raise AttributeError(no_brax_view(self, name, ("sys",)))
+
+
+def raise_own_error(thing: object, name: str) -> None:
+    """Raises the AttributeError inside a property, which Python hides.
+
+    If a property raises AttributeError, Python calls ``__getattr__`` as if there were
+    no property.
+
+    Raises:
+        AttributeError: The class has a property of this name, and it raises one.
+    """
+    own = inspect.getattr_static(type(thing), name, None)
+    if not isinstance(own, property | functools.cached_property):
+        return
+    try:
+        own.__get__(thing, type(thing))
+    except AttributeError as error:
+        place = f"{type(thing).__name__}.{name}"
+        # without the original: its name would look like that of the property
+        raise AttributeError(f"inside of the property {place}: {error}") from error
 
 
 class QDEnv(Env):

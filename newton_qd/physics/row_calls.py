@@ -20,6 +20,7 @@ from newton_qd.physics.explicit_mesh import over_devices
 from newton_qd.physics.native import Plan
 from newton_qd.physics.native.library import library
 from newton_qd.physics.precision import SCALARS
+from newton_qd.physics.reverse_mode import reverse_mode_only
 from newton_qd.physics.warp_internals import ffi_callback
 
 interrupts.protect(ffi_callback())
@@ -168,4 +169,4 @@ def differentiable(
         return (call(f"{name}_backward")(x, y_bar, output_dims=size)[0],)
 
     run.defvjp(run_forward, run_backward)
-    return run
+    return lambda x: run(reverse_mode_only(x))

@@ -10,6 +10,7 @@ import numpy as np
 
 from newton_qd.checks import Fact, message
 from newton_qd.envs.base import Env
+from newton_qd.envs.env import raise_own_error
 from newton_qd.envs.state import State
 from newton_qd.robots import Material
 from newton_qd.scenes import Scene
@@ -114,7 +115,8 @@ class Wrapper(Env):
         """Forwards to the environment inside: ``batch_size``, descriptors, ``system``.
 
         Raises:
-            AttributeError: No environment inside has the attribute.
+            AttributeError: No environment inside has the attribute, or a property of
+                this wrapper raises one.
         """
         # Private names are not forwarded. While Python copies a wrapper, ``env`` does
         # not exist yet: reading it here would recurse without end.
@@ -122,4 +124,5 @@ class Wrapper(Env):
             raise AttributeError(
                 f"{type(self).__name__!r} object has no attribute {name!r}"
             )
+        raise_own_error(self, name)
         return getattr(self.env, name)

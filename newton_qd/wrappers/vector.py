@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import math
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from newton_qd import checks
+from newton_qd import checks, memory
 from newton_qd.checks import Fact, message
 from newton_qd.envs.base import Env
 from newton_qd.envs.state import State
 from newton_qd.types import Action, Params, RNGKey
 from newton_qd.wrappers.base import Wrapper
+
+_MANY = 100_000  # worlds; for fewer, the check is not worth the time to trace a reset
 
 
 class VectorWrapper(Wrapper):
@@ -29,8 +33,8 @@ class VectorWrapper(Wrapper):
             batch_size: Number of worlds of a reset.
 
         Raises:
-            ValueError: ``batch_size`` is not an integer above 0, or ``env`` has a batch
-                already.
+            ValueError: ``batch_size`` is not an integer above 0, the states of so many
+                worlds do not fit in memory, or ``env`` has a batch already.
         """
         checks.integer("batch_size", batch_size)
         inside = env
@@ -40,6 +44,9 @@ class VectorWrapper(Wrapper):
                 allowed = "environments of one world (jax.vmap nests batches)"
                 raise ValueError(message("env", given, allowed))
             inside = inside.env
+        if batch_size > _MANY:
+            needed, most = batch_size * state_bytes(env), memory.limit(jax.devices()[0])
+            memory.check("batch_size", batch_size, needed, most)
         super().__init__(env)
         self.batch_size = int(batch_size)
 
@@ -90,3 +97,10 @@ class VectorWrapper(Wrapper):
             lambda leaf: jnp.broadcast_to(leaf, size + jnp.shape(leaf)),
             self.env.default_params,
         )
+
+
+def state_bytes(env: Env) -> int:
+    """Returns the size of the state of one world [bytes]."""
+    state = jax.eval_shape(env.reset, jax.eval_shape(lambda: jax.random.key(0)))
+    leaves = jax.tree.leaves(state)
+    return sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in leaves)

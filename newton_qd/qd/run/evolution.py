@@ -28,6 +28,7 @@ from newton_qd.qd.run.plot import archive_png
 from newton_qd.qd.run.progress import Progress
 from newton_qd.qd.run.reevaluation import Reevaluated
 from newton_qd.qd.run.search import Search, SearchState
+from newton_qd.qd.run.sizes import check_memory
 from newton_qd.qd.run.tensorboard import EventLog
 from newton_qd.qd.run.warm_start import StartFrom, digest_of, start_genotypes
 from newton_qd.qd.scoring.rollout import make_policy
@@ -121,6 +122,8 @@ def evolve(
         SearchError: No individual of the initial population has finite scores.
     """
     begin = time.monotonic()
+    allowed = "an EvolveConfig, such as EvolveConfig(env_name='ant_uni')"
+    checks.instance("config", config, EvolveConfig, allowed, error=ConfigError)
     folder = _folder(out, resume, tensorboard)
     mesh = _mesh(devices, resume)
     chosen = _device(device, devices)
@@ -130,6 +133,7 @@ def evolve(
         stack.enter_context(jax.default_device(chosen))
         task = task_factory(config)
         config = config.resolve(task.descriptor_length)
+        check_memory(config, task, chosen)
         config, start = _started(config, start_from, task, folder)
         if folder is not None and folder.has_config:
             folder.compare(config)  # before the slow part
@@ -370,7 +374,8 @@ def _finished(
 ) -> EvolveResult:
     """Adds the metrics of re-evaluated elites, and writes the last files."""
     if not result.interrupted:
-        display.note("evaluating the elites again, for metrics without luck")
+        if result.config.reevaluations:
+            display.note("evaluating the elites again, for metrics without luck")
         again = search.reevaluate(result.archive, lambda: stop.requested)
         seconds = time.monotonic() - begin
         result = dataclasses.replace(result, reevaluated=again, seconds=seconds)

@@ -99,7 +99,8 @@ def to_ribs(
 
     Raises:
         MissingExtra: pyribs is not installed.
-        ValueError: ``grid`` does not have as many cells as the repertoire.
+        ValueError: ``grid`` does not have as many cells as the repertoire, or a fitness
+            is NaN.
     """
     require_extra("ribs", "ribs")
     from ribs.archives import CVTArchive, GridArchive
@@ -121,6 +122,7 @@ def to_ribs(
     else:
         archive = GridArchive(dims=grid, **common)
     objectives = np.asarray(repertoire.fitnesses).reshape(len(centroids))
+    _refuse_nan("repertoire.fitnesses", objectives)
     filled = np.isfinite(objectives)
     if filled.any():
         measures = np.asarray(repertoire.descriptors)[filled]
@@ -141,6 +143,7 @@ def from_ribs(archive: CVTArchive | GridArchive) -> MapElitesRepertoire:
     Raises:
         MissingExtra: QDax or pyribs is not installed.
         TypeError: The archive is another one, or its solutions are not vectors.
+        ValueError: An objective is NaN.
     """
     require_extra("qdax", "qd")
     require_extra("ribs", "ribs")
@@ -148,6 +151,7 @@ def from_ribs(archive: CVTArchive | GridArchive) -> MapElitesRepertoire:
 
     centroids = _centroids(archive)
     data = archive.data(["solution", "objective", "measures", "index"])
+    _refuse_nan("objectives of archive", np.asarray(data["objective"]))
     index = np.asarray(data["index"], np.int64)
     cells = len(centroids)
     genotypes = np.zeros((cells, cast("int", archive.solution_dim)), np.float32)
@@ -164,6 +168,18 @@ def from_ribs(archive: CVTArchive | GridArchive) -> MapElitesRepertoire:
         descriptors=jnp.asarray(descriptors),
         centroids=jnp.asarray(centroids, jnp.float32),
     )
+
+
+def _refuse_nan(name: str, values: np.ndarray) -> None:
+    """Refuses NaN: it is neither better nor worse than another number.
+
+    Raises:
+        ValueError: A value is NaN.
+    """
+    count = int(np.isnan(values).sum())
+    if count:
+        given = Fact(f"NaN in {count} of {values.size} cells")
+        raise ValueError(message(name, given, "numbers; -inf in empty cells"))
 
 
 def _centroids(archive: Any) -> np.ndarray:

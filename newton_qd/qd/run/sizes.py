@@ -1,0 +1,43 @@
+"""The memory that a run needs at least, from its settings."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import Any
+
+import jax
+
+from newton_qd import memory
+from newton_qd.qd.config import ConfigError, EvolveConfig
+from newton_qd.qd.scoring.task import Task
+from newton_qd.wrappers.vector import state_bytes
+
+_WEIGHT = 4  # bytes of a weight of a policy
+# Smaller batches are not worth the time to trace a reset.
+_LARGE = 10_000
+
+
+def check_memory(config: EvolveConfig, task: Task, device: Any) -> None:
+    """Checks that the population and the archive of a run can fit in memory.
+
+    Args:
+        config: Settings with a grid or a number of centroids.
+        task: Task of the run.
+        device: JAX device of the run; ``None``: JAX's default device.
+
+    Raises:
+        ConfigError: They cannot.
+    """
+    widths = (task.env.observation_size, *config.hidden, task.env.action_size)
+    layers = itertools.pairwise(widths)
+    policy = _WEIGHT * sum((before + 1) * after for before, after in layers)
+    cells = config.centroids or math.prod(config.grid or (1,))
+    # parents, their children, and the children that the archive compares
+    needed = (3 * config.batch_size + cells) * policy
+    if config.batch_size > _LARGE:
+        needed += config.batch_size * state_bytes(task.env)
+    where = jax.devices()[0] if device is None else device
+    given = (config.batch_size, config.hidden, cells)
+    name, most = "batch_size, hidden, cells", memory.limit(where)
+    memory.check(name, given, needed, most, ConfigError)
