@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 
 __all__ = ["BAD_ARGUMENTS", "FAILED", "INTERRUPTED", "OK", "main"]
 
+_WITH_TASKS = ("evolve", "eval", "plot", "replay", "explore", "render")
+"""Commands that make the task of a run."""
+
 
 def main(
     argv: Sequence[str] | None = None,
@@ -76,14 +79,7 @@ def _run(
     """
     try:
         import_modules(arguments.modules)
-        if arguments.command in (
-            "evolve",
-            "eval",
-            "plot",
-            "replay",
-            "render",
-            "explore",
-        ):
+        if arguments.command in _WITH_TASKS:
             return arguments.run(arguments, task_factory)
         return arguments.run(arguments)
     except UnknownEnvironment as error:

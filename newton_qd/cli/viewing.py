@@ -45,6 +45,39 @@ def add_parsers(commands: Commands) -> None:
     parser.set_defaults(run=replay)
 
     parser = commands.add_parser(
+        "explore",
+        help="write a page with the archive of a run: click a cell, watch its elite",
+        description="Writes one HTML file that opens in any browser, without a "
+        "network: the archive of a run, or of two runs of the same robot. A click on a "
+        "cell shows its elite moving.",
+    )
+    parser.add_argument(
+        "folders",
+        type=Path,
+        nargs="+",
+        metavar="DIR",
+        help="one or two results folders",
+    )
+    modules.add_argument(parser)
+    parser.add_argument(
+        "--out",
+        type=Path,
+        metavar="FILE",
+        help="HTML file (default: explorer.html in the first folder)",
+    )
+    parser.add_argument(
+        "--starts",
+        type=int,
+        default=0,
+        metavar="N",
+        help="also evaluate each elite from N other start states (default: 0)",
+    )
+    parser.add_argument(
+        "--seed", type=int, default=0, metavar="N", help="seed of --starts (default: 0)"
+    )
+    parser.set_defaults(run=explore)
+
+    parser = commands.add_parser(
         "render",
         help="write a picture, a GIF or a video of elites, without a screen",
         description="Writes a picture, a GIF or a video of elites of a results folder, "
@@ -158,6 +191,33 @@ def replay(arguments: argparse.Namespace, task_factory: TaskFactory = None) -> i
     return OK
 
 
+def explore(arguments: argparse.Namespace, task_factory: TaskFactory = None) -> int:
+    """Writes an explorer page. Returns the exit code.
+
+    Raises:
+        ConfigError: An argument is not allowed, or an archive cannot be read.
+    """
+    checks.integer("--starts", arguments.starts, least=0, error=ConfigError)
+    checks.integer("--seed", arguments.seed, least=0, error=ConfigError)
+    if len(arguments.folders) > 2:
+        given = Fact(f"{len(arguments.folders)} folders")
+        raise ConfigError(message("DIR", given, "one folder or two"))
+    out = arguments.out
+    if out is None:
+        out = arguments.folders[0] / "explorer.html"
+    runs = [_drawable(folder, task_factory) for folder in arguments.folders]
+    from newton_qd.viewing import write_explorer
+
+    options = {"starts": arguments.starts, "seed": arguments.seed}
+    try:
+        with Progress("elites") as progress:
+            write_explorer(runs, out, progress=progress, **options)
+    except ValueError as error:
+        return complain(arguments, error, BAD_ARGUMENTS)
+    print(f"written: {out}\nopen it in a browser: {out.absolute().as_uri()}")
+    return OK
+
+
 def render(arguments: argparse.Namespace, task_factory: TaskFactory = None) -> int:
     """Writes a picture, a GIF or a video. Returns the exit code.
 
@@ -222,12 +282,9 @@ def _trajectory(
     )
     if not Path(arguments.what).is_dir():
         return _random_trajectory(arguments), f"{arguments.what}, random actions"
-    from newton_qd.viewing import can_draw, record_elites
+    from newton_qd.viewing import record_elites
 
-    run = opened(Path(arguments.what), task_factory)
-    if not can_draw(run.task.env):
-        given = Fact(type(run.task.env).__name__)
-        raise ConfigError(message("env", given, "simulated robots, and pointmaze"))
+    run = _drawable(Path(arguments.what), task_factory)
     return (
         record_elites(
             run,
@@ -237,6 +294,21 @@ def _trajectory(
         ),
         f"{run.config.env_name}, {run.path}",
     )
+
+
+def _drawable(folder: Path, task_factory: TaskFactory) -> Run:
+    """Opens a run whose environment can be drawn.
+
+    Raises:
+        ConfigError: It cannot be drawn, or the folder holds no run.
+    """
+    from newton_qd.viewing import can_draw
+
+    run = opened(folder, task_factory)
+    if not can_draw(run.task.env):
+        given = Fact(type(run.task.env).__name__)
+        raise ConfigError(message("env", given, "simulated robots, and pointmaze"))
+    return run
 
 
 def _cells(run: Run, arguments: argparse.Namespace) -> list[int]:

@@ -4,6 +4,8 @@
 - ``record_elites(run, cells)``: the same for elites of ``newton_qd.qd.load_run(DIR)``
 - ``write_replay(trajectory, path)``: one HTML file that shows it, without a network
 - ``show(trajectory)``: the same in a notebook
+- ``write_explorer([run], path)``: one HTML file with the archive of a run; a click on a
+  cell shows its elite
 - ``render(trajectory, path)``: a picture, a GIF or a video, without a screen
 - ``joined([...])``: trajectories of one robot as one, to see them together
 
@@ -19,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from newton_qd.viewing.drawing import Drawing, DrawnShape, can_draw, drawing_of
     from newton_qd.viewing.elites import record_elites
+    from newton_qd.viewing.explorer import explorer_html, write_explorer
     from newton_qd.viewing.recording import Recorder, record
     from newton_qd.viewing.replay import replay_html, show, write_replay
     from newton_qd.viewing.trajectory import Contacts, Trajectory, joined
@@ -32,12 +35,14 @@ __all__ = [
     "Trajectory",
     "can_draw",
     "drawing_of",
+    "explorer_html",
     "joined",
     "record",
     "record_elites",
     "render",
     "replay_html",
     "show",
+    "write_explorer",
     "write_replay",
 ]
 
@@ -49,12 +54,14 @@ _HOME = {
     "Trajectory": "trajectory",
     "can_draw": "drawing",
     "drawing_of": "drawing",
+    "explorer_html": "explorer",
     "joined": "trajectory",
     "record": "recording",
     "record_elites": "elites",
     "render": "video",
     "replay_html": "replay",
     "show": "replay",
+    "write_explorer": "explorer",
     "write_replay": "replay",
 }
 

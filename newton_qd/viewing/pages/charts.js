@@ -89,18 +89,22 @@
   NQD.Player.prototype.feetChart = function (w, nf, length, total) {
     const made = surface(this.charts, "feet on the ground", HEIGHT.feet * nf);
     const names = this.view.drawing.feet;
-    const frames = this.data.feet.shape[1];
+    const frames = this.data.feet.shape[1], most = this.data.feet_most || 1;
     for (let f = 0; f < nf; f++) {
       const color = NQD.palette[f % NQD.palette.length];
       let touched = 0;
       made.pen.fillStyle = color;
       for (let k = 1; k <= length; k++) {
-        if (!this.data.feet.data[(w * frames + k) * nf + f]) continue;
-        touched++;
+        // a frame may stand for several steps
+        const share = this.data.feet.data[(w * frames + k) * nf + f] / most;
+        if (!share) continue;
+        touched += share;
+        made.pen.globalAlpha = share;
         const x = (k - 1) / total * made.width;
         made.pen.fillRect(
           x, f * HEIGHT.feet + 1, Math.max(1, made.width / total), HEIGHT.feet - 2);
       }
+      made.pen.globalAlpha = 1;
       key(made.names, names[f] + " " + Math.round(100 * touched / Math.max(1, length))
         + " %", color);
     }

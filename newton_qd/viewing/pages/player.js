@@ -100,10 +100,10 @@
     if (key === " ") {
       if (!this.playing && this.time >= this.duration()) this.time = 0;
       this.playing = !this.playing;
-    } else if (key === "ArrowRight" || key === "ArrowLeft") {
+    } else if (["ArrowRight", "ArrowLeft", ".", ","].includes(key)) {
+      const step = key === "ArrowRight" || key === "." ? 1 : -1;
       this.playing = false;
-      this.seek((Math.round(this.time / this.dt) + (key === "ArrowRight" ? 1 : -1))
-        * this.dt);
+      this.seek((Math.round(this.time / this.dt) + step) * this.dt);
     } else if (key === "Home") this.seek(0);
     else if (key === "End") this.seek(this.duration());
     else if (key === "h") {

@@ -1,0 +1,189 @@
+"""The explorer in a browser: maps of all kinds, and the elites of their cells."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from browser import Pages, chrome, pages
+
+import newton_qd
+from newton_qd import cli
+from newton_qd.qd import EvolveConfig, Policy, Task
+from newton_qd.qd.run.archive import Archive
+from newton_qd.qd.run.folder import COLUMNS
+from newton_qd.qd.run.opened import Run
+from newton_qd.qd.run.reevaluation import Reevaluated
+from newton_qd.viewing import record, write_explorer
+from newton_qd.viewing.explorer import explorer_html
+
+__all__ = ["chrome", "pages"]  # fixtures
+
+STEPS = 8
+HOSTILE = "</script><script>window.hacked=1</script>\u202e"
+
+
+def opened(
+    name: str, dimensions: int, grid: tuple[int, ...] | None, seed: int = 0
+) -> Run:
+    """A run of the point maze without an evolution: its policies are one action."""
+    env: Any = newton_qd.create("pointmaze", episode_length=STEPS, auto_reset=False)
+    rng = np.random.default_rng(seed)
+    limits = np.zeros(dimensions), np.ones(dimensions)
+    if grid is None:
+        centroids = rng.uniform(0, 1, (40, dimensions))
+    else:
+        axes = [(np.arange(count) + 0.5) / count for count in grid]
+        centroids = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
+        centroids = centroids.reshape(-1, dimensions)
+    cells = len(centroids)
+    fitnesses = np.where(
+        rng.uniform(size=cells) < 0.7, rng.uniform(size=cells), -np.inf
+    )
+    fitnesses[:2] = 0.5, -np.inf
+    filled = np.isfinite(fitnesses)
+    archive = Archive(
+        genotypes=rng.uniform(-1, 1, (cells, 2)).astype(np.float32),
+        fitnesses=fitnesses.astype(np.float32),
+        descriptors=np.where(filled[:, None], centroids, 0).astype(np.float32),
+        centroids=centroids.astype(np.float32),
+    )
+    policy = Policy(
+        size=2,
+        init=lambda key: jax.random.normal(key, (2,)),
+        unravel=lambda weights: weights,
+        apply=lambda weights, observation: weights + 0 * observation,
+        ravel=lambda weights: weights,
+        network=None,
+    )
+    task = Task(
+        env=env,
+        descriptor_extractor=lambda data, mask: data.state_desc[:, -1],
+        limits=limits,
+        labels=tuple(f"{name} {k}" for k in range(dimensions)),
+        reward_offset=0.0,
+    )
+    config = EvolveConfig(
+        env_name="pointmaze",
+        episode_length=STEPS,
+        hidden=(),
+        grid=grid,
+        centroids=None if grid else cells,
+    )
+    return Run(
+        path=Path(f"{name} {seed}"),
+        config=config,
+        facts={},
+        task=task,
+        policy=policy,
+        archive=archive,
+        metrics={column: np.arange(4.0) for column in COLUMNS},
+        reevaluated=Reevaluated(4, 1.0, 2.0, 3.0),
+        start_key=jax.random.key(0),
+    )
+
+
+def last(page: Any, world: int = 0) -> np.ndarray:
+    """Last position of the point that a world of the player shows."""
+    code = f"""(() => {{
+        const d = NQD.player.data, w = {world};
+        const at = 2 * (d.q.shape[1] * w + d.lengths[w]);
+        return Array.from(d.q.data.slice(at, at + 2));
+    }})()"""
+    return np.array(page.evaluate(code))
+
+
+def expected(run: Run, cell: int) -> np.ndarray:
+    action = jnp.asarray(run.archive.genotypes[cell])
+    found = record(run.task.env, jnp.tile(action, (STEPS, 1)), run.start_key)
+    return found.q[0, STEPS]
+
+
+@pytest.mark.slow
+@pytest.mark.browser
+@pytest.mark.parametrize("kind", ["grid", "nested", "cells", "lines"])
+def test_a_click_shows_the_elite(kind: str, pages: Pages, tmp_path: Path) -> None:
+    dimensions, grid = {
+        "grid": (2, (5, 4)),
+        "nested": (4, (3, 2, 3, 2)),
+        "cells": (2, None),
+        "lines": (5, None),
+    }[kind]
+    run = opened(kind, dimensions, grid)
+    page = pages.open(write_explorer([run], tmp_path / "e.html"), width=700, height=600)
+    best = run.best()[0].cell
+    assert f"cell {best}" in page.inner_text("#facts")
+    assert np.allclose(last(page), expected(run, best), atol=1e-3)
+    # the pixel of a cell belongs to the elite of the cell
+    cell = int(run.cells[len(run.cells) // 2])
+    elite = int(np.searchsorted(run.cells, cell))
+    spot = page.evaluate(f"[NQD.maps[0].u[{elite}], NQD.maps[0].v[{elite}]]")
+    if kind == "lines":
+        spot = [0.0, float(run.archive.descriptors[cell, 0])]
+    box = page.evaluate("NQD.maps[0].box")
+    place = page.locator(".map").bounding_box()
+    page.mouse.click(
+        place["x"] + box["x"] + spot[0] * box["w"] + 0.5,
+        place["y"] + box["y"] + (1 - spot[1]) * box["h"] - 0.5,
+    )
+    assert f"cell {cell}," in page.inner_text("#facts")
+    assert np.allclose(last(page), expected(run, cell), atol=1e-3)
+    assert f"elite({cell})" in page.inner_text(".tools code")
+    before = page.evaluate("NQD.maps[0].v[NQD.maps[0].selected]")
+    for key in ("ArrowDown", "ArrowDown", "ArrowUp"):
+        page.keyboard.press(key)
+    assert f"cell {cell}," not in page.inner_text("#facts") or before < 0.2
+    shown = page.evaluate("NQD.maps[0].selected")
+    assert f"cell {run.cells[shown]}," in page.inner_text("#facts")
+
+
+@pytest.mark.slow
+@pytest.mark.browser
+def test_two_runs_filter_colour_and_hostile_names(pages: Pages, tmp_path: Path) -> None:
+    runs = [opened(HOSTILE, 2, (5, 4), seed) for seed in (0, 1)]
+    page = pages.open(write_explorer(runs, tmp_path / "e.html"), width=900, height=700)
+    assert page.evaluate("window.hacked === undefined")
+    assert page.locator("h2").all_text_contents() == [str(run.path) for run in runs]
+    assert (
+        page.locator("h2").first.evaluate("e => getComputedStyle(e).unicodeBidi")
+        == "isolate"
+    )
+    for world, run in enumerate(runs):
+        assert np.allclose(
+            last(page, world), expected(run, run.best()[0].cell), atol=1e-3
+        )
+    least = float(np.median(runs[0].archive.fitnesses[runs[0].cells]))
+    page.locator("#maps input[type=range]").fill(str(least))
+    for index, run in enumerate(runs):
+        shown = page.evaluate(f"Array.from(NQD.maps[{index}].shown)")
+        fitness = run.archive.fitnesses[run.cells]
+        # the slider rounds
+        sure = np.abs(fitness - least) > 1e-3
+        assert np.array_equal(np.array(shown)[sure] > 0, (fitness >= least)[sure])
+    page.locator("#maps select").select_option(label="steps before the end")
+    values = page.evaluate("Array.from(NQD.maps[0].values)")
+    assert values == [STEPS] * len(runs[0].cells)
+    assert "re-evaluated 4 times" in page.inner_text(".curves")
+    with page.expect_download() as info:
+        page.locator(".tools button").first.click()
+    stored = info.value.path().read_text(encoding="utf-8")
+    assert f'"cell":{runs[0].best()[0].cell}' in stored and '"genotype":[' in stored
+
+
+def test_a_large_archive_is_thinned(monkeypatch: pytest.MonkeyPatch) -> None:
+    run = opened("grid", 2, (5, 4))
+    monkeypatch.setattr("newton_qd.viewing.explorer._FIXED", 10e6 - 200)
+    text = explorer_html([run])
+    count = len(run.cells)
+    assert f" of {count} elites move, so that the page is below 10 MB" in text
+
+
+def test_wrong_runs_are_named(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(ValueError, match="runs: got 0 runs; allowed: one run or two"):
+        explorer_html([])
+    assert cli.main(["explore", "a", "b", "c"]) == 2
+    assert "DIR: got 3 folders; allowed: one folder or two" in capsys.readouterr().err
