@@ -14,6 +14,7 @@ from newton_qd import checks, tasks
 from newton_qd.checks import Fact, listed, message, shown
 from newton_qd.envs.base import Env
 from newton_qd.envs.methods import check_methods, random_key
+from newton_qd.envs.shown import REGISTERED
 from newton_qd.errors import UnknownEnvironment
 from newton_qd.moved import moved_name
 from newton_qd.robots import Material, RobotSpec
@@ -282,6 +283,7 @@ def create(
         env = CompletedEvalWrapper(EvalWrapper(env))
     if brax_views:
         env = brax.BraxViewsWrapper(env)
+    vars(env)[REGISTERED] = env_name
     return env
 
 

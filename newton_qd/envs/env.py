@@ -12,6 +12,7 @@ import jax
 import numpy as np
 
 from newton_qd.checks import message
+from newton_qd.envs.shown import described
 from newton_qd.envs.state import State, no_brax_view
 from newton_qd.robots import Material
 from newton_qd.scenes import Scene
@@ -24,6 +25,9 @@ class Env(abc.ABC):
     Environments are immutable. They compare and hash by identity, so they can be static
     arguments of jitted functions.
     """
+
+    def __repr__(self) -> str:
+        return described(self)
 
     @abc.abstractmethod
     def reset(self, rng: RNGKey) -> State:

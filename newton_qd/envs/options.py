@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 from newton_qd import checks
+from newton_qd.envs.shown import OPTIONS
 
 Constructor = TypeVar("Constructor", bound=Callable[..., None])
 
@@ -29,6 +30,7 @@ def checked_options(init: Constructor) -> Constructor:
     def checked(self: Any, *args: Any, **options: Any) -> None:
         for name, value in options.items():
             _CHECKS.get(kinds.get(name, ""), _anything)(name, value)
+        vars(self).setdefault(OPTIONS, options)  # of the class itself, for its text
         init(self, *args, **options)
 
     return checked  # pyright: ignore[reportReturnType]

@@ -15,6 +15,7 @@ from newton_qd.physics.inspection import (
     mass_matrix,
     seen_bodies,
 )
+from newton_qd.physics.messages import quiet
 from newton_qd.physics.model import load_system
 from newton_qd.physics.model.rest import grounding_coordinate, raising_coordinate
 from newton_qd.physics.model.substeps import FewSubstepsWarning, recommended_substeps
@@ -22,6 +23,8 @@ from newton_qd.physics.model.wall_speeds import SoftWallWarning, wall_speeds
 from newton_qd.physics.parameters import PhysicsParams, default_params
 from newton_qd.physics.step import initial_state, step
 from newton_qd.physics.system import Kinematics, PhysicsState, System
+
+quiet()
 
 __all__ = [
     "FewSubstepsWarning",

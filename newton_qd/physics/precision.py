@@ -18,6 +18,8 @@ from types import ModuleType
 
 import warp as wp
 
+from newton_qd.physics import messages
+
 _TEMPLATE = Path(__file__).parent / "kernels"
 _TEMPLATE_PACKAGE = "newton_qd.physics.kernels"
 _VECTOR_BYTES = 32
@@ -166,5 +168,5 @@ def pack_width(dtype: str, device: wp.Device) -> int:
 
 
 def quiet() -> None:
-    """Turn off Warp's messages, for programs that print their own output."""
-    wp.config.log_level = wp.LOG_WARNING
+    """Turns off Warp's messages; importing ``newton_qd.physics`` does it already."""
+    messages.quiet()

@@ -111,6 +111,10 @@ class Wrapper(Env):
         """Returns the same wrappers around the same robot with another material."""
         return self.with_base(lambda base: base.with_material(material))
 
+    def __dir__(self) -> list[str]:
+        inside = [name for name in dir(self.env) if not name.startswith("_")]
+        return sorted({*super().__dir__(), *inside})
+
     def __getattr__(self, name: str) -> Any:
         """Forwards to the environment inside: ``batch_size``, descriptors, ``system``.
 
