@@ -39,7 +39,9 @@ class Scenario:
 
     Attributes:
         kind: ``"forward"``: ``env.step`` in a jitted scan; ``"gradient"``: forward
-            and backward of the reward sum with respect to all actions.
+            and backward of the reward sum with respect to all actions; ``"plan"``
+            and ``"plan_gradient"``: the same with our ``env.rollout``, without
+            auto-reset.
         worlds: Batch size [-].
         steps: Environment steps of each world in one call [-].
         calls: Calls in one repetition [-].
@@ -72,6 +74,9 @@ SCENARIOS = (
     Scenario("forward", 1024, 50, required=1.5),
     Scenario("gradient", 16, 32, calls=4),
     Scenario("gradient", 128, 32, required=3.0),
+    Scenario("plan", 1, 250, calls=8),
+    Scenario("plan", 16, 250, calls=4),
+    Scenario("plan_gradient", 1, 32, calls=16),
 )
 
 

@@ -32,21 +32,21 @@ MOVED = 0.01
 PINNING = ("OMP_NUM_THREADS", "XLA_FLAGS", "NEWTON_QD_THREADS")
 
 
-def make_newton_qd() -> Any:
+def make_newton_qd(**options: Any) -> Any:
     """Return the environment of this project."""
     import newton_qd
 
-    return newton_qd.create(ENV_NAME, episode_length=EPISODE_LENGTH)
+    return newton_qd.create(ENV_NAME, episode_length=EPISODE_LENGTH, **options)
 
 
-def make_brax_v1() -> Any:
+def make_brax_v1(**options: Any) -> Any:
     """Return QDax's environment on brax v1, which runs its legacy spring physics."""
     from qdax.tasks.brax import v1
 
-    return v1.create(ENV_NAME, episode_length=EPISODE_LENGTH)
+    return v1.create(ENV_NAME, episode_length=EPISODE_LENGTH, **options)
 
 
-LIBRARIES: dict[str, tuple[Callable[[], Any], tuple[str, ...]]] = {
+LIBRARIES: dict[str, tuple[Callable[..., Any], tuple[str, ...]]] = {
     "newton_qd": (make_newton_qd, ("jax", "newton", "warp-lang")),
     "brax_v1": (make_brax_v1, ("jax", "brax", "qdax")),
 }
@@ -79,23 +79,52 @@ def rollout(env: Any, state: Any, actions: jax.Array) -> tuple[Any, dict[str, An
     return jax.lax.scan(body, state, actions)
 
 
+def plan(env: Any, state: Any, actions: jax.Array) -> tuple[Any, dict[str, Any]]:
+    """Run a batch of plans of actions in one call, where the library can.
+
+    The environment has no auto-reset. Arguments and result are those of ``rollout``.
+    """
+    if not hasattr(env, "rollout"):
+        return rollout(env, state, actions)
+    states = jax.vmap(env.rollout, in_axes=(0, 1), out_axes=1)(state, actions)
+    kept = {
+        "reward": states.reward,
+        "done": states.done,
+        "state_descriptor": states.info["state_descriptor"],
+        "fault": states.info["fault"],
+    }
+    return jax.tree_util.tree_map(lambda leaf: leaf[-1], states), kept
+
+
 def forward(env: Any, state: Any, actions: jax.Array) -> tuple[Any, None]:
     """Return the rollout."""
     return rollout(env, state, actions), None
 
 
-def gradient(env: Any, state: Any, actions: jax.Array) -> tuple[Any, jax.Array]:
+def gradient(
+    env: Any, state: Any, actions: jax.Array, run: Any = rollout
+) -> tuple[Any, jax.Array]:
     """Return the rollout, and the gradient of its reward sum by the actions."""
 
     def reward_sum(actions: jax.Array) -> tuple[jax.Array, Any]:
-        rolled = rollout(env, state, actions)
+        rolled = run(env, state, actions)
         return rolled[1]["reward"].sum(), rolled
 
     slope, rolled = jax.grad(reward_sum, has_aux=True)(actions)
     return rolled, slope
 
 
-KINDS = {"forward": forward, "gradient": gradient}
+def forward_plan(env: Any, state: Any, actions: jax.Array) -> tuple[Any, None]:
+    """Return the rollout of plans."""
+    return plan(env, state, actions), None
+
+
+KINDS = {
+    "forward": forward,
+    "gradient": gradient,
+    "plan": forward_plan,
+    "plan_gradient": functools.partial(gradient, run=plan),
+}
 
 
 def all_finite(tree: Any) -> bool:
@@ -140,6 +169,10 @@ class Worker:
     def _env(self) -> Any:
         return self._make()
 
+    @functools.cached_property
+    def _env_of_plans(self) -> Any:
+        return self._make(auto_reset=False)
+
     def describe(self) -> dict[str, Any]:
         """Return versions, device and what could keep the library off a core."""
         return {
@@ -154,7 +187,7 @@ class Worker:
         self, name: str, kind: str, worlds: int, steps: int, calls: int
     ) -> dict[str, Any]:
         """Compile a scenario, run it once and check what it did."""
-        env = self._env
+        env = self._env_of_plans if kind.startswith("plan") else self._env
         keys = jax.random.split(jax.random.PRNGKey(SEED), worlds)
         state = jax.jit(jax.vmap(env.reset))(keys)
         # NumPy's generator: the same actions in every library and JAX release.

@@ -26,7 +26,7 @@ import pytest
 
 import newton_qd
 from newton_qd import physics
-from newton_qd.physics import bridge, interrupts
+from newton_qd.physics import interrupts, row_calls
 from newton_qd.physics.warp_internals import ffi_module
 from newton_qd.robots import ANT
 
@@ -149,7 +149,7 @@ def child_moments_of_a_callback() -> None:
 
 def with_callbacks() -> None:
     """Lets XLA call Python for the physics, as it does on a GPU."""
-    bridge._native = lambda device: False
+    row_calls.native = lambda device: False
 
 
 def start(child: Callable[[], None], errors: Path, device: jax.Device, callbacks: bool):

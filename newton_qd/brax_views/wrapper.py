@@ -12,6 +12,7 @@ import jax
 from newton_qd.brax_views.views import QP, SystemView, qp_view
 from newton_qd.envs.base import PhysicsEnv
 from newton_qd.envs.env import Env
+from newton_qd.envs.rollouts import RolloutOrder
 from newton_qd.envs.state import State
 from newton_qd.physics.system import System
 from newton_qd.types import Action, Params, RNGKey
@@ -33,6 +34,8 @@ BODY_NAMES: Mapping[str, Mapping[str, str]] = types.MappingProxyType(
 
 class _Shown:
     """A robot in the structure of a pytree: compared by identity, with a short repr."""
+
+    rollout_order = RolloutOrder.AT_ONCE
 
     def __init__(self, system: System) -> None:
         self.system = system

@@ -120,7 +120,7 @@ class Ant(PhysicsEnv):
     ) -> tuple[jax.Array, jax.Array, Metrics]:
         """Returns reward, done and metrics of a step."""
         position = after.q[:3]
-        velocity = (position[:2] - before.q[:2]) / self.dt
+        velocity = rounded((position[:2] - before.q[:2]) / self.dt)
         low, high = self._healthy_z_range
         healthy = ((position[2] >= low) & (position[2] <= high)).astype(self.dtype)
         if self._terminate_when_unhealthy:

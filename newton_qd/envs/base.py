@@ -13,11 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from newton_qd import checks, physics
-from newton_qd.checks import listed, message
 from newton_qd.envs import inputs
 from newton_qd.envs.env import Env, QDEnv
-from newton_qd.envs.joints import joint_indices
+from newton_qd.envs.joints import joint_indices, joint_slices
 from newton_qd.envs.options import checked_options
+from newton_qd.envs.rollouts import RolloutOrder
 from newton_qd.envs.state import State, select
 from newton_qd.physics.explicit_mesh import split_as
 from newton_qd.physics.system import Kinematics, PhysicsState, System
@@ -54,6 +54,8 @@ class PhysicsEnv(Env):
 
     forward_reward_name: str | None = None
     """Metric with the forward part of the reward; ``None``: no forward part."""
+    rollout_order: RolloutOrder = RolloutOrder.AT_ONCE
+    """How ``rollout`` runs the steps of a plan."""
     reads_bodies: bool = False
     """Whether a step returns the poses of bodies too; ``kinematics`` is then faster."""
 
@@ -246,17 +248,7 @@ class PhysicsEnv(Env):
         Raises:
             ValueError: The robot has no such joint.
         """
-        system = self.system
-        if not name or name not in system.joint_names:
-            known = listed([known for known in system.joint_names if known])
-            why = f"which is no joint of {self.name}"
-            raise ValueError(message("name", name, known, why=why))
-        body = system.joint_names.index(name)
-        parts = []
-        for starts, size in ((system.q_start, system.nq), (system.v_start, system.nv)):
-            later = [int(start) for start in starts if start > starts[body]]
-            parts.append(slice(int(starts[body]), min([*later, size])))
-        return parts[0], parts[1]
+        return joint_slices(self.system, name)
 
     def kinematics(self, state: PhysicsState) -> Kinematics:
         """Returns the poses and velocities of the bodies of a state.

@@ -12,6 +12,7 @@ import jax
 import numpy as np
 
 from newton_qd.checks import message
+from newton_qd.envs import rollouts
 from newton_qd.envs.shown import described
 from newton_qd.envs.state import State, no_brax_view
 from newton_qd.robots import Material
@@ -56,6 +57,30 @@ class Env(abc.ABC):
                 wrong shape, ``params`` do not fit this robot, or the environment is
                 float64 and JAX x64 is off.
         """
+
+    def rollout(self, state: State, actions: Action, params: Params = None) -> State:
+        """Runs a plan of actions.
+
+        The states equal those of ``step`` in ``jax.lax.scan``, bit by bit, and so do
+        their gradients to rounding. The physics of all steps is one call, which makes
+        few worlds much faster. It needs wrappers that leave the physics alone: with
+        ``auto_reset=True``, the steps run one by one.
+
+        Args:
+            state: State at the start, of one world.
+            actions: (T, nu) actions of the environment's dtype, usually from -1 to 1.
+            params: Physical parameters of the world, as for ``step``.
+
+        Returns:
+            The states after each step, leaves (T, ...).
+
+        Raises:
+            TypeError: The state or an action has the wrong type.
+            ValueError: The state comes from another environment, the actions have the
+                wrong shape, ``params`` do not fit this robot, or the environment is
+                float64 and JAX x64 is off.
+        """
+        return rollouts.rollout(self, state, actions, params)
 
     @property
     @abc.abstractmethod

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from newton_qd.envs import planar
 from newton_qd.envs.base import PhysicsEnv
 from newton_qd.envs.options import checked_options
-from newton_qd.envs.vectors import ordered_sum
+from newton_qd.envs.vectors import ordered_sum, rounded
 from newton_qd.physics.system import PhysicsState
 from newton_qd.robots import HALFCHEETAH
 from newton_qd.types import Action, Metrics
@@ -72,8 +72,8 @@ class HalfCheetah(PhysicsEnv):
     ) -> tuple[jax.Array, jax.Array, Metrics]:
         """Returns reward, done and metrics of a step."""
         velocity = planar.forward_velocity(before, after, self.dt)
-        forward = self._forward_reward_weight * velocity
-        control = self._ctrl_cost_weight * ordered_sum(jnp.square(action))
+        forward = rounded(self._forward_reward_weight * velocity)
+        control = rounded(self._ctrl_cost_weight * ordered_sum(jnp.square(action)))
         metrics = {
             "x_position": after.q[planar.X],
             "x_velocity": velocity,

@@ -166,8 +166,8 @@ class Humanoid(PhysicsEnv):
             bonus, done = jnp.full_like(healthy, self._healthy_reward), 1 - healthy
         else:
             bonus, done = self._healthy_reward * healthy, jnp.zeros_like(healthy)
-        forward = self._forward_reward_weight * velocity[0]
-        control = self._ctrl_cost_weight * ordered_sum(jnp.square(action))
+        forward = rounded(self._forward_reward_weight * velocity[0])
+        control = rounded(self._ctrl_cost_weight * ordered_sum(jnp.square(action)))
         metrics = {
             "forward_reward": forward,
             "reward_linvel": forward,

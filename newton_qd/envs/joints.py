@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from newton_qd.checks import listed, message
 from newton_qd.physics.system import JointKind, System
 
 _LIGHTEST = 1e-5  # [kg]
@@ -44,3 +45,25 @@ def joint_indices(system: System) -> tuple[np.ndarray, np.ndarray]:
     axes = [axis for chain in joint_chains(system) for axis in chain]
     q, v = system.q_start[axes], system.v_start[axes]
     return q.astype(np.int32), v.astype(np.int32)
+
+
+def joint_slices(system: System, name: str) -> tuple[slice, slice]:
+    """Returns the slices of a joint in the coordinates and in the velocities.
+
+    Args:
+        system: The robot.
+        name: Name of the joint in the URDF file.
+
+    Raises:
+        ValueError: The robot has no such joint.
+    """
+    if not name or name not in system.joint_names:
+        known = listed([known for known in system.joint_names if known])
+        why = f"which is no joint of {system.robot.name}"
+        raise ValueError(message("name", name, known, why=why))
+    body = system.joint_names.index(name)
+    parts = []
+    for starts, size in ((system.q_start, system.nq), (system.v_start, system.nv)):
+        later = [int(start) for start in starts if start > starts[body]]
+        parts.append(slice(int(starts[body]), min([*later, size])))
+    return parts[0], parts[1]

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from newton_qd.checks import Fact, message
 from newton_qd.envs.base import PhysicsEnv
 from newton_qd.envs.options import checked_options
-from newton_qd.envs.vectors import ordered_sum
+from newton_qd.envs.vectors import ordered_sum, rounded
 from newton_qd.physics.system import JointKind, PhysicsState
 from newton_qd.robots import RobotSpec
 from newton_qd.scenes import Scene
@@ -90,9 +90,9 @@ class Locomotion(PhysicsEnv):
         low, high = self._healthy_z_range
         height = after.q[2]
         healthy = ((height >= low) & (height <= high)).astype(self.dtype)
-        forward = self._forward_reward_weight * x_velocity
+        forward = rounded(self._forward_reward_weight * x_velocity)
         bonus = jnp.full_like(forward, self._healthy_reward)
-        control = self._ctrl_cost_weight * ordered_sum(jnp.square(action))
+        control = rounded(self._ctrl_cost_weight * ordered_sum(jnp.square(action)))
         metrics = {
             "reward_forward": forward,
             "reward_survive": bonus,

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from newton_qd.envs.vectors import ordered_sum, wrapped
+from newton_qd.envs.vectors import ordered_sum, rounded, wrapped
 from newton_qd.physics.system import PhysicsState
 from newton_qd.types import Action, Metrics
 
@@ -90,8 +90,8 @@ class UprightRun:
             bonus, done = jnp.full_like(healthy, self.healthy_reward), 1 - healthy
         else:
             bonus, done = self.healthy_reward * healthy, jnp.zeros_like(healthy)
-        forward = self.forward_reward_weight * velocity
-        control = self.ctrl_cost_weight * ordered_sum(jnp.square(action))
+        forward = rounded(self.forward_reward_weight * velocity)
+        control = rounded(self.ctrl_cost_weight * ordered_sum(jnp.square(action)))
         metrics = {
             "reward_forward": forward,
             "reward_ctrl": -control,

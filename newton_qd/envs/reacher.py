@@ -10,7 +10,8 @@ from newton_qd import physics
 from newton_qd.envs.base import PhysicsEnv
 from newton_qd.envs.options import checked_options
 from newton_qd.envs.points import point
-from newton_qd.envs.vectors import length, ordered_sum
+from newton_qd.envs.rollouts import RolloutOrder
+from newton_qd.envs.vectors import length, ordered_sum, rounded
 from newton_qd.physics.inspection import Kinematics
 from newton_qd.physics.system import PhysicsState
 from newton_qd.robots import REACHER, REACHERANGLE, RobotSpec
@@ -133,6 +134,7 @@ class ReacherAngle(Reacher):
     """
 
     _spec = REACHERANGLE
+    rollout_order = RolloutOrder.AT_ONCE  # the control depends on the action only
 
     def _share_of_radius(self, share: jax.Array) -> jax.Array:
         """Returns the relative radius () of a target, uniform over the disk."""
@@ -144,7 +146,7 @@ class ReacherAngle(Reacher):
         dofs = self.system.control_dof
         low = jnp.asarray(self.system.limit_lower[dofs], self.dtype)
         high = jnp.asarray(self.system.limit_upper[dofs], self.dtype)
-        return low + (high - low) * (jnp.clip(action, -1, 1) + 1) / 2
+        return low + rounded((high - low) * (jnp.clip(action, -1, 1) + 1) / 2)
 
     def outcome(
         self, before: PhysicsState, after: PhysicsState, action: Action

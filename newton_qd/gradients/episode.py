@@ -14,6 +14,7 @@ import numpy as np
 
 from newton_qd import checks
 from newton_qd.checks import Fact, message
+from newton_qd.envs.env import Env
 from newton_qd.envs.state import select
 from newton_qd.extractors import Trajectories, check_extractor
 from newton_qd.gradients.exact import EpisodeGradient, EpisodeGradients, differentiate
@@ -24,6 +25,7 @@ from newton_qd.gradients.mixed import (
     mixed_gradients,
 )
 from newton_qd.gradients.outcome import Outcome, at_fault, transition
+from newton_qd.gradients.plans import run_plan
 from newton_qd.gradients.scores import gradient_scores, scores
 from newton_qd.moved import moved_name
 from newton_qd.types import (
@@ -148,6 +150,13 @@ class Episode:
         is_key = isinstance(start, (jax.Array, np.ndarray))
         first: Any = self.env.reset(start) if is_key else start
         self._check_first(first)
+        kept = self.options.exact and self.options.checkpoint_every in (None, 1)
+        if self.policy is None and kept and not self.transitions:
+            if isinstance(self.env, Env):
+                described = self.descriptor_extractor is not None
+                plan = self._plan(parameters)
+                ran = run_plan(self.env, first, plan, params, described=described)
+                return self._outcome(*ran, {})
         dtype, steps = first.reward.dtype, self.episode_length
         rows: dict[str, jax.Array | np.ndarray] = {}
         if not self.options.exact:
@@ -162,13 +171,7 @@ class Episode:
             steps,
             self.options.checkpoint_every,
         )
-        descriptor = jnp.zeros((0,), dtype)
-        if self.descriptor_extractor is not None:
-            data, mask = Trajectories(readings[None]), over[None].astype(readings.dtype)
-            descriptor = self.descriptor_extractor(data, mask)[0]
-        bad = bad | ~jnp.isfinite(fitness) | ~jnp.all(jnp.isfinite(descriptor))
-        admitted = jnp.where(bad, -jnp.inf, fitness)
-        return Outcome(admitted, descriptor, bad, taken, fitness)
+        return self._outcome(fitness, readings, over, bad, taken)
 
     def gradient(
         self, genotypes: Genotype, start: Start, params: Params = None
@@ -329,6 +332,32 @@ class Episode:
                 "QD tasks, as ant_uni, or descriptor_extractor=None without transitions"
             )
             raise ValueError(message("env", given, allowed))
+
+    def _outcome(
+        self,
+        fitness: jax.Array,
+        readings: jax.Array | None,
+        over: jax.Array,
+        bad: jax.Array,
+        taken: dict[str, jax.Array],
+    ) -> Outcome:
+        """Returns the results of an episode.
+
+        Args:
+            fitness: () sum of rewards.
+            readings: (T, nd) state descriptors; ``None``: there is no descriptor.
+            over: (T,) whether the episode had ended before a step.
+            bad: () whether there was a fault.
+            taken: The steps.
+        """
+        descriptor = jnp.zeros((0,), fitness.dtype)
+        if self.descriptor_extractor is not None:
+            assert readings is not None
+            data, mask = Trajectories(readings[None]), over[None].astype(readings.dtype)
+            descriptor = self.descriptor_extractor(data, mask)[0]
+        bad = bad | ~jnp.isfinite(fitness) | ~jnp.all(jnp.isfinite(descriptor))
+        admitted = jnp.where(bad, -jnp.inf, fitness)
+        return Outcome(admitted, descriptor, bad, taken, fitness)
 
     def _plan(self, parameters: PyTree) -> jax.Array:
         """Returns open-loop actions (episode_length, nu).

@@ -1,11 +1,7 @@
 """Differentiable physics: systems, the control step, and functions that inspect it."""
 
-from newton_qd.physics.bridge import (
-    episode_final,
-    episode_proportion,
-    from_jax,
-    to_jax,
-)
+from newton_qd.physics.bridge import from_jax, to_jax
+from newton_qd.physics.episodes import episode_final, episode_proportion
 from newton_qd.physics.inspection import (
     bias_forces,
     contact_gaps,
@@ -21,7 +17,7 @@ from newton_qd.physics.model.rest import grounding_coordinate, raising_coordinat
 from newton_qd.physics.model.substeps import FewSubstepsWarning, recommended_substeps
 from newton_qd.physics.model.wall_speeds import SoftWallWarning, wall_speeds
 from newton_qd.physics.parameters import PhysicsParams, default_params
-from newton_qd.physics.step import initial_state, step
+from newton_qd.physics.step import initial_state, rollout, step
 from newton_qd.physics.system import Kinematics, PhysicsState, System
 
 quiet()
@@ -48,6 +44,7 @@ __all__ = [
     "mass_matrix",
     "raising_coordinate",
     "recommended_substeps",
+    "rollout",
     "seen_bodies",
     "step",
     "to_jax",

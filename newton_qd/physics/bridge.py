@@ -2,7 +2,7 @@
 
 Traced code calls the kernels through the wrappers of
 :mod:`newton_qd.physics.row_calls`. Eager code shares memory through DLPack. Only this
-module and ``row_calls`` use both libraries.
+module, ``episodes`` and ``row_calls`` use both libraries.
 """
 
 import functools
@@ -14,39 +14,23 @@ import jax.numpy as jnp
 import warp as wp
 from jax.core import Tracer
 
-from newton_qd.checks import Fact, listed, message
-from newton_qd.physics import layout
+from newton_qd.checks import Fact, message
+from newton_qd.physics import layout, row_calls
 from newton_qd.physics.explicit_mesh import split_as
 from newton_qd.physics.launch import Launcher, thread_count
 from newton_qd.physics.layout import Layout
-from newton_qd.physics.native import add_plan
-from newton_qd.physics.precision import SCALARS, Variant, build_kernels
 from newton_qd.physics.row_calls import (
-    Differentiable,
     RowCall,
     differentiable,
     native_row_call,
     row_call,
 )
 from newton_qd.physics.system import Kinematics, PhysicsState, System
-from newton_qd.physics.warp_internals import cpu_entry
 
 
 @functools.cache
 def _launcher(system: System, alias: str, parametric: bool) -> Launcher:
     return Launcher(system, wp.get_device(alias), parametric)
-
-
-def _default_device() -> wp.Device:
-    """Returns the Warp device of the first JAX device."""
-    device = wp.device_from_jax(jax.devices()[0])
-    assert device is not None  # Warp finds it by the platform and index in JAX
-    return device
-
-
-def _native(device: wp.Device) -> bool:
-    """Returns whether XLA calls kernels of a device without Python."""
-    return device.is_cpu
 
 
 def launcher(system: System, device: wp.Device, parametric: bool = False) -> Launcher:
@@ -66,8 +50,8 @@ def _kernel_call(
         size: Length of a row of inputs.
         parametric: Whether that row ends with the world's parameters.
     """
-    default = launcher(system, _default_device(), parametric)
-    if _native(default.device):
+    default = launcher(system, row_calls.default_device(), parametric)
+    if row_calls.native(default.device):
         return native_row_call(default.plan(name))
 
     def launch(x: wp.array, *arrays: wp.array) -> None:
@@ -132,6 +116,17 @@ class Step(Protocol):
         ...
 
 
+def _outputs(system: System, row: jax.Array) -> tuple[PhysicsState, jax.Array]:
+    """Splits the outputs of a step into the state and the fault ()."""
+    found = _split(row, layout.outputs(system))
+    fault = found.pop("fault")
+    bodies = None
+    if system.reports_bodies:
+        seen = [field.name for field in layout.bodies(system)]
+        bodies = Kinematics(**{name: found.pop(name) for name in seen})
+    return PhysicsState(**found, bodies=bodies), fault
+
+
 @functools.cache
 def control_step(system: System) -> Step:
     """Returns the differentiable control step of one world.
@@ -150,7 +145,6 @@ def control_step(system: System) -> Step:
     read, written = layout.inputs(system), layout.outputs(system)
     count = layout.parameters(system).size
     shapes = read.shapes | {"params": (count,)}
-    seen = tuple(field.name for field in layout.bodies(system))
     call = functools.partial(_kernel_call, system, size=read.size)
     step = differentiable(call, "step", read.size, written.size)
     size = layout.inputs(system, parametric=True).size
@@ -166,14 +160,91 @@ def control_step(system: System) -> Step:
         else:
             row = _row(system, shapes, q=q, v=v, control=control, params=params)
             y = own_step(row)
-        found = _split(y, written)
-        fault = found.pop("fault")
-        bodies = None
-        if system.reports_bodies:
-            bodies = Kinematics(**{name: found.pop(name) for name in seen})
-        return PhysicsState(**found, bodies=bodies), fault
+        return _outputs(system, y)
 
     return run
+
+
+@functools.cache
+def _rollout_call(system: System, name: str, parametric: bool) -> RowCall:
+    plan = launcher(system, row_calls.default_device(), parametric).plan(name)
+    return native_row_call(plan, "newton_qd_rollout")
+
+
+def rollout(
+    system: System,
+    q: jax.Array,
+    v: jax.Array,
+    controls: jax.Array,
+    params: jax.Array | None = None,
+) -> tuple[PhysicsState, jax.Array]:
+    """Advances one world by a plan of controls.
+
+    On a CPU this is one call of XLA for all steps, and its adjoint is another one. On a
+    GPU it is a scan over control steps.
+
+    Args:
+        system: The system.
+        q: (nq,) coordinates [m or rad].
+        v: (nv,) velocities [m/s or rad/s].
+        controls: (T, nu) controls [-].
+        params: Parameters of the world, as in :func:`control_step`.
+
+    Returns:
+        The states after each step, leaves (T, ...), and the faults (T,). A world with a
+        fault keeps its state in all later steps, and has a fault in each.
+
+    Raises:
+        TypeError: The type of an array is not that of the system.
+        ValueError: An array has the wrong shape, or the value of
+            ``NEWTON_QD_THREADS`` is not allowed.
+    """
+    if controls.ndim != 2 or controls.shape[1] != system.nu:
+        allowed = f"an array of shape (steps, {system.nu}), {system.dtype}"
+        raise ValueError(message("controls", controls, allowed))
+    if not row_calls.native(row_calls.default_device()):
+        return _scanned(system, q, v, controls, params)
+    thread_count()  # raises for a wrong setting now, not inside a compiled call
+    steps, parametric = len(controls), params is not None
+    own = {"params": params} if params is not None else {}
+    shapes = {
+        **layout.coordinates(system).shapes,
+        "params": (layout.parameters(system).size,),
+        "controls": (controls.size,),
+    }
+    row = _row(system, shapes, q=q, v=v, **own, controls=controls.reshape(-1))
+    written = layout.outputs(system).size
+    run = differentiable(
+        functools.partial(_rollout_call, system, parametric=parametric),
+        "step",
+        row.size,
+        steps * written,
+        keeps_outputs=True,
+    )
+    rows = run(row).reshape(steps, written)
+    return jax.vmap(functools.partial(_outputs, system))(rows)
+
+
+def _scanned(
+    system: System,
+    q: jax.Array,
+    v: jax.Array,
+    controls: jax.Array,
+    params: jax.Array | None,
+) -> tuple[PhysicsState, jax.Array]:
+    """Does what :func:`rollout` does, step by step."""
+    step = control_step(system)
+
+    def advance(
+        carry: tuple[jax.Array, jax.Array, jax.Array], control: jax.Array
+    ) -> tuple[tuple, tuple]:
+        q, v, faulty = carry
+        control = jnp.where(faulty, jnp.full_like(control, jnp.nan), control)
+        after, fault = step(q, v, control, params)
+        return (after.q, after.v, faulty | (fault > 0)), (after, fault)
+
+    sound = split_as([q], jnp.zeros((), bool))
+    return jax.lax.scan(advance, (q, v, sound), controls)[1]
 
 
 @functools.cache
@@ -236,107 +307,6 @@ def contact_impulses(
     call = _kernel_call(system, "contact_impulses", read.size)
     row = _row(system, read.shapes, q=q, v=v, control=control)
     return _split(call(row, output_dims=written.size)[0], written)["impulse"]
-
-
-@functools.cache
-def _episode_call(name: str, dtype: str, steps: int, nd: int) -> RowCall:
-    """Wraps a kernel of ``kernels.episodes`` as a function of one episode's row."""
-    kernel = getattr(build_kernels(Variant(dtype, 1)).episodes, name)
-    device, size = _default_device(), steps * (nd + 1)
-    kernel.module.load(device)
-    if _native(device):
-        written = nd if name.startswith("final") else steps * nd
-        adjoint = name.endswith("_backward")
-        rows = [size, written, size][: 3 if adjoint else 2]
-        arrays = [wp.zeros(1, dtype=SCALARS[dtype], device=device) for _ in rows]
-        inputs = [steps, nd, *arrays]
-        recorded = wp.launch(
-            kernel, dim=nd, inputs=inputs, device=device, record_cmd=True
-        )
-        assert isinstance(recorded, wp.Launch)  # because of record_cmd
-        content = (name, dtype, steps, nd)
-        entry = cpu_entry(recorded, adjoint=False)
-        bytes_ = wp.types.type_size_in_bytes(SCALARS[dtype])
-        return native_row_call(add_plan(content, entry, rows, number_bytes=bytes_))
-
-    def launch(x: wp.array, *arrays: wp.array) -> None:
-        episodes = x.shape[0] // size
-        inputs = [steps, nd, x, *arrays]
-        wp.launch(kernel, dim=episodes * nd, inputs=inputs, device=x.device)
-
-    return row_call(name, dtype, kernel.module, launch)
-
-
-@functools.cache
-def _episode_reduction(
-    name: str, dtype: str, steps: int, nd: int, size: int
-) -> Differentiable:
-    """Returns a reverse-mode function of one episode's row.
-
-    The mask has no gradient.
-    """
-    call = functools.partial(_episode_call, dtype=dtype, steps=steps, nd=nd)
-    return differentiable(call, name, steps * (nd + 1), size)
-
-
-def _episode_row(state_desc: jax.Array, mask: jax.Array) -> jax.Array:
-    if state_desc.ndim != 2 or mask.shape != state_desc.shape[:1] or not mask.size:
-        given = Fact(f"shapes {state_desc.shape}, {mask.shape}")
-        allowed = "(t, nd) and (t,), t of 1 or more"
-        raise ValueError(message("state_desc, mask", given, allowed))
-    if state_desc.dtype.name not in SCALARS:
-        raise TypeError(message("state_desc", state_desc, listed(SCALARS)))
-    return jnp.concatenate([state_desc.ravel(), mask.astype(state_desc.dtype)])
-
-
-def episode_proportion(state_desc: jax.Array, mask: jax.Array) -> jax.Array:
-    """Averages the state descriptors over the valid steps of one episode.
-
-    On a CPU the result is bitwise equal to
-    :func:`newton_qd.extractors.get_feet_contact_proportion`. Under ``vmap`` all
-    episodes share one launch.
-
-    Args:
-        state_desc: (t, nd) state descriptors before each step.
-        mask: (t,) 1 for a step after the end of the episode, else 0.
-
-    Returns:
-        (nd,) proportions [-]. Differentiable in reverse mode with respect to
-        ``state_desc``.
-
-    Raises:
-        TypeError: The kernels do not support the type of ``state_desc``.
-        ValueError: ``state_desc`` or ``mask`` has the wrong shape, or has no steps.
-    """
-    row = _episode_row(state_desc, mask)
-    steps, nd = state_desc.shape
-    dtype, size = state_desc.dtype.name, steps * nd
-    run = _episode_reduction("proportion", dtype, steps, nd, size)
-    return run(row).reshape(nd, steps)[:, 0]
-
-
-def episode_final(state_desc: jax.Array, mask: jax.Array) -> jax.Array:
-    """Returns the state descriptor before the last valid step of one episode.
-
-    On a CPU the result is bitwise equal to
-    :func:`newton_qd.extractors.get_final_xy_position`. Under ``vmap`` all episodes
-    share one launch.
-
-    Args:
-        state_desc: (t, nd) state descriptors before each step.
-        mask: (t,) 1 for a step after the end of the episode, else 0.
-
-    Returns:
-        (nd,) descriptor. Differentiable in reverse mode with respect to
-        ``state_desc``.
-
-    Raises:
-        TypeError: The kernels do not support the type of ``state_desc``.
-        ValueError: ``state_desc`` or ``mask`` has the wrong shape, or has no steps.
-    """
-    row = _episode_row(state_desc, mask)
-    steps, nd = state_desc.shape
-    return _episode_reduction("final", state_desc.dtype.name, steps, nd, nd)(row)
 
 
 def to_jax(array: wp.array) -> jax.Array:

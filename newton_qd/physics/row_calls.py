@@ -26,6 +26,18 @@ from newton_qd.physics.warp_internals import ffi_callback
 interrupts.protect(ffi_callback())
 
 
+def default_device() -> wp.Device:
+    """Returns the Warp device of the first JAX device."""
+    device = wp.device_from_jax(jax.devices()[0])
+    assert device is not None  # Warp finds it by the platform and index in JAX
+    return device
+
+
+def native(device: wp.Device) -> bool:
+    """Returns whether XLA calls the kernels of a device without Python."""
+    return device.is_cpu
+
+
 @contextlib.contextmanager
 def _errors_contained() -> Iterator[None]:
     """Convert exceptions that Warp does not catch into an error that Warp reports.
@@ -125,11 +137,13 @@ def _end() -> None:
     library().stop()
 
 
-def native_row_call(plan: Plan) -> RowCall:
+def native_row_call(plan: Plan, target: str = "newton_qd_rows") -> RowCall:
     """Wraps a kernel of a CPU as a function of contiguous rows. It needs no Python.
 
     Args:
         plan: The kernel.
+        target: Native function: ``"newton_qd_rows"`` runs the kernel once,
+            ``"newton_qd_rollout"`` once for each step of a plan of controls.
 
     Returns:
         Function as :func:`row_call` returns it.
@@ -138,14 +152,19 @@ def native_row_call(plan: Plan) -> RowCall:
 
     def call(*rows: jax.Array, output_dims: int) -> tuple[jax.Array, ...]:
         row = jax.ShapeDtypeStruct((output_dims,), rows[0].dtype)
-        run = jax.ffi.ffi_call("newton_qd_rows", row, vmap_method="broadcast_all")
+        run = jax.ffi.ffi_call(target, row, vmap_method="broadcast_all")
         return (run(*rows, plan=np.int64(plan.key)),)
 
     return over_devices(jax.jit(call, static_argnames="output_dims", inline=True))
 
 
 def differentiable(
-    call: Callable[[str], RowCall], name: str, size: int, output_size: int
+    call: Callable[[str], RowCall],
+    name: str,
+    size: int,
+    output_size: int,
+    *,
+    keeps_outputs: bool = False,
 ) -> Differentiable:
     """Returns a reverse-mode function of one row.
 
@@ -156,17 +175,19 @@ def differentiable(
         name: Name of the kernels without ``_forward`` and ``_backward``.
         size: Length of a row of inputs.
         output_size: Length of a row of outputs.
+        keeps_outputs: Whether the adjoint kernel takes the outputs too.
     """
 
     @jax.custom_vjp
     def run(x: jax.Array) -> jax.Array:
         return call(f"{name}_forward")(x, output_dims=output_size)[0]
 
-    def run_forward(x: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return run(x), x
+    def run_forward(x: jax.Array) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+        y = run(x)
+        return y, (x, y) if keeps_outputs else (x,)
 
-    def run_backward(x: jax.Array, y_bar: jax.Array) -> tuple[jax.Array]:
-        return (call(f"{name}_backward")(x, y_bar, output_dims=size)[0],)
+    def run_backward(kept: tuple[jax.Array, ...], y_bar: jax.Array) -> tuple[jax.Array]:
+        return (call(f"{name}_backward")(*kept, y_bar, output_dims=size)[0],)
 
     run.defvjp(run_forward, run_backward)
     return lambda x: run(reverse_mode_only(x))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -57,11 +59,28 @@ def _unloaded(system: System) -> float:
     return np.exp(-np.logaddexp(0.0, deficit))
 
 
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Foreseen:
+    """The result of a step that is known already, in place of its parameters.
+
+    :func:`rollout` computes the steps of a plan at once. Environments then take their
+    rewards and observations from the same code as in a single step.
+
+    Attributes:
+        after: State after the step.
+        fault: () fault of the step.
+    """
+
+    after: PhysicsState
+    fault: jax.Array
+
+
 def step(
     system: System,
     state: PhysicsState,
     control: jax.Array,
-    params: PhysicsParams | None = None,
+    params: PhysicsParams | Foreseen | None = None,
 ) -> tuple[PhysicsState, jax.Array]:
     """Advance one world by one control step.
 
@@ -70,7 +89,8 @@ def step(
         state: State of the world.
         control: (nu,) actions [-]. They are scaled by the gear and not clipped.
         params: Physical parameters of the world. ``None``: the parameters of the
-            system, with kernels that do not read parameters.
+            system, with kernels that do not read parameters. ``Foreseen``: the result,
+            which is returned.
 
     Returns:
         The next state, and the fault () int32. The fault is 1 if a value was not
@@ -86,7 +106,44 @@ def step(
             concrete parameter is out of bounds; or the value of an environment
             variable is not allowed.
     """
+    if isinstance(params, Foreseen):
+        return params.after, params.fault
     own = None if params is None else parameter_row(system, params)
     run = bridge.control_step(system)
     after, fault = run(state.q, state.v, control, own)
     return after, fault.astype(jnp.int32)
+
+
+def rollout(
+    system: System,
+    state: PhysicsState,
+    controls: jax.Array,
+    params: PhysicsParams | None = None,
+) -> Foreseen:
+    """Advance one world by a plan of controls.
+
+    The results equal those of :func:`step` in ``jax.lax.scan``, bit by bit. On a CPU
+    all steps are one call, and so is their gradient, which stores one state for each
+    control step and computes the rest again.
+
+    Args:
+        system: The system.
+        state: State of the world before the first step.
+        controls: (T, nu) actions of each step [-]. They are scaled by the gear and not
+            clipped.
+        params: Physical parameters of the world, as in :func:`step`.
+
+    Returns:
+        The states after each step and their faults, leaves (T, ...). After a fault a
+        world keeps its state, and each later step has a fault too.
+
+    Raises:
+        TypeError: The type of the state, a control or a parameter is not that of the
+            system.
+        ValueError: The state, the controls or a parameter has the wrong shape; a
+            concrete parameter is out of bounds; or the value of an environment
+            variable is not allowed.
+    """
+    own = None if params is None else parameter_row(system, params)
+    after, fault = bridge.rollout(system, state.q, state.v, controls, own)
+    return Foreseen(after, fault.astype(jnp.int32))

@@ -11,6 +11,7 @@ import numpy as np
 from newton_qd.checks import Fact, message
 from newton_qd.envs.base import Env
 from newton_qd.envs.env import raise_own_error
+from newton_qd.envs.rollouts import RolloutOrder
 from newton_qd.envs.state import State
 from newton_qd.robots import Material
 from newton_qd.scenes import Scene
@@ -35,6 +36,8 @@ class Wrapper(Env):
     Attributes:
         env: The environment inside.
     """
+
+    rollout_order: RolloutOrder = RolloutOrder.AT_ONCE
 
     def __init__(self, env: Env) -> None:
         """Wraps an environment.

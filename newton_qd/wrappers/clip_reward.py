@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from newton_qd import checks
 from newton_qd.checks import message
 from newton_qd.envs.base import Env
+from newton_qd.envs.rollouts import RolloutOrder
 from newton_qd.envs.state import State
 from newton_qd.types import Action, Params, RNGKey
 from newton_qd.wrappers.base import Wrapper
@@ -16,6 +17,8 @@ from newton_qd.wrappers.base import Wrapper
 
 class ClipRewardWrapper(Wrapper):
     """Keeps the reward of resets and steps within limits."""
+
+    rollout_order = RolloutOrder.AT_ONCE
 
     def __init__(
         self,

@@ -7,6 +7,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
+from newton_qd.envs.rollouts import RolloutOrder
 from newton_qd.envs.state import State, at_fault
 from newton_qd.types import Action, Metrics, Params, RNGKey
 from newton_qd.wrappers.base import Wrapper
@@ -40,6 +41,8 @@ class CompletedEvalWrapper(Wrapper):
     """
 
     STATE_INFO_KEY = "completed_eval_metrics"
+
+    rollout_order = RolloutOrder.IN_ORDER
 
     def reset(self, rng: RNGKey) -> State:
         """Begins an episode with empty sums.

@@ -12,6 +12,7 @@ import numpy as np
 
 from newton_qd.checks import message
 from newton_qd.envs.base import Env, QDEnv
+from newton_qd.envs.rollouts import RolloutOrder
 from newton_qd.envs.state import State
 from newton_qd.extractors import get_mean_state_descriptor
 from newton_qd.types import Action, Descriptor, DescriptorExtractor, Params, RNGKey
@@ -25,6 +26,7 @@ class DescriptorWrapper(Wrapper, QDEnv):
     ``descriptor_extractor``.
     """
 
+    rollout_order = RolloutOrder.AT_ONCE
     limits: ClassVar[tuple[Sequence[float], Sequence[float]]]
     """Lowest and highest value of each of the nd components. Values beyond these limits
     are in the outermost cells of an archive."""

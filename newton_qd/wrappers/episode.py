@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from newton_qd import checks
 from newton_qd.envs.base import Env
 from newton_qd.envs.inputs import require_state
+from newton_qd.envs.rollouts import RolloutOrder
 from newton_qd.envs.state import State
 from newton_qd.types import Action, Params, RNGKey
 from newton_qd.wrappers.base import Wrapper
@@ -25,6 +26,8 @@ class EpisodeWrapper(Wrapper):
         action_repeat: Control steps for each action.
     """
 
+    rollout_order = RolloutOrder.IN_ORDER
+
     def __init__(self, env: Env, episode_length: int, action_repeat: int) -> None:
         """Wraps an environment.
 
@@ -41,6 +44,8 @@ class EpisodeWrapper(Wrapper):
         super().__init__(env)
         self.episode_length = int(episode_length)
         self.action_repeat = int(action_repeat)
+        if self.action_repeat > 1:
+            self.rollout_order = RolloutOrder.ONE_BY_ONE
 
     def reset(self, rng: RNGKey) -> State:
         """Begins an episode at step 0.

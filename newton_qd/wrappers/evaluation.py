@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from newton_qd.checks import Fact, message
+from newton_qd.envs.rollouts import RolloutOrder
 from newton_qd.envs.state import State, at_fault
 from newton_qd.types import Action, Metrics, Params, RNGKey
 from newton_qd.wrappers.base import Wrapper
@@ -36,6 +37,8 @@ class EvalWrapper(Wrapper):
     """
 
     STATE_INFO_KEY = "eval_metrics"
+
+    rollout_order = RolloutOrder.IN_ORDER
 
     def reset(self, rng: RNGKey) -> State:
         """Begins an episode with empty sums.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from newton_qd.checks import Fact, message
 from newton_qd.envs.base import Env, PhysicsEnv
+from newton_qd.envs.rollouts import RolloutOrder
 from newton_qd.envs.state import State
 from newton_qd.types import Action, Params
 from newton_qd.wrappers.base import Wrapper, unsupported
@@ -11,6 +12,8 @@ from newton_qd.wrappers.base import Wrapper, unsupported
 
 class NoForwardRewardWrapper(Wrapper):
     """Subtracts the forward part from the reward of a step; metrics do not change."""
+
+    rollout_order = RolloutOrder.AT_ONCE
 
     def __init__(self, env: Env, env_name: str) -> None:
         """Wraps a simulated robot whose reward has a forward part.

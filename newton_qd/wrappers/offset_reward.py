@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from newton_qd import checks
 from newton_qd.envs.base import Env
+from newton_qd.envs.rollouts import RolloutOrder
 from newton_qd.envs.state import State
 from newton_qd.types import Action, Params, RNGKey
 from newton_qd.wrappers.base import Wrapper
@@ -11,6 +12,8 @@ from newton_qd.wrappers.base import Wrapper
 
 class OffsetRewardWrapper(Wrapper):
     """Adds a constant to the reward of resets and steps."""
+
+    rollout_order = RolloutOrder.AT_ONCE
 
     def __init__(self, env: Env, offset: float = 0.0) -> None:
         """Wraps an environment.

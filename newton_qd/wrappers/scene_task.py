@@ -10,6 +10,7 @@ import numpy as np
 
 from newton_qd.checks import Fact, message
 from newton_qd.envs.base import Env, PhysicsEnv
+from newton_qd.envs.rollouts import RolloutOrder
 from newton_qd.envs.state import State
 from newton_qd.physics.system import JointKind, System
 from newton_qd.scenes import Scene
@@ -30,6 +31,8 @@ class SceneTaskWrapper(Wrapper):
     """Position with the observation zero [m]."""
     xy_scale: tuple[float, float]
     """Distances from the centre with the observation one [m]."""
+
+    rollout_order = RolloutOrder.AT_ONCE
 
     def __init__(self, env: Env, env_name: str) -> None:
         """Wraps a simulated robot with a floating torso; ``env`` is not changed.

@@ -89,6 +89,28 @@ class VectorWrapper(Wrapper):
                 raise ValueError(message("params", leaf, allowed))
         return jax.vmap(self.env.step)(state, action, params)
 
+    def rollout(self, state: State, actions: Action, params: Params = None) -> State:
+        """Runs a plan of actions in every world.
+
+        Args:
+            state: Batched state.
+            actions: (T, batch, nu) actions.
+            params: As for one world, with the batch axis in front.
+
+        Returns:
+            The states after each step, leaves (T, batch, ...).
+
+        Raises:
+            TypeError: The state or the actions have the wrong type.
+            ValueError: The state or the actions have the wrong shape.
+        """
+        shape = (*jnp.shape(state.done), self.action_size)
+        if jnp.shape(actions)[1:] != shape or jnp.ndim(state.done) != 1:
+            allowed = f"an array of shape (steps, {', '.join(map(str, shape))})"
+            raise ValueError(message("actions", actions, allowed))
+        run = jax.vmap(self.env.rollout, in_axes=(0, 1, 0), out_axes=1)
+        return run(state, actions, params)
+
     @property
     def default_params(self) -> Params:
         """Default ``params`` of ``batch_size`` worlds."""

@@ -96,7 +96,7 @@ static char* aligned(char* at) { return at + (-(size)at & (LINE - 1)); }
 static int64 row_bytes(const Plan* p) {
     int64 numbers = 0;
     for (int k = 0; k < p->arrays; ++k) numbers += p->row[k];
-    return (numbers + p->state) * p->width * p->number_bytes;
+    return numbers * p->width * p->number_bytes;
 }
 
 static Block* take(Plan* p) {
@@ -129,7 +129,7 @@ static void give(Plan* p, Block* block) {
 struct Job {
     Plan* plan;
     void (*compute)(const Job*, Block*, int64 pack);
-    char* arrays[8];
+    char* arrays[4];
     int64 worlds, packs, steps;
     int64 next;     // the next pack that nobody has taken
     int64 helpers;  // workers that may still use this job
@@ -159,88 +159,89 @@ static void compute_rows(const Job* job, Block* block, int64 pack) {
     run_kernel(p, block, arrays, worlds_of(job, pack));
 }
 
-// ---- Rollouts: the steps of a plan, pack by pack
+// ---- Rollouts: all steps of a plan, pack by pack
 
+// A row of a rollout is a world: the state, its parameters, then the control of each step.
+// Its outputs are those of each step.
 template <typename Number> struct Rollout {
     const Plan* p;
     const Job* job;
-    int64 first, count;        // worlds
+    int64 first, count;         // worlds
+    int64 given;                // numbers of a row
     int64 faulty[WIDEST_PACK];  // step with the first fault of a world
-    Number *x, *y, *x_bar;
+    Number *x, *y, *x_bar;      // rows of one step; of the adjoint, y are those of y_bar
 
     Rollout(const Job* job, Block* block, int64 pack)
         : p(job->plan), job(job), first(pack * job->plan->width), count(worlds_of(job, pack)) {
+        given = p->state + p->parameters + job->steps * p->control;
         x = (Number*)block->rows;
-        y = x + p->row[0] * p->width;  // of the adjoint: y_bar
+        y = x + p->row[0] * p->width;
         x_bar = y + p->row[1] * p->width;
         for (int64 w = 0; w < count; ++w) faulty[w] = job->steps;
     }
-    Number* row(int array, int64 numbers, int64 world) const {
-        return (Number*)job->arrays[array] + (first + world) * numbers;
+    Number* state(int array, int64 world) const { return (Number*)job->arrays[array] + (first + world) * given; }
+    Number* parameters(int array, int64 world) const { return state(array, world) + p->state; }
+    Number* control(int array, int64 world, int64 step) const {
+        return parameters(array, world) + p->parameters + step * p->control;
     }
     Number* output(int array, int64 world, int64 step) const {
-        return row(array, job->steps * p->row[1], world) + step * p->row[1];
+        return (Number*)job->arrays[array] + ((first + world) * job->steps + step) * p->row[1];
     }
     // Fills the inputs of a step. After a fault the control of a world is no number: the
     // physics then keeps its state.
-    void read(int64 step, int outputs) const {
+    void read(int64 step) const {
         for (int64 w = 0; w < count; ++w) {
             Number* at = x + w * p->row[0];
-            const Number* state = step ? output(outputs, w, step - 1) : row(0, p->state, w);
-            memcpy(at, state, p->state * sizeof(Number));
-            Number* control = at + p->state;
-            memcpy(control, row(1, job->steps * p->control, w) + step * p->control, p->control * sizeof(Number));
-            for (int64 k = 0; step > faulty[w] && k < p->control; ++k) control[k] = __builtin_nanf("");
-            memcpy(control + p->control, row(2, p->parameters, w), p->parameters * sizeof(Number));
+            memcpy(at, step ? output(1, w, step - 1) : state(0, w), p->state * sizeof(Number));
+            at += p->state;
+            memcpy(at, control(0, w, step), p->control * sizeof(Number));
+            for (int64 k = 0; step > faulty[w] && k < p->control; ++k) at[k] = __builtin_nanf("");
+            memcpy(at + p->control, parameters(0, w), p->parameters * sizeof(Number));
         }
     }
-    void look_for_faults(int64 step, int outputs) {
+    void look_for_faults(int64 step) {
         for (int64 w = 0; w < count; ++w)
-            if (faulty[w] > step && output(outputs, w, step)[p->fault] != 0) faulty[w] = step;
+            if (faulty[w] > step && output(1, w, step)[p->fault] != 0) faulty[w] = step;
     }
 };
 
-// Arrays: start, controls, parameters; outputs of all steps.
+// Arrays: rows, outputs.
 template <typename Number> static void roll_out(const Job* job, Block* block, int64 pack) {
     Rollout<Number> r(job, block, pack);
     char* arrays[ARRAYS] = {(char*)r.x, (char*)r.y, nullptr};
+    const int64 size = r.p->row[1];
     for (int64 step = 0; step < job->steps; ++step) {
-        r.read(step, 3);
+        r.read(step);
         run_kernel(r.p, block, arrays, r.count);
-        for (int64 w = 0; w < r.count; ++w)
-            memcpy(r.output(3, w, step), r.y + w * r.p->row[1], r.p->row[1] * sizeof(Number));
-        r.look_for_faults(step, 3);
+        for (int64 w = 0; w < r.count; ++w) memcpy(r.output(1, w, step), r.y + w * size, size * sizeof(Number));
+        r.look_for_faults(step);
     }
 }
 
-// Arrays: start, controls, parameters, outputs and their adjoints; adjoints of the first three.
+// Arrays: rows, outputs, adjoints of the outputs, adjoints of the rows.
 template <typename Number> static void roll_back(const Job* job, Block* block, int64 pack) {
     Rollout<Number> r(job, block, pack);
     const Plan* p = r.p;
-    Number *x = r.x, *y_bar = r.y, *x_bar = r.x_bar;
-    Number* state_bar = x_bar + p->row[2] * p->width;
-    memset(state_bar, 0, p->state * p->width * sizeof(Number));
-    for (int64 w = 0; w < r.count; ++w) memset(r.row(7, p->parameters, w), 0, p->parameters * sizeof(Number));
-    char* arrays[ARRAYS] = {(char*)x, (char*)y_bar, (char*)x_bar};
-    for (int64 step = 0; step < job->steps; ++step) r.look_for_faults(step, 3);
+    char* arrays[ARRAYS] = {(char*)r.x, (char*)r.y, (char*)r.x_bar};
+    for (int64 step = 0; step < job->steps; ++step) r.look_for_faults(step);
+    for (int64 w = 0; w < r.count; ++w) memset(r.state(3, w), 0, (p->state + p->parameters) * sizeof(Number));
     for (int64 step = job->steps; step-- > 0;) {
-        r.read(step, 3);
+        r.read(step);
         for (int64 w = 0; w < r.count; ++w) {
-            memcpy(y_bar + w * p->row[1], r.output(4, w, step), p->row[1] * sizeof(Number));
-            for (int64 k = 0; k < p->state; ++k) y_bar[w * p->row[1] + k] += state_bar[w * p->state + k];
+            Number* y_bar = r.y + w * p->row[1];
+            const Number* later = r.state(3, w);
+            memcpy(y_bar, r.output(2, w, step), p->row[1] * sizeof(Number));
+            for (int64 k = 0; k < p->state; ++k) y_bar[k] += later[k];
         }
         run_kernel(p, block, arrays, r.count);
         for (int64 w = 0; w < r.count; ++w) {
-            const Number* at = x_bar + w * p->row[2];
-            memcpy(state_bar + w * p->state, at, p->state * sizeof(Number));
-            Number* controls = r.row(6, job->steps * p->control, w) + step * p->control;
-            memcpy(controls, at + p->state, p->control * sizeof(Number));
-            Number* parameters = r.row(7, p->parameters, w);
-            for (int64 k = 0; k < p->parameters; ++k) parameters[k] += at[p->state + p->control + k];
+            const Number* x_bar = r.x_bar + w * p->row[2];
+            memcpy(r.state(3, w), x_bar, p->state * sizeof(Number));
+            x_bar += p->state;
+            memcpy(r.control(3, w, step), x_bar, p->control * sizeof(Number));
+            for (int64 k = 0; k < p->parameters; ++k) r.parameters(3, w)[k] += x_bar[p->control + k];
         }
     }
-    for (int64 w = 0; w < r.count; ++w)
-        memcpy(r.row(5, p->state, w), state_bar + w * p->state, p->state * sizeof(Number));
 }
 
 // ---- Threads: workers poll for a while before they sleep, as the threads of OpenMP do
@@ -413,18 +414,19 @@ static void* run_call(const Call* call, bool rollout) {
     int count = 0;
     for (int64 k = 0; k < call->inputs.count; ++k) job.arrays[count++] = call->inputs.items[k]->data;
     for (int64 k = 0; k < call->outputs.count; ++k) job.arrays[count++] = call->outputs.items[k]->data;
-    const Buffer* first = call->inputs.items[0];
+    const Buffer* rows = call->inputs.items[0];
     const Plan* p = job.plan;
-    const bool wide = p->number_bytes == 8;
     job.steps = 1;
     job.compute = compute_rows;
-    job.worlds = numbers(first) / (rollout ? p->state : p->row[0]);
+    int64 given = p->row[0];
     if (rollout) {
-        const Buffer* controls = call->inputs.items[1];
-        job.steps = controls->dims[controls->rank - 2];
+        const bool wide = p->number_bytes == 8;
+        given = rows->dims[rows->rank - 1];
+        job.steps = (given - p->state - p->parameters) / p->control;
         if (p->adjoint_arguments) job.compute = wide ? roll_back<double> : roll_back<float>;
         else job.compute = wide ? roll_out<double> : roll_out<float>;
     }
+    job.worlds = numbers(rows) / given;
     return error_of(call, run(&job));
 }
 

@@ -1,0 +1,119 @@
+"""Plans of actions: the physics of all steps at once, then what is read from it.
+
+The wrappers and the environment say in ``rollout_order`` how their steps may be run.
+"""
+
+from __future__ import annotations
+
+import enum
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from newton_qd.checks import message
+from newton_qd.envs import inputs
+from newton_qd.envs.state import State
+from newton_qd.physics.step import Foreseen
+from newton_qd.physics.step import rollout as physics_rollout
+from newton_qd.types import Action, Params
+
+
+class RolloutOrder(enum.IntEnum):
+    """How the steps of a plan may be run when the plan is known at the start.
+
+    A class that overrides ``step`` or ``control`` sets its own ``rollout_order``.
+    Without one, its steps run one by one.
+    """
+
+    AT_ONCE = 0
+    """A step reads the physics before and after it, the action, and constant info."""
+    IN_ORDER = 1
+    """A step also reads what the step before has written, such as a count."""
+    ONE_BY_ONE = 2
+    """A step may change the state or the control of the physics."""
+
+
+def rollout(env: Any, state: State, actions: Action, params: Params) -> State:
+    """Runs a plan of actions: see :meth:`~newton_qd.envs.env.Env.rollout`.
+
+    Raises:
+        TypeError: The state or an action has the wrong type.
+        ValueError: The state, the actions or ``params`` do not fit the environment.
+    """
+    if jnp.ndim(actions) != 2 or jnp.shape(actions)[1] != env.action_size:
+        allowed = f"an array of shape (steps, {env.action_size})"
+        raise ValueError(message("actions", actions, allowed))
+    order = _order(env)
+    if order == RolloutOrder.ONE_BY_ONE:
+        return _in_order(env, state, actions, params, known=False)
+    known = _foresee(env.unwrapped, state, actions, params)
+    if order == RolloutOrder.IN_ORDER:
+        return _in_order(env, state, actions, known, known=True)
+    return _at_once(env, state, actions, known)
+
+
+def _order(env: Any) -> RolloutOrder:
+    """Returns the slowest order of an environment and its wrappers."""
+    orders, inside = [], env
+    while True:
+        orders.append(_own_order(inside))
+        if inside is env.unwrapped:
+            return max(orders)
+        inside = inside.env
+
+
+def _own_order(env: Any) -> RolloutOrder:
+    """Returns the order of an environment without those inside it.
+
+    A class that overrides a method may need another order than its base class has.
+    """
+    for name in ("step", "control"):
+        owner = next((kind for kind in type(env).__mro__ if name in vars(kind)), None)
+        if owner is not None and "rollout_order" not in vars(owner):
+            return RolloutOrder.ONE_BY_ONE
+    return getattr(env, "rollout_order", RolloutOrder.ONE_BY_ONE)
+
+
+def _in_order(
+    env: Any, state: State, actions: Action, params: Params, *, known: bool
+) -> State:
+    def advance(state: State, row: tuple[Action, Params]) -> tuple[State, State]:
+        action, foreseen = row
+        state = env.step(state, action, foreseen if known else params)
+        return state, state
+
+    rows = (actions, params if known else None)
+    return jax.lax.scan(advance, state, rows)[1]
+
+
+def _foresee(base: Any, state: State, actions: Action, params: Params) -> Foreseen:
+    """Runs the physics of a :class:`~newton_qd.envs.base.PhysicsEnv` for a plan."""
+    inputs.require_state(state, "fault")
+    start = state.pipeline_state
+    actions = jax.vmap(
+        lambda action: inputs.checked_action(action, base.action_size, base.dtype)
+    )(actions)
+    controls = jax.vmap(base.control, (None, 0))(start, actions)
+    # as in ``PhysicsEnv.step``: such a control tells the physics to freeze a world
+    sound = jnp.all(jnp.isfinite(actions), axis=1) & (state.info["fault"] == 0)
+    controls = jnp.where(sound[:, None], controls, jnp.full_like(controls, jnp.nan))
+    return physics_rollout(base.system, start, controls, params)
+
+
+def _at_once(env: Any, state: State, actions: Action, known: Foreseen) -> State:
+    """Reads all steps side by side, as if they were worlds of a batch."""
+
+    def before(first: jax.Array, after: jax.Array) -> jax.Array:
+        return jnp.concatenate([jnp.asarray(first, after.dtype)[None], after[:-1]])
+
+    def step(start: Any, fault: jax.Array, action: Action, after: Foreseen) -> State:
+        info = {**state.info, "fault": fault}
+        begin = state.replace(pipeline_state=start, info=info)
+        return env.step(begin, action, after)
+
+    if not len(actions):
+        return _in_order(env, state, actions, known, known=True)
+    starts = jax.tree.map(before, state.pipeline_state, known.after)
+    faults = before(state.info["fault"], known.fault)
+    return jax.vmap(step)(starts, faults, actions, known)

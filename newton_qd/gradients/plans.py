@@ -1,0 +1,47 @@
+"""Episodes of a plan of actions, whose physics is one call."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from newton_qd.envs.env import Env
+from newton_qd.gradients.outcome import at_fault
+from newton_qd.types import Params
+
+
+def run_plan(
+    env: Env, first: Any, plan: jax.Array, params: Params, *, described: bool
+) -> tuple[jax.Array, jax.Array | None, jax.Array, jax.Array]:
+    """Runs a plan of actions in one world.
+
+    Args:
+        env: The environment.
+        first: State of the world.
+        plan: (T, nu) actions.
+        params: Physical parameters of the world; ``None``: the default ones.
+        described: Whether to return state descriptors.
+
+    Returns:
+        The sum () of rewards up to the first ``done``; the state descriptors (T, nd)
+        before each step, or ``None``; whether the episode had ended before each step
+        (T,); whether there was a fault () until then.
+    """
+    states = env.rollout(first, plan, params)
+    ended = jax.lax.cummax((states.done > 0).astype(jnp.int32)) > 0
+    over = jnp.concatenate([jnp.zeros_like(ended[:1]), ended[:-1]])
+    bad = jnp.any(~over & jax.vmap(at_fault)(states))
+
+    # This sum is in time order. A reduction over time would depend on the batch size.
+    def add(total: jax.Array, row: tuple) -> tuple[jax.Array, None]:
+        over, reward = row
+        return jnp.where(over, total, total + reward), None
+
+    zero = jnp.zeros_like(states.reward[0])
+    fitness, _ = jax.lax.scan(add, zero, (over, states.reward))
+    if not described:
+        return fitness, None, over, bad
+    begin, after = (x.info["state_descriptor"] for x in (first, states))
+    return fitness, jnp.concatenate([begin[None], after[:-1]]), over, bad
