@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import importlib
+import pickle
 from typing import Any
 
 import jax
@@ -117,6 +118,36 @@ def test_scores(line: Any) -> None:
     np.testing.assert_allclose(sizes[:, 0], [1, 0, 1], rtol=1e-6)
     mixed = episode.scoring(functools.partial(episode.mixed, samples=2, sigma=0.1))
     assert jax.jit(mixed)(plans, KEY)[2]["gradients"].shape == (3, STEPS, 1, 2)
+
+
+def test_what_is_not_jitted_is_compiled_once() -> None:
+    """The policy is traced in the first call only, also by gradients of a call."""
+    traces = []
+
+    def policy(weights: jax.Array, obs: jax.Array) -> jax.Array:
+        traces.append(obs)
+        return jnp.tanh(weights * obs)
+
+    episode = Episode(Line(1.1), policy, get_final_xy_position, episode_length=STEPS)
+    weights = jnp.array([[0.1], [0.2]], jnp.float32)
+    around = {"params": None, "samples": 2, "sigma": 0.1}
+    calls = {
+        "call": lambda: episode(weights[0], KEY),
+        "gradient": lambda: episode.gradient(weights, KEY),
+        "keywords": lambda: episode.gradient(genotypes=weights, start=KEY),
+        "others": lambda: episode.gradient(genotypes=2 * weights, start=KEY),
+        "mixed": lambda: episode.mixed(weights, KEY, **around),
+        "scores": lambda: episode.scoring()(weights, KEY),
+        "of a call": lambda: jax.grad(lambda w: episode(w, KEY).fitness)(weights[0]),
+        "of many": lambda: jax.vmap(episode, (0, None))(weights, KEY),
+    }
+    for name, call in calls.items():
+        first = call()
+        traces.clear()
+        assert same(call(), first) and not traces, name
+        assert same(jax.jit(call)(), first), name
+    assert pickle.loads(pickle.dumps(Episode(Line(1.1), episode_length=2))) is not None
+    assert not hasattr(dataclasses.replace(episode, episode_length=2), "_compiled")
 
 
 def test_no_fault_pays(line: Any) -> None:

@@ -17,6 +17,7 @@ from newton_qd.checks import Fact, message
 from newton_qd.envs.env import Env
 from newton_qd.envs.state import select
 from newton_qd.extractors import Trajectories, check_extractor
+from newton_qd.gradients.compiled import compiled_once, without_compiled
 from newton_qd.gradients.exact import EpisodeGradient, EpisodeGradients, differentiate
 from newton_qd.gradients.flow import EXACT, GradientOptions, passed_back, scan_keeping
 from newton_qd.gradients.mixed import (
@@ -67,12 +68,12 @@ def itself(genotype: _Same) -> _Same:
 class Episode:
     """One episode of an environment with a policy, and its gradients.
 
-    Every method is a pure function and works with ``jax.jit`` and ``jax.vmap``. An
-    episode is immutable. It compares and hashes by identity, so it can be a static
-    argument of jitted functions. A call runs one world. It is differentiable with
-    respect to the genotype, the initial state and the physical parameters of the world.
-    The other methods take N genotypes, a pytree with leaves (N, ...). All N episodes
-    have the same start.
+    Every method is a pure function and works with ``jax.jit`` and ``jax.vmap``. Outside
+    of ``jax.jit``, the first call of a method compiles it. An episode is immutable. It
+    compares and hashes by identity, so it can be a static argument of jitted functions.
+    A call runs one world. It is differentiable with respect to the genotype, the
+    initial state and the physical parameters of the world. The other methods take N
+    genotypes, a pytree with leaves (N, ...). All N episodes have the same start.
 
         episode = Episode(env, policy, extractor, episode_length=100)
         outcome = episode(genotype, key)
@@ -130,6 +131,11 @@ class Episode:
         checks.instance("options", self.options, GradientOptions, "GradientOptions")
         checks.flag("transitions", self.transitions)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Returns what pickle stores."""
+        return without_compiled(self.__dict__)
+
+    @compiled_once
     def __call__(
         self, genotype: Genotype, start: Start, params: Params = None, /
     ) -> Outcome:
@@ -173,6 +179,7 @@ class Episode:
         )
         return self._outcome(fitness, readings, over, bad, taken)
 
+    @compiled_once
     def gradient(
         self, genotypes: Genotype, start: Start, params: Params = None
     ) -> EpisodeGradients:
@@ -194,6 +201,7 @@ class Episode:
         axes = (0, None, None, None)
         return jax.vmap(self._differentiated, axes)(genotypes, None, start, params)
 
+    @compiled_once
     def directional(
         self,
         genotypes: Genotype,
@@ -224,6 +232,7 @@ class Episode:
         axes = (0, 0, None, None)
         return jax.vmap(self._differentiated, axes)(genotypes, weights, start, params)
 
+    @compiled_once
     def mixed(
         self,
         genotypes: Genotype,
@@ -295,6 +304,7 @@ class Episode:
             return self._score
         return lambda genotypes, key: gradient_scores(gradient(genotypes, key))
 
+    @compiled_once
     def _score(
         self, genotypes: Genotype, key: RNGKey
     ) -> tuple[jax.Array, jax.Array, ExtraScores]:
