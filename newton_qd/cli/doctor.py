@@ -1,18 +1,25 @@
-"""``newton-qd doctor``: measures where gradients of an environment are useful."""
+"""``newton-qd doctor gradients``: measures where gradients are useful."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-from newton_qd.cli import modules
+from newton_qd.cli import health, modules
 from newton_qd.cli.arguments import BAD_ARGUMENTS, OK, Commands, complain, widths
 
 
 def add_parser(commands: Commands) -> None:
     """Adds the command to the subparsers of ``newton-qd``."""
-    doctor = commands.add_parser("doctor", help="measure where gradients are useful")
-    ailments = doctor.add_subparsers(dest="ailment", required=True, metavar="WHAT")
+    doctor = commands.add_parser(
+        "doctor",
+        help="check the installation, or measure where gradients are useful",
+        description="Without WHAT, checks the installation: versions, devices, missing "
+        "packages, and a few steps of an ant.",
+    )
+    doctor.add_argument("--json", action="store_true", help="print JSON, for scripts")
+    doctor.set_defaults(run=health.run, modules=[])
+    ailments = doctor.add_subparsers(dest="ailment", metavar="WHAT")
     parser = ailments.add_parser(
         "gradients",
         help="measure over how many control steps a gradient is useful, and why",

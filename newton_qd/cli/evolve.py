@@ -116,6 +116,8 @@ def _report(result: EvolveResult, out: Path, modules: Sequence[str]) -> None:
                 f"best fitness {again.max_fitness:.1f}"
             )
         print(f"results in {out}")
+        own = "".join(f" --module {shlex.quote(name)}" for name in modules)
+        print(f"see them: newton-qd explore {shlex.quote(str(out))}{own}")
     if result.interrupted:
         when = "before the initial population"
         if result.iteration >= 0:

@@ -1,0 +1,56 @@
+"""What ``newton-qd envs NAME`` and ``newton-qd doctor`` say."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+import newton_qd
+from newton_qd import cli
+
+
+def test_an_environment_is_described(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["envs", "ant_uni"]) == cli.OK
+    text = capsys.readouterr().out
+    for part in (
+        "observation: 87 numbers",
+        "hip_1, gear ",
+        "descriptor: feet_contact, limits 0 to 1, 0 to 1, 0 to 1, 0 to 1",
+        "reward_forward: ",
+        "FeetContactWrapper",
+        "picture: ",
+    ):
+        assert part in text
+    assert max(map(len, text.splitlines())) < 100
+    assert cli.main(["envs", "pointmaze", "--json"]) == cli.OK
+    found = json.loads(capsys.readouterr().out)
+    assert found["descriptor"]["low"] == [-1, -1] and found["step_seconds"] == 1
+    assert sum(block["size"] for block in found["observation"]) == 2
+    assert cli.main(["envs", "antt"]) == cli.BAD_ARGUMENTS
+    assert "does not exist" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_doctor_checks_the_installation(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert cli.main(["doctor", "--json"]) == cli.OK
+    found = json.loads(capsys.readouterr().out)
+    assert found["check"]["passed"] and found["kernel_cache"]["writable"]
+    assert found["packages"]["jax"] and found["devices"]
+    assert len(json.dumps(found)) > 200
+
+    def broken(*arguments: object, **options: object) -> None:
+        raise RuntimeError("no such thing")
+
+    monkeypatch.setattr(newton_qd, "create", broken)
+    assert cli.main(["doctor"]) == cli.FAILED
+    assert "check failed: RuntimeError: no such thing" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_the_table_for_scripts(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["envs", "--json"]) == cli.OK
+    rows = json.loads(capsys.readouterr().out)
+    assert [row["name"] for row in rows] == [*newton_qd.registered_envs()]
