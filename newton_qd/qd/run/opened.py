@@ -18,7 +18,7 @@ import numpy as np
 
 from newton_qd import checks
 from newton_qd.checks import Fact, message
-from newton_qd.qd.algorithms import algorithm_named
+from newton_qd.qd.algorithms import ALGORITHMS, algorithm_named
 from newton_qd.qd.config import ConfigError, EvolveConfig, read_config
 from newton_qd.qd.extras import require_extra
 from newton_qd.qd.run.archive import ARCHIVE, Archive, load_archive
@@ -33,14 +33,14 @@ from newton_qd.qd.run.folder import (
 from newton_qd.qd.run.plot import grid_indices
 from newton_qd.qd.run.reevaluation import Reevaluated
 from newton_qd.qd.run.search import start_key
-from newton_qd.qd.scoring.robust import run_scoring
+from newton_qd.qd.scoring.robust import robust_scoring, run_scoring
 from newton_qd.qd.scoring.rollout import (
     Policy,
     episode_of,
     make_policy,
 )
 from newton_qd.qd.scoring.task import Task, make_task, randomized
-from newton_qd.types import Repertoire, RNGKey
+from newton_qd.types import Repertoire, RNGKey, ScoringFunction
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -264,8 +264,21 @@ class Run:
     @functools.cached_property
     def _score(self) -> Callable[[jax.Array, jax.Array], tuple]:
         """The scoring function of the loop, compiled: genotypes and their keys."""
-        score = jax.jit(run_scoring(self.config, self.task, self.policy))
+        score = jax.jit(self._plain_scoring())
         return lambda genotypes, _: score(genotypes, self.start_key)[:2]
+
+    def _plain_scoring(self) -> ScoringFunction:
+        """Returns the scoring function of the loop, without gradients.
+
+        Those of the package have the same values with gradients; a registered
+        algorithm may score differently.
+        """
+        config, spec = self.config, algorithm_named(self.config.algorithm)
+        if spec in ALGORITHMS or spec.scoring is None:
+            return run_scoring(config, self.task, self.policy)
+        options = spec.read_options(config)
+        score = spec.scoring(config, options, self.task, self.policy)
+        return robust_scoring(score, starts=config.starts, statistic=config.statistic)
 
     @functools.cached_property
     def _pairs(self) -> Callable[[jax.Array, jax.Array], tuple]:
