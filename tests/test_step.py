@@ -316,11 +316,12 @@ def test_lanes_change_nothing(
 
 
 @pytest.mark.gpu
+@pytest.mark.parametrize("setting", ["NEWTON_QD_LANES", "NEWTON_QD_DETERMINISTIC"])
 def test_one_lane_gives_the_same_gradient_twice(
-    device: jax.Device, monkeypatch: pytest.MonkeyPatch
+    device: jax.Device, monkeypatch: pytest.MonkeyPatch, setting: str
 ) -> None:
     """The deterministic mode: a world's only thread adds in the program's order."""
-    monkeypatch.setenv("NEWTON_QD_LANES", "1")
+    monkeypatch.setenv(setting, "1")
     system, states = single_states(4096)
     first = gradients(system, states)
     for _ in range(3):
@@ -402,6 +403,12 @@ def test_a_diverging_world_is_at_fault(speed: float) -> None:
 def test_bad_number_of_lanes(monkeypatch: pytest.MonkeyPatch, text: str) -> None:
     monkeypatch.setenv("NEWTON_QD_LANES", text)
     with pytest.raises(ValueError, match="NEWTON_QD_LANES"):
+        lane_count("step_backward")
+
+
+def test_bad_deterministic_mode(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NEWTON_QD_DETERMINISTIC", "yes")
+    with pytest.raises(ValueError, match="NEWTON_QD_DETERMINISTIC"):
         lane_count("step_backward")
 
 

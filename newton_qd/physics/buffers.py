@@ -35,7 +35,7 @@ _PAIRED = ("pair_weight", "pair_impulse", "pair_adjoint", "pair_w", "pair_v")
 _PASSED = ("passed_ww", "passed_wv", "passed_vv", "passed_w", "passed_v", "effort")
 _PASSED += ("multiplier_w", "multiplier_v")
 _WITHOUT_ADJOINT = (*_PER_SOLVE_BODY, *_ROOT_FACTORS, *_ANSWERS, *_PAIRED)
-_WITHOUT_ADJOINT += ("pair_coupling", *_PASSED)
+_WITHOUT_ADJOINT += ("pair_coupling", "wrong", *_PASSED)
 _PER_READING = ("body_impulse", "body_angular_impulse", "body_normal_impulse")
 _PER_READING += ("position", "com", "com_velocity")
 _REPORTED = ("impulse", "angular_impulse", "normal_impulse")
@@ -110,7 +110,8 @@ def build_model(system: System, device: wp.Device, parametric: bool = False) -> 
     put("rest_q", system.rest_q)
     put("origin_axis", reference.origin_axes(system))
     _put_bodies(put, system, tree)
-    model.body_levels = len(tree.body_level[0]) - 1
+    model.levels = len(tree.limb_level) - 1
+    model.roots = int(tree.limb_level[1])
     _put_dofs(put, system)
     model.limit_smoothing = material.limit_smoothing
     model.limit_dissipation = material.limit_dissipation
@@ -220,8 +221,9 @@ def _put_bodies(put: Put, system: System, tree: Tree) -> None:
     ball = system.inertia[:, :1, :1] * np.eye(3)
     isotropic = np.all(system.inertia == ball, axis=(1, 2))
     put("isotropic", _with_world(isotropic.astype(np.int32)))
-    put("body_level_start", tree.body_level[0])
-    put("body_level", tree.body_level[1])
+    put("limb_level", tree.limb_level)
+    put("limb_start", tree.limb[0])
+    put("limb_body", tree.limb[1])
     put("child_start", tree.child[0])
     put("child", tree.child[1])
 
@@ -288,6 +290,7 @@ def _entries(system: System, adjoint: bool) -> dict[str, int]:
     return {
         "fault": 1,
         "lost": 1,
+        "wrong": nc,
         "q": (n + 2) * system.nq,
         "v": (turns + 2) * system.nv,
         "ctrl": max(system.nu, 1),

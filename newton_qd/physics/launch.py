@@ -25,10 +25,13 @@ _MODULES = {
     "contact_gaps": "gaps",
     "contact_impulses": "impulses",
 }
-# The fastest numbers of lanes on an H200, up to a number of worlds and beyond: a small
-# batch needs more lanes to fill the GPU. docs/verification.md has the measurements.
+# Kernels with lanes, and the fastest number of them on an H200. A tree without branches
+# leaves most lanes idle, so many worlds of it take fewer. docs/verification.md has the
+# measurements.
+_LANE_KERNELS = ("step_forward", "step_backward")
+_LANES = 8
 _MANY_WORLDS = 8192
-_LANES = {"step_forward": (8, 8), "step_backward": (8, 4)}
+_LANES_OF_MANY_CHAINS = 4
 # Minimum number of packs per thread, without and with adjoint. For fewer packs, waking
 # another thread takes longer than the work that it saves.
 _PACKS_PER_THREAD = {False: 4, True: 2}
@@ -55,24 +58,34 @@ def thread_count() -> int:
     return int(text)
 
 
-def lane_count(kernel: str, worlds: int = 1) -> int:
+def lane_count(kernel: str, worlds: int = 1, branches: bool = True) -> int:
     """Returns the number of lanes per world of a GPU launch.
 
     It is ``NEWTON_QD_LANES``, or by default the number that was measured as fastest.
+    An adjoint has one lane where ``NEWTON_QD_DETERMINISTIC`` is 1: lanes add to
+    gradients in no fixed order, but change no value of a step.
 
     Args:
         kernel: Name of the kernel. Only the kernels of the step support several lanes;
             the result for all others is 1.
         worlds: Number of worlds of the launch.
+        branches: Whether a body of the robot has several children.
 
     Raises:
-        ValueError: The environment variable is not one of ``LANES``.
+        ValueError: ``NEWTON_QD_LANES`` is not one of ``LANES``, or
+            ``NEWTON_QD_DETERMINISTIC`` is not 0 or 1.
     """
-    if kernel not in _LANES:
+    if kernel not in _LANE_KERNELS:
+        return 1
+    fixed = os.environ.get("NEWTON_QD_DETERMINISTIC", "0")
+    if fixed not in ("0", "1"):
+        raise ValueError(message("NEWTON_QD_DETERMINISTIC", fixed, "0, 1"))
+    if fixed == "1" and kernel == "step_backward":
         return 1
     text = os.environ.get("NEWTON_QD_LANES")
     if text is None:
-        return _LANES[kernel][worlds > _MANY_WORLDS]
+        many = worlds > _MANY_WORLDS and not branches
+        return _LANES_OF_MANY_CHAINS if many else _LANES
     if not text.isdecimal() or int(text) not in LANES:
         raise ValueError(message("NEWTON_QD_LANES", text, listed(LANES)))
     return int(text)
@@ -142,6 +155,7 @@ class Launcher:
         self.kernels = buffers.kernels_of(system, device, parametric)
         self.model = buffers.build_model(system, device, parametric)
         self._block = 1 if device.is_cpu else _GPU_BLOCK
+        self._branches = self.model.levels > 1
         self._scratch: dict[tuple[bool, int], tuple[int, buffers.Memory]] = {}
         self._commands: dict[tuple[str, int, bool], _Command] = {}
         self._plans: dict[str, Plan] = {}
@@ -171,8 +185,8 @@ class Launcher:
             y: (worlds * outputs,) Warp array to write.
 
         Raises:
-            ValueError: The value of ``NEWTON_QD_THREADS`` or ``NEWTON_QD_LANES`` is
-                not allowed.
+            ValueError: The value of ``NEWTON_QD_THREADS``, ``NEWTON_QD_LANES`` or
+                ``NEWTON_QD_DETERMINISTIC`` is not allowed.
         """
         self.launch("step_forward", worlds, x, y)
 
@@ -194,8 +208,8 @@ class Launcher:
             adjoint: Whether to run the adjoint of the kernel.
 
         Raises:
-            ValueError: The value of ``NEWTON_QD_THREADS`` or ``NEWTON_QD_LANES`` is
-                not allowed.
+            ValueError: The value of ``NEWTON_QD_THREADS``, ``NEWTON_QD_LANES`` or
+                ``NEWTON_QD_DETERMINISTIC`` is not allowed.
         """
         if worlds == 0:
             return
@@ -207,13 +221,14 @@ class Launcher:
         resident = min(-(-worlds // _WARP) * _WARP, _RESIDENT_WORLDS[adjoint])
         owner = wp.get_stream(self.device).cuda_stream
         commands = [self._command(kernel, owner, resident, arrays, adjoint)]
-        lanes = [lane_count(name, worlds)]
+        lanes = [lane_count(name, worlds, self._branches)]
         if adjoint:  # a launch of its own runs the parts of the kernel, see `part`
             forward = self._command(
                 kernel, owner, resident, arrays, adjoint, parts=True
             )
             commands.insert(0, forward)
-            lanes.insert(0, lane_count(name.replace("backward", "forward"), worlds))
+            run_first = name.replace("backward", "forward")
+            lanes.insert(0, lane_count(run_first, worlds, self._branches))
         for first in range(0, worlds, resident):
             count = min(resident, worlds - first)
             for command, number in zip(commands, lanes, strict=True):

@@ -20,12 +20,23 @@ def _ragged(rows: Sequence[Sequence[int]]) -> tuple[np.ndarray, np.ndarray]:
     return starts, np.asarray(items, np.int32)
 
 
-def _by_level(level: Sequence[int]) -> list[list[int]]:
-    """Returns the items grouped by level, roots first."""
-    return [
-        [item for item, its in enumerate(level) if its == n]
-        for n in range(max(level) + 1)
-    ]
+def _limbs(children: Sequence[Sequence[int]]) -> list[list[list[int]]]:
+    """Returns the limbs by level: those at the world, those that branch off them, ...
+
+    A limb is a run of bodies, each but the last of which has one child. Row 0 of
+    ``children`` is the world.
+    """
+    levels, first = [], list(children[0])
+    while first:
+        limbs = []
+        for body in first:
+            limb = [body]
+            while len(children[limb[-1]]) == 1:
+                limb.append(children[limb[-1]][0])
+            limbs.append(limb)
+        levels.append(limbs)
+        first = [child for limb in limbs for child in children[limb[-1]]]
+    return levels
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,13 +45,15 @@ class Tree:
 
     Attributes:
         body_parent: (nb + 1,) parent of each body.
-        body_level: Start of each level, and the bodies by level, roots first.
+        limb_level: (levels + 1,) first limb of each level; roots are in the first one.
+        limb: Start of each limb, and the bodies by limb, each from root to tip.
         child: (nb + 2,) start of each body's children, and the children.
         contact: (nb + 2,) start of each body's contacts.
     """
 
     body_parent: np.ndarray
-    body_level: tuple[np.ndarray, np.ndarray]
+    limb_level: np.ndarray
+    limb: tuple[np.ndarray, np.ndarray]
     child: tuple[np.ndarray, np.ndarray]
     contact: np.ndarray
 
@@ -49,16 +62,14 @@ def build_tree(system: System) -> Tree:
     """Returns the index tables of ``system``."""
     nb = system.nb
     parent = [-1, *(int(p) + 1 for p in system.parent)]
-    level = [-1]
-    for body in range(1, nb + 1):
-        level.append(level[parent[body]] + 1)
-    levels = [[b + 1 for b in row] for row in _by_level(level[1:])]
     children = [[c for c in range(1, nb + 1) if parent[c] == b] for b in range(nb + 1)]
+    levels = _limbs(children)
 
     contact_counts = np.bincount(system.contact_body + 1, minlength=nb + 1)
     return Tree(
         body_parent=np.asarray(parent, np.int32),
-        body_level=_ragged(levels),
+        limb_level=np.asarray([0, *np.cumsum([len(row) for row in levels])], np.int32),
+        limb=_ragged([limb for row in levels for limb in row]),
         child=_ragged(children),
         contact=np.asarray([0, *np.cumsum(contact_counts)], np.int32),
     )

@@ -60,6 +60,9 @@ width = _variant.width
 parametric = _variant.parametric
 boxes = _variant.boxes
 pairs = _variant.pairs
+# Whether lanes share a pack: then what bodies need of themselves alone is computed
+# ahead, side by side, and the sweeps over the tree only hand on.
+shared = width == 1
 
 # One value for each world of a pack.
 real = wp.types.vector(length=width, dtype=scalar)
@@ -70,13 +73,10 @@ mat33 = wp.types.matrix(shape=(9, width), dtype=scalar)
 # xx, xy, xz, yy, yz, zz of a symmetric matrix
 sym33 = wp.types.matrix(shape=(6, width), dtype=scalar)
 
-# Threads of a GPU's block at most, and blocks that fit on a multiprocessor, of kernels
-# without and with adjoint. The compiler gives a thread the registers that these leave.
-# With more threads, less of the time passes in waiting for memory.
+# Threads of a GPU's block at most, and blocks that fit on a multiprocessor. They leave
+# 128 registers for a thread of float32: few are spilled.
 block = 256
-_fit = 1 if scalar == wp.float64 else 2
-bounds = (block, 2 * _fit)
-adjoint_bounds = (block, _fit)
+bounds = (block, 1 if scalar == wp.float64 else 2)
 
 _SYNC = """
 #if defined(__CUDA_ARCH__)

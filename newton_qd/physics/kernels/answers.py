@@ -170,28 +170,52 @@ def answer_between(m: Model, sc: Scratch, offsets: Offsets, i: int, j: int):
 
 
 @plain
+def gather_limb(m: Model, sc: Scratch, offsets: Offsets, j: int, limb: int):
+    """Wrenches of pair ``j``'s unit impulses on a limb, from tip to root.
+
+    Reads: m.joint_kind, m.limb_start, m.limb_body.
+    """
+    first = load(m.limb_start, limb)
+    stop = load(m.limb_start, limb + 1)
+    for turn in range(stop - first):
+        i = load(m.limb_body, stop - 1 - turn)
+        gather_unit(m, sc, offsets, j, i)
+        if load(m.joint_kind, i) != JointKind.FREE:
+            unit_effort(m, sc, offsets, j, i)
+
+
+@plain
+def answer_limb(m: Model, sc: Scratch, offsets: Offsets, j: int, limb: int):
+    """What a limb answers to pair ``j``'s unit impulses, from root to tip.
+
+    Reads: m.joint_kind, m.limb_start, m.limb_body.
+    """
+    for p in range(load(m.limb_start, limb), load(m.limb_start, limb + 1)):
+        i = load(m.limb_body, p)
+        if load(m.joint_kind, i) == JointKind.FREE:
+            answer_free(m, sc, offsets, j, i)
+        else:
+            answer_axis(m, sc, offsets, j, i)
+
+
+@plain
 def answer(m: Model, sc: Scratch, offsets: Offsets, j: int, lane: int, lanes: int):
     """The tree's answer to pair ``j``'s unit impulses: to the root, and back.
 
-    Reads: m.joint_kind, m.body_levels, m.body_level_start, m.body_level.
+    Reads: m.levels, m.roots, m.limb_level.
     """
     if lane == 0:
         rest_answer(m, sc, offsets, j)
-    for n in range(m.body_levels):
-        level = m.body_levels - 1 - n
-        start = load(m.body_level_start, level)
-        for p in range(start + lane, load(m.body_level_start, level + 1), lanes):
-            i = load(m.body_level, p)
-            gather_unit(m, sc, offsets, j, i)
-            if load(m.joint_kind, i) != JointKind.FREE:
-                unit_effort(m, sc, offsets, j, i)
-        sync(lane)
-    for level in range(m.body_levels):
-        start = load(m.body_level_start, level)
-        for p in range(start + lane, load(m.body_level_start, level + 1), lanes):
-            i = load(m.body_level, p)
-            if load(m.joint_kind, i) == JointKind.FREE:
-                answer_free(m, sc, offsets, j, i)
-            else:
-                answer_axis(m, sc, offsets, j, i)
+    for turn in range(m.levels):
+        level = m.levels - 1 - turn
+        first = load(m.limb_level, level) + lane
+        for limb in range(first, load(m.limb_level, level + 1), lanes):
+            gather_limb(m, sc, offsets, j, limb)
+        # the lane of the world has the first root as well
+        if level > 0 or m.roots > 1:
+            sync(lane)
+    for level in range(m.levels):
+        first = load(m.limb_level, level) + lane
+        for limb in range(first, load(m.limb_level, level + 1), lanes):
+            answer_limb(m, sc, offsets, j, limb)
         sync(lane)

@@ -13,9 +13,11 @@ what leaves it are the factors of its joint, which the adjoint (:mod:`.solve`) u
 again, and what it passes on.
 """
 
+import warp as wp
+
 from newton_qd.physics.kinds import JointKind
 
-from . import mat33, plain, scalar, sym33, sync, vec3
+from . import mat33, pairs, plain, real, scalar, shared, sym33, sync, vec3
 from .cpp.algebra import (
     add_diagonal,
     component,
@@ -35,19 +37,21 @@ from .cpp.operators import add, div, mul, sub  # noqa: F401
 from .parameters import body_mass
 from .structs import Model, Offsets, Scratch
 
+PAIRS = wp.constant(pairs)
+SHARED = wp.constant(shared)
+
 
 @plain
-def body_equation(m: Model, sc: Scratch, offsets: Offsets, i: int):
-    """Inertia and wrench of body ``i``: its own, its contacts', its children's.
+def own_equation(m: Model, sc: Scratch, offsets: Offsets, i: int):
+    """Inertia and wrench of body ``i``: its own and its contacts'.
 
     Contacts of pairs are not among them: :mod:`.coupling` adds them. A contact at r
     with weight W = wt 1 + (wn - wt) n n^T is a point of mass wt there, and with
-    R = [r]x and l = r x n adds (wn - wt) times l l^T, l n^T and n n^T.
+    R = [r]x and l = r x n adds (wn - wt) times l l^T, l n^T and n n^T. First mass
+    moment, mass and bias wrench are apart; :func:`with_bias` adds them.
 
-    Reads: m.h, m.child_start, m.child, m.contact_start, m.contact_stop, sc.parameter,
-        sc.inertia, sc.moment, sc.wrench_w, sc.wrench_v, sc.point, sc.normal, sc.push,
-        sc.weight_n, sc.weight_t, sc.passed_ww, sc.passed_wv, sc.passed_vv, sc.passed_w,
-        sc.passed_v.
+    Reads: m.contact_start, m.contact_stop, sc.parameter, sc.inertia, sc.moment,
+        sc.point, sc.normal, sc.push, sc.weight_n, sc.weight_t.
     """
     body = offsets.body + i
     mass = body_mass(m, sc, offsets, i)
@@ -75,16 +79,29 @@ def body_equation(m: Model, sc: Scratch, offsets: Offsets, i: int):
         vv = vv + parallel(normal, more * normal)
         n = n + cross(r, p)
         f = f + p
-    for j in range(load(m.child_start, i), load(m.child_start, i + 1)):
-        child = offsets.reading + load(m.child, j)
-        ww = ww + load(sc.passed_ww, child)
-        wv = wv + load(sc.passed_wv, child)
-        vv = vv + load(sc.passed_vv, child)
-        n = n + load(sc.passed_w, child)
-        f = f + load(sc.passed_v, child)
+    return ww, wv, vv, n, f, moment, mass
+
+
+@plain
+def with_bias(
+    m: Model,
+    sc: Scratch,
+    offsets: Offsets,
+    i: int,
+    wv: mat33,
+    vv: sym33,
+    n: vec3,
+    f: vec3,
+    moment: vec3,
+    mass: real,
+):
+    """Equation of body ``i`` with its mass, first mass moment and bias wrench.
+
+    Reads: m.h, sc.wrench_w, sc.wrench_v.
+    """
     n = n - m.h * load(sc.wrench_w, offsets.motion + i)
     f = f - m.h * load(sc.wrench_v, offsets.motion + i)
-    return ww, wv + skew(moment), add_diagonal(vv, mass), n, f
+    return wv + skew(moment), add_diagonal(vv, mass), n, f
 
 
 @plain
@@ -99,15 +116,12 @@ def eliminate_axis(
     n: vec3,
     f: vec3,
 ):
-    """Take the joint's dof out of body ``i``'s equation; pass the rest on.
+    """Take the joint's dof out of body ``i``'s equation; returns what is passed on.
 
-    Reads: m.body_parent, m.v_start, sc.axis_w, sc.axis_v, sc.joint_push,
-        sc.joint_weight.
-    Writes: sc.lever_w, sc.lever_v, sc.share, sc.passed_ww, sc.passed_wv, sc.passed_vv,
-        sc.passed_w, sc.passed_v, sc.effort.
+    Reads: m.v_start, sc.axis_w, sc.axis_v, sc.joint_push, sc.joint_weight.
+    Writes: sc.lever_w, sc.lever_v, sc.share, sc.effort.
     """
     at = offsets.solve_body + i
-    here = offsets.reading + i
     k = load(m.v_start, i)
     sw = load(sc.axis_w, offsets.dof + k)
     sv = load(sc.axis_v, offsets.dof + k)
@@ -121,13 +135,66 @@ def eliminate_axis(
     store(sc.lever_w, at, scaled_w)
     store(sc.lever_v, at, scaled_v)
     store(sc.share, at, share)
-    store(sc.effort, here, share * effort)
-    if load(m.body_parent, i) > 0:
-        store(sc.passed_ww, here, ww - parallel(uw, scaled_w))
-        store(sc.passed_wv, here, wv - outer(uw, scaled_v))
-        store(sc.passed_vv, here, vv - parallel(uv, scaled_v))
-        store(sc.passed_w, here, n - effort * scaled_w)
-        store(sc.passed_v, here, f - effort * scaled_v)
+    store(sc.effort, offsets.reading + i, share * effort)
+    return (
+        ww - parallel(uw, scaled_w),
+        wv - outer(uw, scaled_v),
+        vv - parallel(uv, scaled_v),
+        n - effort * scaled_w,
+        f - effort * scaled_v,
+    )
+
+
+@plain
+def eliminate_limb(m: Model, sc: Scratch, offsets: Offsets, limb: int):
+    """Eliminate the joints of a limb, from tip to root.
+
+    Reads: m.joint_kind, m.body_parent, m.limb_start, m.limb_body, m.child_start,
+        m.child, sc.passed_ww, sc.passed_wv, sc.passed_vv, sc.passed_w, sc.passed_v.
+    Writes: sc.passed_ww, sc.passed_wv, sc.passed_vv, sc.passed_w, sc.passed_v.
+    """
+    first = load(m.limb_start, limb)
+    stop = load(m.limb_start, limb + 1)
+    ww_in = sym33()
+    wv_in = mat33()
+    vv_in = sym33()
+    n_in = vec3()
+    f_in = vec3()
+    for turn in range(stop - first):
+        i = load(m.limb_body, stop - 1 - turn)
+        ww, wv, vv, n, f, moment, mass = own_equation(m, sc, offsets, i)
+        # limbs that branch off the tip; inside of the limb there is one child
+        branch = load(m.child_start, i)
+        branches = load(m.child_start, i + 1)
+        if turn > 0:
+            branches = branch
+        for j in range(branch, branches):
+            child = offsets.reading + load(m.child, j)
+            ww = ww + load(sc.passed_ww, child)
+            wv = wv + load(sc.passed_wv, child)
+            vv = vv + load(sc.passed_vv, child)
+            n = n + load(sc.passed_w, child)
+            f = f + load(sc.passed_v, child)
+        ww = ww + ww_in
+        wv = wv + wv_in
+        vv = vv + vv_in
+        n = n + n_in
+        f = f + f_in
+        wv, vv, n, f = with_bias(m, sc, offsets, i, wv, vv, n, f, moment, mass)
+        if load(m.joint_kind, i) == JointKind.FREE:
+            solve_free(m, sc, offsets, i, ww, wv, vv, n, f)
+        else:
+            ww_in, wv_in, vv_in, n_in, f_in = eliminate_axis(
+                m, sc, offsets, i, ww, wv, vv, n, f
+            )
+    root = load(m.limb_body, first)
+    if load(m.body_parent, root) > 0:
+        here = offsets.reading + root
+        store(sc.passed_ww, here, ww_in)
+        store(sc.passed_wv, here, wv_in)
+        store(sc.passed_vv, here, vv_in)
+        store(sc.passed_w, here, n_in)
+        store(sc.passed_v, here, f_in)
 
 
 @plain
@@ -141,27 +208,47 @@ def rest_world(sc: Scratch, offsets: Offsets):
 
 
 @plain
-def change_axis(m: Model, sc: Scratch, offsets: Offsets, i: int):
-    """Change of the joint's velocity and of body ``i``'s twist.
+def change_axis(m: Model, sc: Scratch, offsets: Offsets, i: int, w: vec3, v: vec3):
+    """Change of the joint's velocity and of body ``i``'s twist, which is returned.
 
-    Reads: m.body_parent, m.v_start, sc.axis_w, sc.axis_v, sc.change_w, sc.change_v,
-        sc.lever_w, sc.lever_v, sc.effort.
+    ``w`` and ``v`` are the change of the parent's twist.
+
+    Reads: m.v_start, sc.axis_w, sc.axis_v, sc.lever_w, sc.lever_v, sc.effort.
     Writes: sc.dv, sc.change_w, sc.change_v.
     """
     at = offsets.solve_body + i
-    up = offsets.solve_body + load(m.body_parent, i)
-    to = offsets.solve_body + i
     k = load(m.v_start, i)
-    w = load(sc.change_w, up)
-    v = load(sc.change_v, up)
     dv = (
         load(sc.effort, offsets.reading + i)
         - dot(load(sc.lever_w, at), w)
         - dot(load(sc.lever_v, at), v)
     )
+    w = w + dv * load(sc.axis_w, offsets.dof + k)
+    v = v + dv * load(sc.axis_v, offsets.dof + k)
     store(sc.dv, offsets.solve_dof + k, dv)
-    store(sc.change_w, to, w + dv * load(sc.axis_w, offsets.dof + k))
-    store(sc.change_v, to, v + dv * load(sc.axis_v, offsets.dof + k))
+    store(sc.change_w, at, w)
+    store(sc.change_v, at, v)
+    return w, v
+
+
+@plain
+def change_limb(m: Model, sc: Scratch, offsets: Offsets, limb: int):
+    """Changes of the twists of a limb, from root to tip.
+
+    Reads: m.joint_kind, m.body_parent, m.limb_start, m.limb_body, sc.change_w,
+        sc.change_v.
+    """
+    first = load(m.limb_start, limb)
+    root = load(m.limb_body, first)
+    if load(m.joint_kind, root) == JointKind.FREE:
+        first = first + 1
+        up = offsets.solve_body + root
+    else:
+        up = offsets.solve_body + load(m.body_parent, root)
+    w = load(sc.change_w, up)
+    v = load(sc.change_v, up)
+    for p in range(first, load(m.limb_start, limb + 1)):
+        w, v = change_axis(m, sc, offsets, load(m.limb_body, p), w, v)
 
 
 @plain
@@ -220,27 +307,25 @@ def solve_free(
 def solve_tree(m: Model, sc: Scratch, offsets: Offsets, lane: int, lanes: int):
     """Eliminate joints, leaves to root; velocity changes, root to leaves.
 
-    Reads: m.joint_kind, m.body_levels, m.body_level_start, m.body_level.
+    Reads: m.levels, m.roots, m.limb_level.
     """
     if lane == 0:
         rest_world(sc, offsets)
-    for turn in range(m.body_levels):
-        level = m.body_levels - 1 - turn
-        start = load(m.body_level_start, level)
-        for p in range(start + lane, load(m.body_level_start, level + 1), lanes):
-            i = load(m.body_level, p)
-            ww, wv, vv, n, f = body_equation(m, sc, offsets, i)
-            if load(m.joint_kind, i) == JointKind.FREE:
-                solve_free(m, sc, offsets, i, ww, wv, vv, n, f)
-            else:
-                eliminate_axis(m, sc, offsets, i, ww, wv, vv, n, f)
+    # the lanes of roots read it
+    if m.roots > 1:
         sync(lane)
-    for level in range(m.body_levels):
-        start = load(m.body_level_start, level)
-        for p in range(start + lane, load(m.body_level_start, level + 1), lanes):
-            i = load(m.body_level, p)
-            if load(m.joint_kind, i) != JointKind.FREE:
-                change_axis(m, sc, offsets, i)
+    for turn in range(m.levels):
+        level = m.levels - 1 - turn
+        first = load(m.limb_level, level) + lane
+        for limb in range(first, load(m.limb_level, level + 1), lanes):
+            eliminate_limb(m, sc, offsets, limb)
+        # the lanes of roots go on with them
+        if level > 0:
+            sync(lane)
+    for level in range(m.levels):
+        first = load(m.limb_level, level) + lane
+        for limb in range(first, load(m.limb_level, level + 1), lanes):
+            change_limb(m, sc, offsets, limb)
         sync(lane)
 
 
@@ -254,7 +339,9 @@ def contact_slip(m: Model, sc: Scratch, offsets: Offsets, c: int):
     at = offsets.solve_body + load(m.contact_body, c)
     r = load(sc.point, offsets.contact + c)
     dv = load(sc.change_v, at) + cross(load(sc.change_w, at), r)
-    partner = load(m.contact_partner, c)
+    partner = int(-1)
+    if PAIRS:
+        partner = load(m.contact_partner, c)
     if partner >= 0:
         other = offsets.solve_body + load(m.contact_body, partner)
         dv = dv - (load(sc.change_v, other) + cross(load(sc.change_w, other), r))

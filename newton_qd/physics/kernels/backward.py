@@ -2,14 +2,14 @@
 
 import warp as wp
 
-from . import adjoint_bounds, scalar
+from . import bounds, scalar
 from .cpp.place import place
 from .simulate import simulate
 from .structs import Model, Scratch, offsets_after, offsets_at
 from .world import load_world, pack_at, seed_world
 
 
-@wp.kernel(launch_bounds=adjoint_bounds)
+@wp.kernel(launch_bounds=bounds)
 def step_backward(
     # system
     m: Model,

@@ -16,7 +16,7 @@ a light foot gains energy.
 
 import warp as wp
 
-from . import real, scalar, stage, vec3
+from . import pairs, real, scalar, stage, vec3
 from .cpp.algebra import cross, dot, transform_point
 from .cpp.memory import constant, load, store
 from .cpp.numbers import sqrt, uniform
@@ -28,6 +28,7 @@ from .pair import touch_partner
 from .parameters import contact_stiffness, friction, total_mass
 from .structs import Model, Offsets, Scratch
 
+PAIRS = wp.constant(pairs)
 # Clipping switches over this fraction of its natural scale.
 CLIP_WIDTH = wp.constant(scalar(0.5))
 
@@ -67,7 +68,9 @@ def contact_predictor(m: Model, sc: Scratch, offsets: Offsets, c: int):
     """
     i = load(m.contact_body, c)
     x = load(sc.pose, offsets.body + i)
-    partner = load(m.contact_partner, c)
+    partner = int(-1)
+    if PAIRS:
+        partner = load(m.contact_partner, c)
     # one law for both: written twice, a GPU's compiler takes twice as long
     r = vec3()
     normal = vec3()
@@ -183,7 +186,10 @@ def contact_given(m: Model, sc: Scratch, offsets: Offsets, c: int, p: int):
     store(sc.push_n, at, applied)
     store(sc.weight_n, at, real())
     push = applied * n
-    if load(m.contact_partner, c) < 0 or p < m.iterations * m.solves - 1:
+    partner = int(-1)
+    if PAIRS:
+        partner = load(m.contact_partner, c)
+    if partner < 0 or p < m.iterations * m.solves - 1:
         # what of the friction is not given answers the new velocity
         answers = m.friction_answers * wt
         given = (scalar(1.0) - m.friction_answers) * wt

@@ -52,7 +52,7 @@ def contact_gaps(
     sc = place(scratch, pack.column)
     offsets = offsets_at(m, pack.slot, 0, 0, 0)
     load_views(m, sc, sc, offsets, x, x, pack)
-    kinematics(m, sc, offsets, 0, 1)
+    kinematics(m, sc, offsets, 0, 0, 1)
     for c in range(m.nc):
         write_output(
             y, pack.first * m.nc + c, m.nc, pack.count, gap_of(m, sc, offsets, c)

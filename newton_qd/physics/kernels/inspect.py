@@ -77,7 +77,7 @@ def read_bodies(m: Model, sc: Scratch, offsets: Offsets):
 
     Reads: m.nb.
     """
-    kinematics(m, sc, offsets, 0, 1)
+    kinematics(m, sc, offsets, 0, 0, 1)
     for i in range(1, m.nb + 1):
         body_reading(m, sc, offsets, i)
 
@@ -253,7 +253,7 @@ def dynamics_forward(
     sc = place(scratch, pack.column)
     offsets = offsets_at(m, pack.slot, 0, 0, 0)
     load_views(m, sc, sc, offsets, x, x, pack)
-    kinematics(m, sc, offsets, 0, 1)
+    kinematics(m, sc, offsets, 0, 0, 1)
     store_dynamics(m, sc, offsets, y, pack)
 
 

@@ -110,7 +110,8 @@ def joint_laws(m: Model, sc: Scratch, offsets: Offsets, lane: int, lanes: int):
 
     Reads: m.nb, m.joint_kind.
     """
-    for i in range(1 + lane, m.nb + 1, lanes):
+    # lanes with one more contact have no more joints
+    for i in range(lanes - lane, m.nb + 1, lanes):
         if load(m.joint_kind, i) == JointKind.FREE:
             free_law(m, sc, offsets, i)
         else:

@@ -7,6 +7,7 @@ from newton_qd.physics.kinds import JointKind
 
 from . import plain, scalar, sync, vec3
 from .answers import pair_side
+from .articulation import SHARED
 from .coupling import PAIRS, answered, pair_motion, with_answers
 from .cpp.algebra import cross, dot, translation, vector
 from .cpp.memory import add_adjoint, load, load_adjoint, store, store_adjoint
@@ -43,10 +44,10 @@ def pair_slip(m: Model, sc: Scratch, offsets: Offsets, j: int):
 
 @plain
 def adjoint_wrench(m: Model, sc: Scratch, offsets: Offsets, i: int):
-    """Wrench on body ``i`` of the adjoints of slips, with what its children hand on.
+    """Wrench on body ``i`` of the adjoints of slips.
 
-    Reads: m.pairs, m.child_start, m.child, m.contact_start, m.contact_stop, sc.point,
-        sc.pair_w, sc.pair_v, sc.passed_w, sc.passed_v, g.slip.
+    Reads: m.pairs, m.contact_start, m.contact_stop, sc.point, sc.pair_w, sc.pair_v,
+        g.slip.
     """
     n = vec3()
     f = vec3()
@@ -60,31 +61,36 @@ def adjoint_wrench(m: Model, sc: Scratch, offsets: Offsets, i: int):
             if side != scalar(0.0):
                 n = n + side * load(sc.pair_w, offsets.pair + j)
                 f = f + side * load(sc.pair_v, offsets.pair + j)
-    for j in range(load(m.child_start, i), load(m.child_start, i + 1)):
-        child = offsets.reading + load(m.child, j)
-        n = n + load(sc.passed_w, child)
-        f = f + load(sc.passed_v, child)
     return n, f
 
 
 @plain
+def keep_wrench(m: Model, sc: Scratch, offsets: Offsets, i: int):
+    """Leave body ``i``'s wrench where its joint leaves what it hands on.
+
+    Writes: sc.passed_w, sc.passed_v.
+    """
+    w, v = adjoint_wrench(m, sc, offsets, i)
+    store(sc.passed_w, offsets.reading + i, w)
+    store(sc.passed_v, offsets.reading + i, v)
+
+
+@plain
 def hand_back_axis(m: Model, sc: Scratch, offsets: Offsets, i: int, n: vec3, f: vec3):
-    """The adjoint's effort of a joint with one dof, and what the joint passes on.
+    """The adjoint's effort of a joint with one dof; returns what is passed on.
 
     Reads: m.v_start, sc.axis_w, sc.axis_v, sc.lever_w, sc.lever_v, sc.share, g.dv.
-    Writes: sc.passed_w, sc.passed_v, sc.effort.
+    Writes: sc.effort.
     """
     at = offsets.solve_body + i
-    here = offsets.reading + i
     k = load(m.v_start, i)
     effort = (
         load_adjoint(sc.dv, offsets.solve_dof + k)
         + dot(load(sc.axis_w, offsets.dof + k), n)
         + dot(load(sc.axis_v, offsets.dof + k), f)
     )
-    store(sc.effort, here, load(sc.share, at) * effort)
-    store(sc.passed_w, here, n - effort * load(sc.lever_w, at))
-    store(sc.passed_v, here, f - effort * load(sc.lever_v, at))
+    store(sc.effort, offsets.reading + i, load(sc.share, at) * effort)
+    return n - effort * load(sc.lever_w, at), f - effort * load(sc.lever_v, at)
 
 
 @plain
@@ -126,27 +132,87 @@ def rest_multiplier(sc: Scratch, offsets: Offsets):
 
 
 @plain
-def multiplier_axis(m: Model, sc: Scratch, offsets: Offsets, i: int):
+def multiplier_axis(m: Model, sc: Scratch, offsets: Offsets, i: int, w: vec3, v: vec3):
     """Multipliers of a joint with one dof, in the place of its effort, and its body.
 
-    Reads: m.body_parent, m.v_start, sc.axis_w, sc.axis_v, sc.lever_w, sc.lever_v,
-        sc.effort, sc.multiplier_w, sc.multiplier_v.
+    ``w`` and ``v`` are those of the parent; the body's are returned.
+
+    Reads: m.v_start, sc.axis_w, sc.axis_v, sc.lever_w, sc.lever_v, sc.effort.
     Writes: sc.effort, sc.multiplier_w, sc.multiplier_v.
     """
     at = offsets.solve_body + i
-    up = offsets.reading + load(m.body_parent, i)
     here = offsets.reading + i
     k = load(m.v_start, i)
-    w = load(sc.multiplier_w, up)
-    v = load(sc.multiplier_v, up)
     dv = (
         load(sc.effort, here)
         - dot(load(sc.lever_w, at), w)
         - dot(load(sc.lever_v, at), v)
     )
+    w = w + dv * load(sc.axis_w, offsets.dof + k)
+    v = v + dv * load(sc.axis_v, offsets.dof + k)
     store(sc.effort, here, dv)
-    store(sc.multiplier_w, here, w + dv * load(sc.axis_w, offsets.dof + k))
-    store(sc.multiplier_v, here, v + dv * load(sc.axis_v, offsets.dof + k))
+    store(sc.multiplier_w, here, w)
+    store(sc.multiplier_v, here, v)
+    return w, v
+
+
+@plain
+def hand_back_limb(m: Model, sc: Scratch, offsets: Offsets, limb: int):
+    """Hand the adjoint's wrenches of a limb back, from tip to root.
+
+    Reads: m.joint_kind, m.body_parent, m.limb_start, m.limb_body, m.child_start,
+        m.child, sc.passed_w, sc.passed_v.
+    Writes: sc.passed_w, sc.passed_v.
+    """
+    first = load(m.limb_start, limb)
+    stop = load(m.limb_start, limb + 1)
+    w_in = vec3()
+    v_in = vec3()
+    for turn in range(stop - first):
+        i = load(m.limb_body, stop - 1 - turn)
+        if SHARED:
+            w = load(sc.passed_w, offsets.reading + i)
+            v = load(sc.passed_v, offsets.reading + i)
+        else:
+            w, v = adjoint_wrench(m, sc, offsets, i)
+        branch = load(m.child_start, i)
+        branches = load(m.child_start, i + 1)
+        if turn > 0:
+            branches = branch
+        for j in range(branch, branches):
+            child = offsets.reading + load(m.child, j)
+            w = w + load(sc.passed_w, child)
+            v = v + load(sc.passed_v, child)
+        w = w + w_in
+        v = v + v_in
+        if load(m.joint_kind, i) == JointKind.FREE:
+            multiplier_free(m, sc, offsets, i, w, v)
+        else:
+            w_in, v_in = hand_back_axis(m, sc, offsets, i, w, v)
+    root = load(m.limb_body, first)
+    if load(m.body_parent, root) > 0:
+        store(sc.passed_w, offsets.reading + root, w_in)
+        store(sc.passed_v, offsets.reading + root, v_in)
+
+
+@plain
+def multiplier_limb(m: Model, sc: Scratch, offsets: Offsets, limb: int):
+    """Multipliers of a limb, from root to tip.
+
+    Reads: m.joint_kind, m.body_parent, m.limb_start, m.limb_body, sc.multiplier_w,
+        sc.multiplier_v.
+    """
+    first = load(m.limb_start, limb)
+    root = load(m.limb_body, first)
+    if load(m.joint_kind, root) == JointKind.FREE:
+        first = first + 1
+        up = offsets.reading + root
+    else:
+        up = offsets.reading + load(m.body_parent, root)
+    w = load(sc.multiplier_w, up)
+    v = load(sc.multiplier_v, up)
+    for p in range(first, load(m.limb_start, limb + 1)):
+        w, v = multiplier_axis(m, sc, offsets, load(m.limb_body, p), w, v)
 
 
 @plain

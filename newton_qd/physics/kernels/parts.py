@@ -6,8 +6,11 @@ the solve found are 0 in the end, as before.
 
 import warp as wp
 
+from newton_qd.physics.kinds import JointKind
+
 from . import parametric, plain, quat, real, scalar, vec3, width
 from .answers import pair_side
+from .articulation import SHARED
 from .coupling import PAIRS
 from .cpp.algebra import component, cross, dot, form_slope, rigid, translation, vector
 from .cpp.memory import add_adjoint, load, load_adjoint, store, store_adjoint
@@ -145,14 +148,13 @@ def rigid_part(m: Model, sc: Scratch, offsets: Offsets, i: int):
 
 @plain
 def body_part(m: Model, sc: Scratch, offsets: Offsets, i: int, touching: int):
-    """Parts of body ``i`` and its contacts; returns its subtree's residual wrenches.
+    """Parts of body ``i`` and its contacts; returns its own residual wrenches.
 
-    The first is of the solve, the second of its adjoint. Children have left the first
-    where joints pass wrenches on, and the second in the place of their multipliers.
+    The first is of the solve, the second of its adjoint.
 
-    Reads: m.pairs, m.child_start, m.child, m.contact_start, m.contact_stop,
-        m.pair_lead, sc.point, sc.change_w, sc.change_v, sc.pair_impulse, sc.pair_w,
-        sc.pair_v, sc.passed_w, sc.passed_v, sc.multiplier_w, sc.multiplier_v.
+    Reads: m.pairs, m.contact_start, m.contact_stop, m.pair_lead, sc.point,
+        sc.change_w, sc.change_v, sc.pair_impulse, sc.pair_w, sc.pair_v,
+        sc.multiplier_w, sc.multiplier_v.
     """
     rw, rv, qw, qv = rigid_part(m, sc, offsets, i)
     xw = load(sc.change_w, offsets.solve_body + i)
@@ -177,13 +179,26 @@ def body_part(m: Model, sc: Scratch, offsets: Offsets, i: int, touching: int):
                     impulse = side * load(sc.pair_impulse, offsets.pair + j)
                     rw = rw + cross(load(sc.point, lead), impulse)
                     rv = rv + impulse
-    for j in range(load(m.child_start, i), load(m.child_start, i + 1)):
-        child = offsets.reading + load(m.child, j)
-        rw = rw + load(sc.passed_w, child)
-        rv = rv + load(sc.passed_v, child)
-        qw = qw + load(sc.multiplier_w, child)
-        qv = qv + load(sc.multiplier_v, child)
     return rw, rv, qw, qv
+
+
+@plain
+def keep_residual(m: Model, sc: Scratch, offsets: Offsets, i: int, touching: int):
+    """Leave body ``i``'s residual wrenches where its joint leaves its subtree's.
+
+    That is where joints pass wrenches on, and the place of the body's multipliers.
+
+    Reads: m.joint_kind.
+    Writes: sc.passed_w, sc.passed_v, sc.multiplier_w, sc.multiplier_v.
+    """
+    here = offsets.reading + i
+    rw, rv, qw, qv = body_part(m, sc, offsets, i, touching)
+    if load(m.joint_kind, i) == JointKind.FREE:
+        free_part(m, sc, offsets, i)
+    store(sc.passed_w, here, rw)
+    store(sc.passed_v, here, rv)
+    store(sc.multiplier_w, here, qw)
+    store(sc.multiplier_v, here, qv)
 
 
 @plain
@@ -197,26 +212,20 @@ def axis_part(
     qw: vec3,
     qv: vec3,
 ):
-    """Parts of body ``i`` and of its joint, which has one dof.
+    """Parts of body ``i``'s joint, which has one dof.
 
     Reads: m.v_start, sc.dv, sc.effort.
-    Writes: sc.passed_w, sc.passed_v, sc.multiplier_w, sc.multiplier_v, g.axis_w,
-        g.axis_v, g.joint_push, g.joint_weight, g.dv.
+    Writes: g.axis_w, g.axis_v, g.joint_push, g.joint_weight, g.dv.
     """
-    here = offsets.reading + i
     k = load(m.v_start, i)
     dof = offsets.solve_dof + k
     dv = load(sc.dv, dof)
-    multiplier = load(sc.effort, here)
+    multiplier = load(sc.effort, offsets.reading + i)
     add_adjoint(sc.axis_w, offsets.dof + k, multiplier * rw + dv * qw)
     add_adjoint(sc.axis_v, offsets.dof + k, multiplier * rv + dv * qv)
     add_adjoint(sc.joint_push, dof, multiplier)
     add_adjoint(sc.joint_weight, dof, neg(multiplier * dv))
     store_adjoint(sc.dv, dof, real())
-    store(sc.passed_w, here, rw)
-    store(sc.passed_v, here, rv)
-    store(sc.multiplier_w, here, qw)
-    store(sc.multiplier_v, here, qv)
 
 
 @plain
@@ -252,3 +261,56 @@ def free_part(
         add_adjoint(sc.joint_push, k + 3 + j, component(lw, j))
         store_adjoint(sc.dv, k + j, real())
         store_adjoint(sc.dv, k + 3 + j, real())
+
+
+@plain
+def limb_part(m: Model, sc: Scratch, offsets: Offsets, limb: int, touching: int):
+    """Parts of the bodies and joints of a limb, from tip to root.
+
+    Reads: m.joint_kind, m.limb_start, m.limb_body, m.child_start, m.child,
+        sc.passed_w, sc.passed_v, sc.multiplier_w, sc.multiplier_v.
+    Writes: sc.passed_w, sc.passed_v, sc.multiplier_w, sc.multiplier_v.
+    """
+    first = load(m.limb_start, limb)
+    stop = load(m.limb_start, limb + 1)
+    rw_in = vec3()
+    rv_in = vec3()
+    qw_in = vec3()
+    qv_in = vec3()
+    for turn in range(stop - first):
+        i = load(m.limb_body, stop - 1 - turn)
+        here = offsets.reading + i
+        if SHARED:
+            rw = load(sc.passed_w, here)
+            rv = load(sc.passed_v, here)
+            qw = load(sc.multiplier_w, here)
+            qv = load(sc.multiplier_v, here)
+        else:
+            rw, rv, qw, qv = body_part(m, sc, offsets, i, touching)
+        branch = load(m.child_start, i)
+        branches = load(m.child_start, i + 1)
+        if turn > 0:
+            branches = branch
+        for j in range(branch, branches):
+            child = offsets.reading + load(m.child, j)
+            rw = rw + load(sc.passed_w, child)
+            rv = rv + load(sc.passed_v, child)
+            qw = qw + load(sc.multiplier_w, child)
+            qv = qv + load(sc.multiplier_v, child)
+        rw_in = rw + rw_in
+        rv_in = rv + rv_in
+        qw_in = qw + qw_in
+        qv_in = qv + qv_in
+        if load(m.joint_kind, i) != JointKind.FREE:
+            axis_part(m, sc, offsets, i, rw_in, rv_in, qw_in, qv_in)
+        else:
+            if SHARED:
+                pass
+            else:
+                free_part(m, sc, offsets, i)
+    # a root hands them to nobody
+    root = offsets.reading + load(m.limb_body, first)
+    store(sc.passed_w, root, rw_in)
+    store(sc.passed_v, root, rv_in)
+    store(sc.multiplier_w, root, qw_in)
+    store(sc.multiplier_v, root, qv_in)

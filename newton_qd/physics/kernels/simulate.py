@@ -24,50 +24,49 @@ from .kinematics import (
 )
 from .readings import body_impulse, body_reading, foot_contact, torso_position
 from .solve import linear_solve
-from .structs import Model, Offsets, Scratch, offsets_after, offsets_at
+from .structs import Model, Offsets, Scratch, offsets_after, offsets_at, offsets_in
 from .world import Pack, detect_fault, freeze_faulty
 
 
 @stage
-def kinematics(m: Model, sc: Scratch, offsets: Offsets, lane: int, lanes: int):
-    """Poses and axes, then twists and bias accelerations, root to leaves.
+def limb_kinematics(m: Model, sc: Scratch, offsets: Offsets, n: int, moved: int):
+    """Poses and axes (unless ``moved`` is 1), twists and bias accelerations of a limb.
 
-    Reads: m.joint_kind, m.body_levels, m.body_level_start, m.body_level.
+    Reads: m.joint_kind, m.limb_start, m.limb_body.
     """
-    if lane == 0:
-        world_frame(m, sc, offsets)
-        world_motion(m, sc, offsets)
-    sync(lane)
-    for level in range(m.body_levels):
-        start = load(m.body_level_start, level)
-        for p in range(start + lane, load(m.body_level_start, level + 1), lanes):
-            i = load(m.body_level, p)
-            if load(m.joint_kind, i) == JointKind.FREE:
+    for p in range(load(m.limb_start, n), load(m.limb_start, n + 1)):
+        i = load(m.limb_body, p)
+        if load(m.joint_kind, i) == JointKind.FREE:
+            if moved == 0:
                 free_joint(m, sc, offsets, i)
-                free_motion(m, sc, offsets, i)
-            else:
+            free_motion(m, sc, offsets, i)
+        else:
+            if moved == 0:
                 axis_joint(m, sc, offsets, i)
-                axis_motion(m, sc, offsets, i)
-        sync(lane)
+            axis_motion(m, sc, offsets, i)
 
 
 @stage
-def motions(m: Model, sc: Scratch, offsets: Offsets, lane: int, lanes: int):
-    """Twists and bias accelerations at other velocities, in the same pose.
+def kinematics(
+    m: Model, sc: Scratch, offsets: Offsets, moved: int, lane: int, lanes: int
+):
+    """Poses and axes, then twists and bias accelerations, root to leaves.
 
-    Reads: m.joint_kind, m.body_levels, m.body_level_start, m.body_level.
+    ``moved`` is 1 for twists and bias accelerations alone, at other velocities.
+
+    Reads: m.levels, m.roots, m.limb_level.
     """
     if lane == 0:
+        if moved == 0:
+            world_frame(m, sc, offsets)
         world_motion(m, sc, offsets)
-    sync(lane)
-    for level in range(m.body_levels):
-        start = load(m.body_level_start, level)
-        for p in range(start + lane, load(m.body_level_start, level + 1), lanes):
-            i = load(m.body_level, p)
-            if load(m.joint_kind, i) == JointKind.FREE:
-                free_motion(m, sc, offsets, i)
-            else:
-                axis_motion(m, sc, offsets, i)
+    # the lane of the world has the first root as well
+    if m.roots > 1:
+        sync(lane)
+    for level in range(m.levels):
+        first = load(m.limb_level, level) + lane
+        for n in range(first, load(m.limb_level, level + 1), lanes):
+            limb_kinematics(m, sc, offsets, n, moved)
         sync(lane)
 
 
@@ -89,14 +88,15 @@ def substep(
     Reads: m.nb, m.nv, m.nc, m.iterations, m.solves, m.given.
     """
     start = iteration * m.solves
-    first = offsets_at(m, slot, keep, s, start)
-    for i in range(1 + lane, m.nb + 1, lanes):
+    first = offsets_in(m, slot, keep, s, iteration, start)
+    # lanes with one more contact have no more bodies
+    for i in range(lanes - lane, m.nb + 1, lanes):
         if iteration == 0:
             rigid_inertia(m, sc, first, i)
         bias_wrench(m, sc, first, i)
-    # predictor, then correctors
+    # predictor, then correctors; a lane has the same contacts in all of them
     for p in range(start, start + m.solves):
-        offsets = offsets_at(m, slot, keep, s, p)
+        offsets = offsets_in(m, slot, keep, s, iteration, p)
         for c in range(lane, m.nc, lanes):
             if p == 0:
                 contact_predictor(m, sc, offsets, c)
@@ -105,16 +105,15 @@ def substep(
                     contact_corrector(m, sc, offsets, c)
                 else:
                     contact_given(m, sc, offsets, c, p)
-        sync(lane)
         linear_solve(m, sc, offsets, lane, lanes)
-    last = offsets_at(m, slot, keep, s, start + m.solves - 1)
+    last = offsets_in(m, slot, keep, s, iteration, start + m.solves - 1)
     if iteration < m.iterations - 1:
-        ahead = offsets_at(m, slot, keep, s, start + m.solves)
-        for k in range(lane, m.nv, lanes):
+        ahead = offsets_in(m, slot, keep, s, iteration + 1, start + m.solves)
+        for k in range(lanes - 1 - lane, m.nv, lanes):
             mean_velocity(sc, last, ahead, k)
         sync(lane)
     else:
-        for k in range(lane, m.nv, lanes):
+        for k in range(lanes - 1 - lane, m.nv, lanes):
             new_velocity(sc, last, k)
         for c in range(lane, m.nc, lanes):
             contact_impulse(sc, last, c)
@@ -144,18 +143,16 @@ def simulate(
         # twice, a GPU's compiler takes twice as long
         s = n // m.iterations
         iteration = n - s * m.iterations
-        offsets = offsets_at(m, slot, keep, s + s // m.substeps, iteration * m.solves)
+        ends = 1 - wp.min(m.substeps - s, 1)
+        offsets = offsets_in(m, slot, keep, s + ends, iteration, iteration * m.solves)
         if s == m.substeps:
-            detect_fault(m, sc, pack, x, lane)
-            freeze_faulty(
-                m, sc, pack, x, offsets_at(m, slot, keep, s, 0), offsets, lane, lanes
-            )
+            detect_fault(m, sc, pack, lane, lanes)
+            end = offsets_at(m, slot, keep, s, 0)
+            freeze_faulty(m, sc, pack, x, end, offsets, lane, lanes)
             sync(lane)
         if s < m.substeps or m.reports_bodies == 1 or m.torso_q < 0:
-            if iteration == 0:
-                kinematics(m, sc, offsets, lane, lanes)
-            else:
-                motions(m, sc, offsets, lane, lanes)
+            moved = wp.min(iteration, 1)
+            kinematics(m, sc, offsets, moved, lane, lanes)
         if s < m.substeps:
             substep(m, sc, slot, keep, s, iteration, lane, lanes)
     read_out(m, sc, slot, offsets_after(m, slot, keep), lane, lanes)

@@ -35,23 +35,20 @@ the root hands out the parts and adds up the residuals (:mod:`.parts`).
 
 import warp as wp
 
-from newton_qd.physics.kinds import JointKind
-
 from . import plain, stage, sync
-from .articulation import contact_slip, solve_tree
+from .articulation import SHARED, contact_slip, solve_tree
 from .coupling import PAIRS, couple_pairs, pairs_touch
 from .cpp.memory import load
 from .joints import joint_laws
 from .multipliers import (
-    adjoint_wrench,
     couple_multipliers,
-    hand_back_axis,
-    multiplier_axis,
-    multiplier_free,
+    hand_back_limb,
+    keep_wrench,
+    multiplier_limb,
     pair_slip,
     rest_multiplier,
 )
-from .parts import axis_part, body_part, free_part, pair_part
+from .parts import keep_residual, limb_part, pair_part
 from .structs import Model, Offsets, Scratch
 
 
@@ -65,16 +62,16 @@ def solve(m: Model, sc: Scratch, offsets: Offsets, lane: int, lanes: int):
     if PAIRS:
         if pairs_touch(m, sc, offsets) > 0:
             couple_pairs(m, sc, offsets, lane, lanes)
+    # read again by the same lanes
     for c in range(lane, m.nc, lanes):
         contact_slip(m, sc, offsets, c)
-    sync(lane)
 
 
 @wp.func_grad(solve)
 def adj_solve(m: Model, sc: Scratch, offsets: Offsets, lane: int, lanes: int):
     """Multipliers, then what inertias, contacts, joints and axes take of them.
 
-    Reads: m.pairs, m.joint_kind, m.body_levels, m.body_level_start, m.body_level.
+    Reads: m.nb, m.pairs, m.levels, m.limb_level.
     """
     sync(lane)
     if lane == 0:
@@ -83,23 +80,22 @@ def adj_solve(m: Model, sc: Scratch, offsets: Offsets, lane: int, lanes: int):
         for j in range(lane, m.pairs, lanes):
             pair_slip(m, sc, offsets, j)
         sync(lane)
-    for n in range(m.body_levels):
-        level = m.body_levels - 1 - n
-        start = load(m.body_level_start, level)
-        for p in range(start + lane, load(m.body_level_start, level + 1), lanes):
-            i = load(m.body_level, p)
-            w, v = adjoint_wrench(m, sc, offsets, i)
-            if load(m.joint_kind, i) == JointKind.FREE:
-                multiplier_free(m, sc, offsets, i, w, v)
-            else:
-                hand_back_axis(m, sc, offsets, i, w, v)
+    if SHARED:
+        for i in range(1 + lane, m.nb + 1, lanes):
+            keep_wrench(m, sc, offsets, i)
         sync(lane)
-    for level in range(m.body_levels):
-        start = load(m.body_level_start, level)
-        for p in range(start + lane, load(m.body_level_start, level + 1), lanes):
-            i = load(m.body_level, p)
-            if load(m.joint_kind, i) != JointKind.FREE:
-                multiplier_axis(m, sc, offsets, i)
+    for turn in range(m.levels):
+        level = m.levels - 1 - turn
+        first = load(m.limb_level, level) + lane
+        for limb in range(first, load(m.limb_level, level + 1), lanes):
+            hand_back_limb(m, sc, offsets, limb)
+        # the lanes of roots go on with them
+        if level > 0:
+            sync(lane)
+    for level in range(m.levels):
+        first = load(m.limb_level, level) + lane
+        for limb in range(first, load(m.limb_level, level + 1), lanes):
+            multiplier_limb(m, sc, offsets, limb)
         sync(lane)
     touching = int(0)
     if PAIRS:
@@ -109,16 +105,15 @@ def adj_solve(m: Model, sc: Scratch, offsets: Offsets, lane: int, lanes: int):
             for j in range(lane, m.pairs, lanes):
                 pair_part(m, sc, offsets, j)
             sync(lane)
-    for n in range(m.body_levels):
-        level = m.body_levels - 1 - n
-        start = load(m.body_level_start, level)
-        for p in range(start + lane, load(m.body_level_start, level + 1), lanes):
-            i = load(m.body_level, p)
-            rw, rv, qw, qv = body_part(m, sc, offsets, i, touching)
-            if load(m.joint_kind, i) == JointKind.FREE:
-                free_part(m, sc, offsets, i)
-            else:
-                axis_part(m, sc, offsets, i, rw, rv, qw, qv)
+    if SHARED:
+        for i in range(1 + lane, m.nb + 1, lanes):
+            keep_residual(m, sc, offsets, i, touching)
+        sync(lane)
+    for turn in range(m.levels):
+        level = m.levels - 1 - turn
+        first = load(m.limb_level, level) + lane
+        for limb in range(first, load(m.limb_level, level + 1), lanes):
+            limb_part(m, sc, offsets, limb, touching)
         sync(lane)
 
 

@@ -22,8 +22,7 @@ from .rows import Bodies, Coordinates, Dynamics, Inputs, Outputs, Parameters
 class Model:
     """One robot in one scene; shared by all worlds. Row 0 of a body table is the world.
 
-    Bodies are counted from 1 in ``body_parent`` and in every scratch array; level
-    lists hold items of equal depth, roots first.
+    Bodies are counted from 1 in ``body_parent`` and in every scratch array.
     """
 
     nb: int
@@ -59,9 +58,12 @@ class Model:
     com: VectorTable
     inertia: MatrixTable
     isotropic: IntTable  # 1: the inertia does not depend on the rotation
-    body_levels: int
-    body_level_start: IntTable
-    body_level: IntTable
+    # limbs: runs of bodies with one child each
+    levels: int
+    roots: int  # limbs of the first level
+    limb_level: IntTable  # (levels + 1,) first limb
+    limb_start: IntTable  # (limbs + 1,)
+    limb_body: IntTable  # (nb,) by limb, from root to tip
     child_start: IntTable
     child: IntTable
     # degrees of freedom, (nv)
@@ -135,6 +137,7 @@ class Scratch:
     # (slots,), 0 or 1: the step failed; its inputs were not finite
     fault: Reals
     lost: Reals
+    wrong: Reals  # contacts, without adjoint: an impulse is not finite
     # bodies; world axes, spatial vectors about O
     pose: Transforms
     twist_w: Vectors
@@ -240,10 +243,20 @@ class Offsets:
 
 @wp.func
 def offsets_at(m: Model, slot: int, keep: int, s: int, p: int):
+    """Offsets of substep ``s`` and solve ``p`` of its first iteration.
+
+    ``keep`` is as in ``offsets_in``.
+    """
+    return offsets_in(m, slot, keep, s, 0, p)
+
+
+@wp.func
+def offsets_in(m: Model, slot: int, keep: int, s: int, iteration: int, p: int):
     """Offsets of substep ``s`` and solve ``p``, counted over all its iterations.
 
     ``keep`` is 1 where every substep has entries of its own, as the adjoint needs, and
-    0 where a slot's substeps share them.
+    0 where a slot's substeps share them. The caller knows the iteration of the solve:
+    a GPU divides integers slowly.
 
     Reads: m.nb, m.nq, m.nv, m.nu, m.nc, m.pairs, m.substeps, m.iterations,
         m.solves, m.parameters, m.given.
@@ -252,7 +265,6 @@ def offsets_at(m: Model, slot: int, keep: int, s: int, p: int):
     turn = slot
     solve = slot
     before = slot
-    iteration = p // m.solves
     iterations = m.substeps * m.iterations
     if keep == 1:
         step = slot * (m.substeps + 1) + wp.min(s, m.substeps)

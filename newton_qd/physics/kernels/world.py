@@ -134,39 +134,52 @@ def adj_load_world(
 
 
 @plain
-def detect_fault(m: Model, sc: Scratch, pack: Pack, x: wp.array[scalar], lane: int):
+def impulses_wrong(m: Model, sc: Scratch, slot: int, c: int):
+    """Record whether the impulses of contact ``c`` are finite: 0, else not a number.
+
+    Reads: m.nc, m.substeps, sc.impulse, sc.angular_impulse, sc.normal_impulse.
+    Writes: sc.wrong.
+    """
+    # zero times a finite number is zero, anything else is not a number
+    zero = scalar(0.0)
+    total = real()
+    for s in range(m.substeps):
+        report = offsets_at(m, slot, 0, s, 0).report
+        impulse = load(sc.impulse, report + c)
+        angular = load(sc.angular_impulse, report + c)
+        for j in range(3):
+            total = total + zero * component(impulse, j)
+            total = total + zero * component(angular, j)
+        total = total + zero * load(sc.normal_impulse, report + c)
+    store(sc.wrong, slot * m.nc + c, total)
+
+
+@plain
+def detect_fault(m: Model, sc: Scratch, pack: Pack, lane: int, lanes: int):
     """Record where a number is not finite, or a speed out of bounds.
 
-    Reads: m.nq, m.nv, m.nc, m.substeps, m.inputs, sc.q, sc.v, sc.impulse,
-        sc.angular_impulse, sc.normal_impulse, x.
+    Reads: m.nq, m.nv, m.nc, m.substeps, sc.q, sc.v, sc.wrong.
     Writes: sc.fault, sc.lost.
     """
+    for c in range(lane, m.nc, lanes):
+        impulses_wrong(m, sc, pack.slot, c)
+    sync(lane)
     if lane == 0:
-        # zero times a finite number is zero, anything else is not a number
         zero = scalar(0.0)
         total = real()
-        size = m.inputs.size
-        q = pack.first * size + m.inputs.q
-        v = pack.first * size + m.inputs.v
+        start = offsets_at(m, pack.slot, 0, 0, 0)
         for k in range(m.nq):
-            total = total + zero * read_input(x, q + k, size, pack.count)
+            total = total + zero * load(sc.q, start.q + k)
         for k in range(m.nv):
-            total = total + zero * read_input(x, v + k, size, pack.count)
+            total = total + zero * load(sc.v, start.v + k)
         store(sc.lost, pack.slot, beyond(total, scalar(1.0)))
         end = offsets_at(m, pack.slot, 0, m.substeps, 0)
         for k in range(m.nq):
             total = total + zero * load(sc.q, end.q + k)
         for k in range(m.nv):
             total = total + zero * load(sc.v, end.v + k)
-        for s in range(m.substeps):
-            report = offsets_at(m, pack.slot, 0, s, 0).report
-            for c in range(m.nc):
-                impulse = load(sc.impulse, report + c)
-                angular = load(sc.angular_impulse, report + c)
-                for j in range(3):
-                    total = total + zero * component(impulse, j)
-                    total = total + zero * component(angular, j)
-                total = total + zero * load(sc.normal_impulse, report + c)
+        for c in range(m.nc):
+            total = total + load(sc.wrong, pack.slot * m.nc + c)
         fault = beyond(total, scalar(1.0))
         for k in range(m.nv):
             fault = fault + beyond(load(sc.v, end.v + k), MAX_SPEED)
@@ -175,7 +188,7 @@ def detect_fault(m: Model, sc: Scratch, pack: Pack, x: wp.array[scalar], lane: i
 
 
 @wp.func_grad(detect_fault)
-def adj_detect_fault(m: Model, sc: Scratch, pack: Pack, x: wp.array[scalar], lane: int):
+def adj_detect_fault(m: Model, sc: Scratch, pack: Pack, lane: int, lanes: int):
     """Nothing: a fault has no gradient."""
     sync(lane)
 

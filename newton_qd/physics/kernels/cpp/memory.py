@@ -143,7 +143,8 @@ def _at(line: str, n: int) -> str:
     more = "" if line == "first" else f" + (a.{line} - a.first) * {SIDE}"
     return f"""{PRELUDE}{ADDRESS}
 #if defined(__CUDA_ARCH__)
-Number* at = (Number*)GLOBAL(a.base) + (a.{line} + i * {n}) * {SIDE};
+unsigned line = a.{line} + i * {n};
+Number* at = (Number*)GLOBAL(a.base + (size_t)line * ({SIDE} * sizeof(Number)));
 #else
 Number* at = (Number*)a.base + (long long)i * {n * SIDE}{more};
 #endif
@@ -180,7 +181,9 @@ def _write(line: str, cpp: str, n: int) -> str:
 
 
 @wp.func_native(
-    snippet=f"{ADDRESS}\nreturn ((const int*)GLOBAL(a.data))[i];", adj_snippet=""
+    snippet=f"""{ADDRESS}
+return *(const int*)GLOBAL(a.data + (size_t)(unsigned)i * sizeof(int));""",
+    adj_snippet="",
 )
 def load(a: IntTable, i: int) -> int:
     """Element ``i`` of a table."""
@@ -243,7 +246,8 @@ for _handle, (_entry, _type) in ENTRIES.items():
     _name, _cpp, _n = CPP[_type]
     _CONSTANT = f"""
 {PRELUDE}{ADDRESS}
-const Number* at = (const Number*)GLOBAL(a.data) + i * {_n};
+const Number* at = (const Number*)GLOBAL(
+    a.data + (size_t)(unsigned)i * {_n} * sizeof(Number));
 {_name} value;
 for (int j = 0; j < {_n}; ++j)
 #if defined(__CUDA_ARCH__)
