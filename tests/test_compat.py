@@ -6,6 +6,7 @@ import functools
 import importlib
 import subprocess
 import sys
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,7 +19,7 @@ import pytest
 import newton_qd
 import newton_qd.compat
 from newton_qd.compat import finder
-from newton_qd.compat.contents import CONTENTS
+from newton_qd.compat.contents import BRAX_V1, CONTENTS
 from newton_qd.compat.scoring import evaluate
 from newton_qd.errors import MissingExtra
 
@@ -43,6 +44,55 @@ def test_modules_hold_what_they_say(name: str) -> None:
         for attribute in names:
             expected = getattr(importlib.import_module(home), attribute)
             assert getattr(module, attribute) is expected
+
+
+@pytest.mark.parametrize("name", BRAX_V1)
+def test_brax_v1_is_there_for_scripts_of_qdax(name: str) -> None:
+    """New releases of brax have lost it; one that is installed stays."""
+    if BRAX_V1.keys() - finder._FINDER.contents.keys():
+        pytest.skip("brax v1 is installed")
+    module = importlib.import_module(name)
+    for home, names in BRAX_V1[name].items():
+        for attribute in names:
+            expected = getattr(importlib.import_module(home), attribute)
+            assert getattr(module, attribute) is expected
+
+
+def test_environments_are_those_of_brax_v1() -> None:
+    old: Any = importlib.import_module("brax.v1.envs")
+    assert isinstance(newton_qd.create("pointmaze"), old.Env)
+    jp: Any = importlib.import_module("brax.v1.jumpy")
+    assert jp.random_uniform(jp.random_prngkey(seed=0), (2,), 1.0, 2.0).min() >= 1
+
+
+def test_notebooks_draw_with_our_pages(tmp_path: Path) -> None:
+    html: Any = importlib.import_module("brax.v1.io.html")
+    env: Any = newton_qd.create("hopper_uni", brax_views=True)
+    qps = [jax.jit(env.reset)(jax.random.key(0)).qp] * 3
+    text = html.render(env.sys, qps)
+    assert text.startswith("<iframe") and 'height="480"' in text
+    html.save_html(tmp_path / "new" / "page.html", env.sys, qps, make_dir=True)
+    page = (tmp_path / "new" / "page.html").read_text(encoding="utf-8")
+    assert "<title>hopper - newton_qd</title>" in page
+    with pytest.raises(TypeError, match=r"sys: got 3; allowed: env.sys of "):
+        html.render(3, qps)
+    with pytest.raises(ValueError, match=r"qps: got \[\]; allowed: state.qp of at le"):
+        html.render(env.sys, [])
+
+
+def test_voronoi_plots_of_qdax_run_with_numpy_2() -> None:
+    plotting: Any = importlib.import_module("qdax.utils.plotting")
+    centroids = np.random.default_rng(0).uniform(size=(5, 2))
+    regions, _ = plotting.get_voronoi_finite_polygons_2d(centroids)
+    assert len(regions) == 5
+
+
+def test_installing_is_silent() -> None:
+    newton_qd.compat.uninstall()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        newton_qd.compat.install()
+    assert finder._FINDER in sys.meta_path
 
 
 def test_installing_twice_is_installing_once() -> None:

@@ -52,7 +52,7 @@ LAYERS = (
 )
 # Leaves read every layer, and these leaves.
 LEAVES: dict[str, set[str]] = {
-    "compat": set(),
+    "compat": {"viewing"},
     "qd": {"compat"},
     "viewing": {"qd"},
     "cli": {"qd", "compat", "viewing"},

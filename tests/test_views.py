@@ -109,6 +109,29 @@ def test_joints_are_those_of_the_observation(batch: BraxState) -> None:
     assert ANT.sys.num_joint_dof == 8
 
 
+def test_joints_are_flat_arrays_too(batch: BraxState) -> None:
+    """Newer releases of brax v1 return them so: joint by joint, all its axes."""
+    (joints,) = ANT.sys.joints
+    angles, rates = joints.angle_vel(batch.qp)
+    for found, expected in ((angles, batch.obs[:, 5:13]), (rates, batch.obs[:, 19:27])):
+        assert np.array_equal(jnp.asarray(found), expected)
+        assert np.array_equal(np.asarray(found), expected)
+    again = jax.jit(lambda x: x)(angles)
+    assert jax.tree.structure(again) == jax.tree.structure(angles)
+    humanoid: Any = newton_qd.create("humanoid", brax_views=True)
+    qp = humanoid.sys.default_qp()
+    flat = jnp.concatenate([joint.angle_vel(qp)[0] for joint in humanoid.sys.joints])
+    settings = humanoid.sys.config.joints
+    counts = [len(joint.angle_limit) for joint in settings]
+    assert counts == sorted(counts) and sum(counts) == humanoid.sys.num_joint_dof
+    named = {x.name: x.angle for x in humanoid.sys.config.defaults[0].angles}
+    axes = [(j, "xyz"[i]) for j in settings for i in range(len(j.angle_limit))]
+    degrees = [getattr(named[joint.name], axis) for joint, axis in axes]
+    assert np.array_equal(flat, np.radians(degrees).astype(np.float32))
+    assert humanoid.sys.config.dynamics_mode == "legacy_spring"
+    assert all(joint.stiffness > 0 for joint in settings)
+
+
 def test_joints_of_the_fixed_initial_state() -> None:
     # the test of QDax: exactly the default angles, exactly at rest
     env: Any = newton_qd.create("ant_uni", fixed_init_state=True, brax_views=True)

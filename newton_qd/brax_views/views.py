@@ -16,6 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from newton_qd import physics
+from newton_qd.brax_views.configuration import (
+    Defaults,
+    JointSettings,
+    Readings,
+    default_pose,
+    joint_settings,
+)
 from newton_qd.checks import Fact, message
 from newton_qd.envs.joints import joint_chains, joint_indices, solid_bodies
 from newton_qd.physics.model.rest import grounding_coordinate
@@ -93,15 +100,16 @@ class Joints:
     q: np.ndarray
     v: np.ndarray
 
-    def angle_vel(self, qp: QP) -> tuple[tuple[jax.Array, ...], tuple[jax.Array, ...]]:
+    def angle_vel(self, qp: QP) -> tuple[Readings, Readings]:
         """Returns angles and rates, each as one array (nj,) per axis [rad, rad/s].
 
-        A rate is the time derivative of its angle. The original has the opposite sign.
+        Both are also one flat array for functions of JAX and NumPy. A rate is the time
+        derivative of its angle. The original has the opposite sign.
         """
         axes = range(self.q.shape[1])
         return (
-            tuple(qp.physics.q[..., self.q[:, axis]] for axis in axes),
-            tuple(qp.physics.v[..., self.v[:, axis]] for axis in axes),
+            Readings(qp.physics.q[..., self.q[:, axis]] for axis in axes),
+            Readings(qp.physics.v[..., self.v[:, axis]] for axis in axes),
         )
 
 
@@ -112,10 +120,16 @@ class Config:
     Attributes:
         dt: Duration of a step, with repeated actions [s].
         substeps: Physics steps in a step [-].
+        joints: The joints, in the order of ``env.sys.joints``.
+        defaults: The default pose, as the only entry.
+        dynamics_mode: Name of the original's simulation; QDax uses this one.
     """
 
     dt: float
     substeps: int
+    joints: tuple[JointSettings, ...] = ()
+    defaults: tuple[Defaults, ...] = ()
+    dynamics_mode: str = "legacy_spring"
 
 
 class SystemView:
@@ -178,7 +192,17 @@ class SystemView:
     def config(self) -> Config:
         """Settings of the simulation."""
         system = self._system
-        return Config(system.robot.dt * self._repeat, system.substeps * self._repeat)
+        return Config(
+            system.robot.dt * self._repeat,
+            system.substeps * self._repeat,
+            joint_settings(system),
+            (default_pose(system),),
+        )
+
+    @property
+    def system(self) -> System:
+        """The robot."""
+        return self._system
 
     def default_angle(self) -> jax.Array:
         """Returns the joint angles (num_joint_dof,) of the default pose [rad].

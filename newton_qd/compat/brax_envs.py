@@ -30,6 +30,7 @@ __all__ = [
     "create_brax_scoring_fn",
     "create_default_brax_task_components",
     "create_fn",
+    "create_policy_network_play_step_fn",
     "get_aurora_scoring_fn",
     "get_mask_from_transitions",
     "make_policy_network_play_step_fn_brax",
@@ -38,6 +39,12 @@ __all__ = [
     "scoring_actor_dc_function_brax_envs",
     "scoring_function_brax_envs",
 ]
+
+JumanjiState = Any
+"""Type of a state of Jumanji, for annotations of older scripts."""
+
+create_policy_network_play_step_fn = make_policy_network_play_step_fn_brax
+"""Older name of this function."""
 
 ScoresAndKey = tuple[jax.Array, jax.Array, ExtraScores, jax.Array]
 ScoringFunction = Callable[[Genotype, RNGKey], ScoresAndKey]

@@ -65,6 +65,7 @@ _SCORING = (
 _NEW: dict[str, Contents] = {
     "qdax.tasks.brax.descriptor_extractors": {
         "newton_qd.extractors": (*_EXTRACTORS, "get_aurora_encoding"),
+        "qdax.custom_types": ("AuroraExtraInfoNormalization",),
     },
     "qdax.tasks.brax.v1": {
         **_ENVIRONMENTS,
@@ -111,12 +112,14 @@ _OLD: dict[str, Contents] = {
     "qdax.tasks.brax_envs": {
         "newton_qd.compat.brax_envs": (
             *_SCORING,
+            "create_policy_network_play_step_fn",
             "reset_based_scoring_actor_dc_function_brax_envs",
             "reset_based_scoring_function_brax_envs",
             "scoring_actor_dc_function_brax_envs",
         )
     },
     "qdax.types": {
+        "newton_qd.compat.brax_envs": ("JumanjiState",),
         "qdax.custom_types": (
             "Action",
             "Centroid",
@@ -137,8 +140,81 @@ _OLD: dict[str, Contents] = {
             "Skill",
             "Spread",
             "StateDescriptor",
-        )
+        ),
     },
 }
 
 CONTENTS: Mapping[str, Contents] = {**_NEW, **_OLD}
+
+_JUMPY = (
+    "abs",
+    "all",
+    "any",
+    "arange",
+    "array",
+    "ceil",
+    "clip",
+    "concatenate",
+    "cos",
+    "cross",
+    "dot",
+    "exp",
+    "eye",
+    "floor",
+    "inf",
+    "logical_and",
+    "logical_not",
+    "logical_or",
+    "matmul",
+    "max",
+    "maximum",
+    "mean",
+    "min",
+    "minimum",
+    "ndarray",
+    "ones",
+    "ones_like",
+    "outer",
+    "pi",
+    "prod",
+    "repeat",
+    "reshape",
+    "round",
+    "sign",
+    "sin",
+    "sqrt",
+    "square",
+    "stack",
+    "std",
+    "sum",
+    "tan",
+    "tanh",
+    "tile",
+    "where",
+    "zeros",
+    "zeros_like",
+)
+
+BRAX_V1: Mapping[str, Contents] = {
+    "brax.v1": {"newton_qd.compat.brax_v1": ("QP",)},
+    "brax.v1.envs": {
+        "newton_qd.envs.base": ("Env",),
+        "newton_qd.envs.state": ("State",),
+    },
+    "brax.v1.io": {},
+    "brax.v1.io.html": {"newton_qd.compat.brax_v1": ("render", "save_html")},
+    "brax.v1.jumpy": {
+        "jax": ("vmap",),
+        "jax.lax": ("scan", "while_loop"),
+        "jax.numpy": _JUMPY,
+        "newton_qd.compat.brax_v1": (
+            "random_prngkey",
+            "random_split",
+            "random_uniform",
+        ),
+    },
+    "brax.v1.physics": {},
+    "brax.v1.physics.base": {"newton_qd.compat.brax_v1": ("QP", "vec_to_arr")},
+    "brax.v1.physics.config_pb2": {"newton_qd.compat.brax_v1": ("Joint",)},
+}
+"""Modules of brax v1 that scripts of QDax import, if it is not installed."""

@@ -6,14 +6,15 @@ import importlib
 import importlib.metadata
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.abc import Loader, MetaPathFinder
-from importlib.machinery import ModuleSpec
+from importlib.machinery import ModuleSpec, PathFinder
 from importlib.util import find_spec, spec_from_loader
 from types import ModuleType
 from typing import Any
 
-from newton_qd.compat.contents import CONTENTS
+from newton_qd.compat.contents import BRAX_V1, CONTENTS, Contents
+from newton_qd.compat.mending import MENDED, MendingLoader
 from newton_qd.errors import MissingExtra
 
 SUPPORTED = ("0.5.0",)
@@ -21,7 +22,14 @@ SUPPORTED = ("0.5.0",)
 
 
 class _Finder(MetaPathFinder, Loader):
-    """Finds and fills the modules of ``CONTENTS``."""
+    """Finds and fills the modules of ``CONTENTS``, and mends those of ``MENDED``.
+
+    Attributes:
+        contents: The modules that it fills: ``CONTENTS``, and ``BRAX_V1`` if brax v1 is
+            not installed.
+    """
+
+    contents: Mapping[str, Contents] = CONTENTS
 
     def find_spec(
         self,
@@ -29,14 +37,18 @@ class _Finder(MetaPathFinder, Loader):
         path: Sequence[str] | None,
         target: ModuleType | None = None,
     ) -> ModuleSpec | None:
-        del path, target
-        if fullname not in CONTENTS:
+        if fullname in self.contents:
+            package = any(name.startswith(f"{fullname}.") for name in self.contents)
+            return spec_from_loader(fullname, self, is_package=package)
+        if fullname not in MENDED:
             return None
-        package = any(name.startswith(f"{fullname}.") for name in CONTENTS)
-        return spec_from_loader(fullname, self, is_package=package)
+        spec = PathFinder.find_spec(fullname, path, target)
+        if spec is not None and spec.loader is not None:
+            spec.loader = MendingLoader(spec)
+        return spec
 
     def exec_module(self, module: ModuleType) -> None:
-        for home, names in CONTENTS[module.__name__].items():
+        for home, names in self.contents[module.__name__].items():
             source = importlib.import_module(home)
             for name in names:
                 setattr(module, name, getattr(source, name))
@@ -71,8 +83,12 @@ def install() -> None:
             f"{imported[0]} is imported already, with environments that are not of "
             "newton_qd; call newton_qd.compat.install() before importing QDax"
         )
+    _restore_jax()  # first, so that a warning as an error leaves nothing half done
+    _FINDER.contents = CONTENTS if _has_brax_v1() else {**CONTENTS, **BRAX_V1}
     sys.meta_path.insert(0, _FINDER)
-    _restore_jax()
+    for name, mend in MENDED.items():
+        if name in sys.modules:
+            mend(sys.modules[name])
 
 
 def uninstall() -> None:
@@ -80,11 +96,15 @@ def uninstall() -> None:
     if _FINDER not in sys.meta_path:
         return
     sys.meta_path.remove(_FINDER)
-    for name in CONTENTS:
+    for name in _FINDER.contents:
         module = sys.modules.pop(name, None)
         parent, _, child = name.rpartition(".")
         if module is not None and parent in sys.modules:
             vars(sys.modules[parent]).pop(child, None)
+
+
+def _has_brax_v1() -> bool:
+    return find_spec("brax") is not None and find_spec("brax.v1") is not None
 
 
 def _restore_jax() -> None:
@@ -93,9 +113,9 @@ def _restore_jax() -> None:
 
     # TensorFlow Probability 0.25, the last release, registers a type under a name
     # that JAX has moved.
-    xla: Any = importlib.import_module("jax.interpreters.xla")
-    if not hasattr(xla, "pytype_aval_mappings"):
-        with warnings.catch_warnings():
-            # JAX has deprecated the new place too, but there is no other.
-            warnings.simplefilter("ignore", DeprecationWarning)
+    with warnings.catch_warnings():
+        # JAX has deprecated the new place too, but there is no other.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        xla: Any = importlib.import_module("jax.interpreters.xla")
+        if not hasattr(xla, "pytype_aval_mappings"):
             xla.pytype_aval_mappings = core.pytype_aval_mappings

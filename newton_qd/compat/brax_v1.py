@@ -1,0 +1,140 @@
+"""What scripts of QDax import from brax v1, which newer releases of brax lack.
+
+If brax v1 is installed, it stays, and only learns of the environments of this library.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from newton_qd.brax_views.configuration import JointSettings as Joint
+from newton_qd.brax_views.views import QP, SystemView
+from newton_qd.checks import message
+from newton_qd.files import write_atomically
+
+__all__ = [
+    "QP",
+    "Joint",
+    "random_prngkey",
+    "random_split",
+    "random_uniform",
+    "render",
+    "save_html",
+    "vec_to_arr",
+]
+
+
+def random_prngkey(seed: int) -> jax.Array:
+    """Returns a random key."""
+    return jax.random.PRNGKey(seed)
+
+
+def random_split(rng: jax.Array, num: int = 2) -> jax.Array:
+    """Returns ``num`` new random keys."""
+    return jax.random.split(rng, num)
+
+
+def random_uniform(
+    rng: jax.Array,
+    shape: tuple[int, ...] = (),
+    low: float | None = 0.0,
+    high: float | None = 1.0,
+) -> jax.Array:
+    """Returns uniform random numbers from ``low`` to ``high``."""
+    return jax.random.uniform(rng, shape, jnp.float32, low or 0.0, high)
+
+
+def vec_to_arr(vector: Any) -> np.ndarray:
+    """Returns a vector with ``x``, ``y`` and ``z`` as an array (3,)."""
+    return np.array([vector.x, vector.y, vector.z])
+
+
+def render(
+    sys: SystemView, qps: Sequence[QP], height: int = 480, info: object = None
+) -> str:
+    """Returns HTML that shows a trajectory: a replay page of this library in a frame.
+
+    Args:
+        sys: The robot, ``env.sys``.
+        qps: ``state.qp`` of each state of one world.
+        height: Height of the frame [px].
+        info: Ignored.
+
+    Raises:
+        TypeError: ``sys`` is not a robot of this library.
+        ValueError: ``qps`` is empty.
+    """
+    del info
+    from newton_qd.viewing.replay import Shown
+
+    return Shown(_page(sys, qps), height)._repr_html_()
+
+
+def save_html(
+    path: str | os.PathLike[str],
+    sys: SystemView,
+    qps: Sequence[QP],
+    make_dir: bool = False,
+) -> None:
+    """Writes a replay page of a trajectory.
+
+    Args:
+        path: The HTML file.
+        sys: The robot, ``env.sys``.
+        qps: ``state.qp`` of each state of one world.
+        make_dir: Whether to make the folder of the file.
+
+    Raises:
+        OSError: The file cannot be written.
+        TypeError: ``sys`` is not a robot of this library.
+        ValueError: ``qps`` is empty.
+    """
+    target = Path(path)
+    if make_dir:
+        target.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(target, _page(sys, qps).encode())
+
+
+def _page(sys: SystemView, qps: Sequence[QP]) -> str:
+    """Returns the replay page of a trajectory.
+
+    Raises:
+        TypeError: ``sys`` is not a robot of this library.
+        ValueError: ``qps`` is empty.
+    """
+    if not isinstance(sys, SystemView):
+        raise TypeError(
+            message("sys", sys, "env.sys of newton_qd, with brax_views=True")
+        )
+    if not len(qps):
+        raise ValueError(message("qps", qps, "state.qp of at least one state"))
+    from newton_qd.viewing.drawing import drawing_of_system
+    from newton_qd.viewing.replay import replay_html
+    from newton_qd.viewing.trajectory import Trajectory
+
+    states = [qp.physics for qp in qps]
+    steps = len(states) - 1
+    rows = {
+        name: np.stack([np.asarray(getattr(state, name)) for state in states])[None]
+        for name in ("q", "feet_contact")
+    }
+    return replay_html(
+        Trajectory(
+            drawing=drawing_of_system(sys.system),
+            q=rows["q"].astype(np.float32),
+            lengths=np.array([steps]),
+            dt=sys.config.dt,
+            rewards=np.zeros((1, steps), np.float32),
+            descriptors=np.zeros((1, steps + 1, 0), np.float32),
+            descriptor_names=(),
+            feet=rows["feet_contact"],
+            labels=(sys.system.robot.name,),
+        )
+    )
