@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import shutil
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -11,7 +13,7 @@ import pytest
 from point_runs import SMALL, compile_once, point_task, reference, run
 
 from newton_qd import cli
-from newton_qd.qd import load_run
+from newton_qd.qd import load_run, make_scoring_function
 from newton_qd.qd.config import ConfigError, EvolveConfig
 from newton_qd.qd.run import plot_curves
 from newton_qd.qd.run.archive import Archive, ArchiveError, load_archive
@@ -300,6 +302,39 @@ def test_elites_of_an_ant_repeat_bitwise(tmp_path: Path) -> None:
     for again in (found.evaluate(), found.evaluate(keys=found.start_key)):
         assert np.array_equal(again.fitnesses, found.archive.fitnesses[cells])
         assert np.array_equal(again.descriptors, found.archive.descriptors[cells])
+
+
+@pytest.mark.slow
+def test_a_scoring_function_of_ones_own_is_repeated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from newton_qd.qd import algorithms
+    from newton_qd.qd.algorithms.me import ME
+
+    def doubled(config: EvolveConfig, options: Any, task: Any, policy: Any) -> Any:
+        score = make_scoring_function(task, policy, config.episode_length)
+
+        def scored(genotypes: jax.Array, key: jax.Array) -> Any:
+            fitness, descriptor, extra = score(genotypes, key)
+            return 2 * fitness, descriptor, extra
+
+        return scored
+
+    monkeypatch.setattr(algorithms, "_REGISTERED", {})
+    spec = dataclasses.replace(ME, name="doubled", scoring=doubled)
+    algorithms.register_algorithm(spec)
+    result = run(SMALL.replace(algorithm="doubled", starts=2), out=tmp_path / "run")
+    again = opened(tmp_path / "run").evaluate()
+    filled = result.archive.filled
+    assert np.array_equal(again.fitnesses, result.archive.fitnesses[filled])
+
+
+def test_new_starts_cannot_be_repeated(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run(SMALL.replace(new_starts=True, iterations=4), out=tmp_path / "run")
+    assert call("eval", tmp_path / "run") == cli.OK
+    assert "each generation had start states of its own" in capsys.readouterr().out
 
 
 def test_runs_need_no_finished_run(tmp_path: Path) -> None:

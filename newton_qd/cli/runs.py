@@ -169,8 +169,12 @@ def _print_repeated(
     if len(shown) > _MOST_SHOWN:
         print(f"... and {len(shown) - _MOST_SHOWN} more")
     count = "1 elite" if len(elites) == 1 else f"{len(elites)} elites"
-    if run.config.new_starts:
-        print("note: each generation of this run had start states of its own")
+    if run.config.new_starts and not same.all():
+        print(
+            f"{count} of {run.path}: each generation had start states of its own, so "
+            f"{len(same) - same.sum()} have other results"
+        )
+        return OK
     if same.all():
         print(f"{count} of {run.path}: fitness and descriptor are bitwise the same")
         return OK
