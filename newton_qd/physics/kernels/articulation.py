@@ -39,6 +39,8 @@ from .structs import Model, Offsets, Scratch
 
 PAIRS = wp.constant(pairs)
 SHARED = wp.constant(shared)
+# Whether a limb hands its equation on in registers. A CPU has too few, and fast caches.
+CARRIED = wp.constant(shared)
 
 
 @plain
@@ -163,11 +165,12 @@ def eliminate_limb(m: Model, sc: Scratch, offsets: Offsets, limb: int):
     for turn in range(stop - first):
         i = load(m.limb_body, stop - 1 - turn)
         ww, wv, vv, n, f, moment, mass = own_equation(m, sc, offsets, i)
-        # limbs that branch off the tip; inside of the limb there is one child
         branch = load(m.child_start, i)
         branches = load(m.child_start, i + 1)
-        if turn > 0:
-            branches = branch
+        if CARRIED:
+            # only limbs that branch off the tip; inside of the limb there is one child
+            if turn > 0:
+                branches = branch
         for j in range(branch, branches):
             child = offsets.reading + load(m.child, j)
             ww = ww + load(sc.passed_ww, child)
@@ -175,26 +178,33 @@ def eliminate_limb(m: Model, sc: Scratch, offsets: Offsets, limb: int):
             vv = vv + load(sc.passed_vv, child)
             n = n + load(sc.passed_w, child)
             f = f + load(sc.passed_v, child)
-        ww = ww + ww_in
-        wv = wv + wv_in
-        vv = vv + vv_in
-        n = n + n_in
-        f = f + f_in
+        if CARRIED:
+            ww = ww + ww_in
+            wv = wv + wv_in
+            vv = vv + vv_in
+            n = n + n_in
+            f = f + f_in
         wv, vv, n, f = with_bias(m, sc, offsets, i, wv, vv, n, f, moment, mass)
         if load(m.joint_kind, i) == JointKind.FREE:
             solve_free(m, sc, offsets, i, ww, wv, vv, n, f)
         else:
-            ww_in, wv_in, vv_in, n_in, f_in = eliminate_axis(
-                m, sc, offsets, i, ww, wv, vv, n, f
-            )
-    root = load(m.limb_body, first)
-    if load(m.body_parent, root) > 0:
-        here = offsets.reading + root
-        store(sc.passed_ww, here, ww_in)
-        store(sc.passed_wv, here, wv_in)
-        store(sc.passed_vv, here, vv_in)
-        store(sc.passed_w, here, n_in)
-        store(sc.passed_v, here, f_in)
+            ww, wv, vv, n, f = eliminate_axis(m, sc, offsets, i, ww, wv, vv, n, f)
+            kept = load(m.body_parent, i)
+            if CARRIED:
+                ww_in = ww
+                wv_in = wv
+                vv_in = vv
+                n_in = n
+                f_in = f
+                if turn < stop - first - 1:
+                    kept = 0
+            if kept > 0:
+                here = offsets.reading + i
+                store(sc.passed_ww, here, ww)
+                store(sc.passed_wv, here, wv)
+                store(sc.passed_vv, here, vv)
+                store(sc.passed_w, here, n)
+                store(sc.passed_v, here, f)
 
 
 @plain
