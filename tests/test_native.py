@@ -51,6 +51,12 @@ for thread in threads:
 }
 
 
+CALLBACKS = """
+from newton_qd.physics import row_calls
+row_calls.native = lambda device: False
+"""
+
+
 def run(code: str) -> tuple[int, float]:
     """Exit status of a program, and seconds from its last line to its end."""
     code += "\nprint('end', flush=True)" if "exit" not in code else ""
@@ -73,6 +79,13 @@ def test_a_program_ends_with_work_in_flight(device: jax.Device) -> None:
 def test_every_way_out_with_work_in_flight(end: str) -> None:
     status, _ = run(IN_FLIGHT + ENDS[end])
     assert status == {"sys.exit": 3, "an exception": 1, "two threads": 0}[end]
+
+
+@pytest.mark.slow
+def test_daemon_threads_leave_the_callbacks() -> None:
+    """As on a GPU, where XLA calls Python."""
+    status, _ = run(CALLBACKS + IN_FLIGHT + ENDS["two threads"])
+    assert status == 0
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ with nested ``vmap``.
 import atexit
 import contextlib
 import functools
+import time
 from collections.abc import Callable, Iterator
 from typing import Protocol
 
@@ -38,6 +39,35 @@ def native(device: wp.Device) -> bool:
     return device.is_cpu
 
 
+class _Callbacks:
+    """The calls from XLA into Python.
+
+    Attributes:
+        begun: Number of calls until now.
+        refused: Whether calls end with an error, because Python ends.
+    """
+
+    def __init__(self) -> None:
+        self.begun = 0
+        self.refused = False
+
+    def refuse(self) -> None:
+        """Ends the programs of other threads at their next call.
+
+        Python stops a daemon thread that is inside XLA with an exception that C++
+        cannot handle. The thread has to leave XLA before.
+        """
+        self.refused = True
+        seen, self.begun = -1, 0
+        while seen != self.begun:
+            seen = self.begun
+            time.sleep(_LEAVING_SECONDS)
+
+
+_LEAVING_SECONDS = 0.05
+_callbacks = _Callbacks()
+
+
 @contextlib.contextmanager
 def _errors_contained() -> Iterator[None]:
     """Convert exceptions that Warp does not catch into an error that Warp reports.
@@ -47,10 +77,13 @@ def _errors_contained() -> Iterator[None]:
 
     Raises:
         RuntimeError: An exception that is not an ``Exception`` was raised, for example
-            an interrupt.
+            an interrupt; or Python ends.
     """
     # Notebooks restore Python's SIGINT handler before each cell.
     interrupts.install()
+    _callbacks.begun += 1
+    if _callbacks.refused:
+        raise RuntimeError("the physics was stopped, because Python ends")
     try:
         yield
     except Exception:
@@ -89,6 +122,7 @@ def row_call(
         share one launch.
     """
     interrupts.install()
+    _end_callbacks()
     real = SCALARS[dtype]
 
     def forward(x: wp.array(dtype=real), y: wp.array(dtype=real)):
@@ -124,17 +158,26 @@ def _register() -> None:
     for name, address in library().handlers.items():
         capsule = jax.ffi.pycapsule(address)
         jax.ffi.register_ffi_target(name, capsule, platform="cpu")
-    atexit.register(_end)
+    atexit.register(_cut_off, library().stop)
 
 
-def _end() -> None:
-    """Cuts off the physics that is still in flight when the program ends.
+@functools.cache
+def _end_callbacks() -> None:
+    """Ends calls into Python before Python ends."""
+    atexit.register(_cut_off, _callbacks.refuse)
+
+
+def _cut_off(stop: Callable[[], None]) -> None:
+    """Stops the physics that is still in flight when the program ends.
 
     XLA would wait for it, and its results are lost anyway. Programs with effects, such
     as ``jax.debug.print``, run to their end.
+
+    Args:
+        stop: Lets physics in flight, and all later physics, end with an error.
     """
     jax.effects_barrier()
-    library().stop()
+    stop()
 
 
 def native_row_call(plan: Plan, target: str = "newton_qd_rows") -> RowCall:
