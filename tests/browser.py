@@ -26,7 +26,7 @@ FLAGS = (
     "--disable-component-update",
     "--disable-sync",
 )
-SIZE = {"width": 420, "height": 400}  # drawing takes most of the time
+SIZE = {"width": 390, "height": 400}  # drawing takes most of the time
 
 
 def chromium() -> str | None:

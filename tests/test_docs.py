@@ -10,6 +10,8 @@ from types import ModuleType
 
 import pytest
 
+import newton_qd
+
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 
 
@@ -80,3 +82,15 @@ def test_python_on_a_page_runs_as_pasted(
 def test_only_a_cluster_needs_a_fragment() -> None:
     fragments = [b for page in PAGES for b in blocks(page) if "# fragment" in b]
     assert len(fragments) == 1 and "jax.distributed.initialize" in fragments[0]
+
+
+def test_the_gallery_has_every_environment() -> None:
+    spec = importlib.util.spec_from_file_location("gallery", DOCS / "gallery.py")
+    assert spec is not None and spec.loader is not None
+    gallery = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(gallery)
+    written = (DOCS / "gallery.md").read_text(encoding="utf-8")
+    assert written == gallery.page(), "run: python docs/gallery.py"
+    pictures = {path.stem for path in gallery.FOLDER.glob("*.gif")}
+    assert pictures == {*newton_qd.registered_envs(), "evolved"}
+    assert sum(path.stat().st_size for path in gallery.FOLDER.iterdir()) < 4e6

@@ -206,14 +206,14 @@ def test_origins_of_links_are_where_the_physics_has_them(
     for name, robot, scene in shown:
         system = build_system(robot, "float32", scene)
         path = write_replay(still(system, name), tmp_path / f"{name}.html")
-        page = pages.open(path, width=320, height=400)
+        page = pages.open(path, width=240, height=320)
         page.keyboard.press(" ")
         page.keyboard.press("Home")
         page.keyboard.press("o")
-        page.wait_for_timeout(150)
+        page.wait_for_timeout(80)
         points = reference.body_frames(system, system.rest_q)[:, :3]
         expected, found = projected(page, points), marked(page)
-        inside = ((expected > 4) & (expected < [316, 1000])).all(axis=1)
+        inside = ((expected > 4) & (expected < [236, 1000])).all(axis=1)
         assert len(found) and inside.any(), name
         for pixel in expected[inside]:
             near = found[np.abs(found - pixel).max(axis=1) < 5]

@@ -16,7 +16,7 @@ from newton_qd.viewing.trajectory import Trajectory
 _FIELD = 40.0 * math.pi / 180.0  # vertical field of view, as in the pages [rad]
 _SKY = 0x00F2EDE8  # blue, green, red: the light theme of the pages
 _SAMPLES = 4  # rays of a pixel
-_REACH = 12.0  # half width of the grid around the way of a robot [radii]
+_REACH = 7.0  # half width of the grid around the way of a robot [radii]
 
 
 class Camera:
@@ -33,6 +33,7 @@ class Camera:
         area: tuple[np.ndarray, np.ndarray],
         width: int = 640,
         height: int = 480,
+        zoom: float = 1.0,
     ) -> None:
         """Builds the scene.
 
@@ -41,17 +42,19 @@ class Camera:
             area: Lowest and highest x and y (2,) of the grid on the ground [m].
             width: Width of a picture [px].
             height: Height of a picture [px].
+            zoom: Size of the robot in the picture; 1: as in the pages.
 
         Raises:
-            ValueError: A number is not an integer above 0.
+            ValueError: A number is not allowed.
         """
         checks.integer("width", width)
         checks.integer("height", height)
+        checks.number("zoom", zoom, above=0)
         import warp as wp
         from newton.sensors import SensorCamera
 
         self.width, self.height = width, height
-        self._drawing = drawing
+        self._drawing, self._zoom = drawing, zoom
         self._model = newton_model(drawing, area)
         self._state = self._model.state()
         options = SensorCamera.RenderConfig()
@@ -88,7 +91,7 @@ class Camera:
             # the height stays, so that a hopping robot is seen to hop
             aim[:2] = frames[self._drawing.torso, :2]
         place = wp.array(
-            [wp.transform(*_pose(self._drawing, aim))], dtype=wp.transformf
+            [wp.transform(*_pose(self._drawing, aim, self._zoom))], dtype=wp.transformf
         )
         self._sensor.update(self._state, place, self._rays, color_image=self._image)
         image: Any = self._image
@@ -97,10 +100,10 @@ class Camera:
         return np.stack(parts, axis=-1).astype(np.uint8)
 
 
-def _pose(drawing: Drawing, aim: np.ndarray) -> list[float]:
+def _pose(drawing: Drawing, aim: np.ndarray, zoom: float) -> list[float]:
     """Returns the frame (7,) of a camera that looks at a point, as the pages do."""
     flat, side = (0.45, 0.42) if drawing.follow else (1.1, 0.2)
-    distance = 1.15 * drawing.radius / math.sin(_FIELD / 2)
+    distance = 1.15 * drawing.radius / math.sin(_FIELD / 2) / zoom
     away = np.array([-side, -math.sqrt(1 - side * side), flat])
     back = away / np.linalg.norm(away)
     right = np.cross([0.0, 0.0, 1.0], back)
@@ -132,6 +135,7 @@ def pictures(
     *,
     width: int = 640,
     height: int = 480,
+    zoom: float = 1.0,
     progress: Callable[[int, int], None] | None = None,
 ) -> Iterator[np.ndarray]:
     """Yields pictures of all worlds, beside and below each other.
@@ -141,19 +145,20 @@ def pictures(
         frames: (n,) numbers of the frames.
         width: Width of the picture of one world [px].
         height: Height of the picture of one world [px].
+        zoom: Size of the robot in the picture; 1: as in the pages.
         progress: Called after each picture with its number from 1 and n.
 
     Yields:
         (rows * height, columns * width, 3) red, green and blue, uint8.
 
     Raises:
-        ValueError: ``width`` or ``height`` is not an integer above 0.
+        ValueError: ``width``, ``height`` or ``zoom`` is not allowed.
     """
     drawing = trajectory.drawing
     torso = body_frames(drawing, trajectory.q)[..., drawing.torso, :2].reshape(-1, 2)
-    reach = max(_REACH * drawing.radius, 2 * drawing.grid)
+    reach = max(_REACH * drawing.radius / min(zoom, 1.0), 2 * drawing.grid)
     area = torso.min(axis=0) - reach, torso.max(axis=0) + reach
-    camera = Camera(drawing, area, width, height)
+    camera = Camera(drawing, area, width, height, zoom)
     columns = math.ceil(math.sqrt(trajectory.worlds))
     rows = math.ceil(trajectory.worlds / columns)
     for number, frame in enumerate(frames):

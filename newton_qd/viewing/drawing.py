@@ -25,8 +25,8 @@ from newton_qd.physics.system import System
 if TYPE_CHECKING:
     import newton
 
-_POINT, _WALL, _GOAL = (0.2, 0.4, 0.8), (0.55, 0.58, 0.62), (0.2, 0.65, 0.3)
-_POINT_RADIUS = 0.02  # of the point of a maze, which has no size of its own
+_POINT, _WALL, _GOAL = (0.85, 0.35, 0.1), (0.25, 0.32, 0.42), (0.2, 0.65, 0.3)
+_POINT_RADIUS = 0.03  # of the point of a maze, which has no size of its own
 _SMALL = 0.6  # largest radius of a robot on a fine grid [m]
 _IDENTITY = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
 
@@ -220,13 +220,25 @@ def drawing_of_system(system: System) -> Drawing:
 
 
 def _travels(system: System) -> bool:
-    """Returns whether the torso can leave its place: it floats, or slides."""
-    body = system.torso
+    """Returns whether the robot can leave its place.
+
+    Then its torso floats or slides, and something that is driven moves with it. The
+    torso of an arm may be an object that it pushes.
+    """
+    parents = [int(parent) for parent in system.parent]
+
+    def root(body: int) -> int:
+        return body if parents[body] < 0 else root(parents[body])
+
+    driven = np.flatnonzero(np.isin(system.v_start, system.control_dof))
+    own = root(system.torso)
+    if own not in {root(int(body)) for body in driven}:
+        return False
+    body, kinds = system.torso, set()
     while body >= 0:
-        if system.joint_kind[body] != JointKind.REVOLUTE:
-            return True
-        body = int(system.parent[body])
-    return False
+        kinds.add(int(system.joint_kind[body]))
+        body = parents[body]
+    return kinds != {int(JointKind.REVOLUTE)}
 
 
 def _bounds(system: System, shapes: tuple[DrawnShape, ...]) -> tuple[np.ndarray, float]:

@@ -19,7 +19,7 @@ from newton_qd.viewing.trajectory import Trajectory
 
 FORMATS = (".png", ".gif", ".mp4")
 _RATE = 20.0  # pictures per second of a GIF or video
-_COLORS = 64  # of a GIF
+_COLORS = 48  # of a GIF
 
 
 def require(ending: str) -> None:
@@ -45,6 +45,7 @@ def render(
     height: int = 480,
     time: float | None = None,
     rate: float = _RATE,
+    zoom: float = 1.0,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
     """Renders a trajectory to a file, without a screen. Several worlds make a sheet.
@@ -56,6 +57,7 @@ def render(
         height: Height of the picture of one world [px].
         time: Moment of a picture [s]; ``None``: the middle.
         rate: Pictures per second of a GIF or a video [1/s].
+        zoom: Size of the robot in the picture; 1: as in the pages.
         progress: Called after each picture with its number from 1 and their count.
 
     Returns:
@@ -80,7 +82,9 @@ def render(
         frames = np.array([min(middle, last)])
     else:
         frames = times(trajectory, rate)
-    found = pictures(trajectory, frames, width=width, height=height, progress=progress)
+    found = pictures(
+        trajectory, frames, width=width, height=height, zoom=zoom, progress=progress
+    )
     temporary = temporary_name(target)
     try:
         if ending == ".mp4":

@@ -109,7 +109,9 @@
     this.scene.add(new THREE.HemisphereLight(0xffffff, 0xb0a898, 1.7));
     this.sun = new THREE.DirectionalLight(0xffffff, 1.9);
     this.sun.castShadow = true;
-    this.sun.shadow.mapSize.set(1024, 1024);
+    // a small picture shows no finer shadow
+    const fine = this.container.clientWidth > 400 ? 1024 : 256;
+    this.sun.shadow.mapSize.set(fine, fine);
     const box = this.sun.shadow.camera;
     box.left = box.bottom = -4 * r;
     box.right = box.top = 4 * r;
