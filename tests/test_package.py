@@ -320,6 +320,15 @@ def test_wheel_holds_the_robots(distributions: Path, tmp_path: Path) -> None:
     assert found == (tmp_path / "newton_qd" / "urdf" / "ant.urdf").resolve()
 
 
+def test_wheel_holds_the_pages(distributions: Path) -> None:
+    (wheel,) = distributions.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        held = set(archive.namelist())
+    pages = {path.name for path in (PACKAGE / "viewing" / "pages").iterdir()}
+    assert {"three.min.js", "three.LICENSE", "explorer.js", "style.css"} <= pages
+    assert {f"newton_qd/viewing/pages/{name}" for name in pages} <= held
+
+
 def test_wheel_says_that_it_is_typed(distributions: Path) -> None:
     (wheel,) = distributions.glob("*.whl")
     with zipfile.ZipFile(wheel) as archive:

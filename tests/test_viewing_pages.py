@@ -21,7 +21,7 @@ from newton_qd.physics.model import build_system
 from newton_qd.physics.system import PhysicsState, System
 from newton_qd.robots import ROBOTS, Contact, RobotSpec
 from newton_qd.scenes import SCENES
-from newton_qd.viewing import Trajectory, drawing_of, record, write_replay
+from newton_qd.viewing import Trajectory, drawing_of, record, show, write_replay
 from newton_qd.viewing.drawing import drawing_of_system
 from newton_qd.viewing.html import drawing_data
 
@@ -106,7 +106,7 @@ class Hostile(PhysicsEnv):
         self, before: PhysicsState, after: PhysicsState, action: jax.Array
     ) -> tuple[jax.Array, jax.Array, dict[str, jax.Array]]:
         del before, action
-        return after.q[2], jnp.zeros((), bool), {}
+        return after.q[0], jnp.zeros((), bool), {}
 
 
 def test_hostile_names_cannot_run(pages: Pages, tmp_path: Path) -> None:
@@ -257,3 +257,45 @@ def test_the_maze_of_the_point_has_a_page(pages: Pages, tmp_path: Path) -> None:
     assert np.allclose(place[:2], found.q[0, -1], atol=1e-6)
     assert "steps" in page.inner_text(".clock")
     assert drawing_of(env).name in page.inner_text("h1")
+
+
+@pytest.mark.slow
+def test_a_notebook_shows_the_page(
+    walk: Trajectory, pages: Pages, tmp_path: Path
+) -> None:
+    path = tmp_path / "notebook.html"
+    shown = show(walk.world(0), height=300)._repr_html_()
+    path.write_text(f"<!doctype html><p>out:</p>{shown}", encoding="utf-8")
+    page = pages.context.new_page()
+    page.on("pageerror", lambda error: pages.errors.append(str(error)))
+    page.goto(path.absolute().as_uri())
+    (frame,) = page.main_frame.child_frames
+    until(frame, "typeof NQD === 'object' && NQD.player && NQD.player.cost > 0")
+    assert frame.inner_text("h1") == "ant"
+
+
+@pytest.mark.slow
+def test_meshes_are_drawn(pages: Pages, tmp_path: Path) -> None:
+    """A tetrahedron of an OBJ file, as the visual of a ball."""
+    (tmp_path / "corner.obj").write_text(
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    )
+    urdf = tmp_path / "mesh.urdf"
+    urdf.write_text(
+        """<robot name="mesh"><link name="world"/><link name="ball">
+        <inertial><mass value="1"/><inertia ixx=".1" iyy=".1" izz=".1" ixy="0" ixz="0"
+          iyz="0"/></inertial>
+        <visual><origin xyz="0 0 1"/>
+          <geometry><mesh filename="corner.obj" scale="1 2 3"/></geometry></visual>
+        <collision><geometry><sphere radius="0.1"/></geometry></collision></link>
+        <joint name="turn" type="continuous"><parent link="world"/><child link="ball"/>
+          <axis xyz="0 0 1"/></joint></robot>""",
+        encoding="utf-8",
+    )
+    robot = RobotSpec("mesh", str(urdf), "ball", actuators=(("turn", 1.0),))
+    found = record(Hostile(robot), jnp.zeros((2, 1)), jax.random.key(0))
+    (mesh,) = [s for s in found.drawing.shapes if s.kind == "mesh"]
+    assert (mesh.vertices * mesh.size).max(axis=0).tolist() == [1, 2, 3]
+    page = pages.open(write_replay(found, tmp_path / "mesh.html"))
+    drawn = "NQD.player.view.shapes[0].mesh.geometry.attributes.position.array"
+    assert max(page.evaluate(f"Array.from({drawn})")) == 3

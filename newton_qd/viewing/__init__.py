@@ -7,6 +7,7 @@
 - ``write_explorer([run], path)``: one HTML file with the archive of a run; a click on a
   cell shows its elite
 - ``render(trajectory, path)``: a picture, a GIF or a video, without a screen
+- ``play(trajectory, viewer)``: shows it in a viewer of Newton
 - ``joined([...])``: trajectories of one robot as one, to see them together
 
 Importing this package imports no other module of it. Each name is loaded when it is
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from newton_qd.viewing.drawing import Drawing, DrawnShape, can_draw, drawing_of
     from newton_qd.viewing.elites import record_elites
     from newton_qd.viewing.explorer import explorer_html, write_explorer
+    from newton_qd.viewing.newton_viewers import play
     from newton_qd.viewing.recording import Recorder, record
     from newton_qd.viewing.replay import replay_html, show, write_replay
     from newton_qd.viewing.trajectory import Contacts, Trajectory, joined
@@ -37,6 +39,7 @@ __all__ = [
     "drawing_of",
     "explorer_html",
     "joined",
+    "play",
     "record",
     "record_elites",
     "render",
@@ -56,6 +59,7 @@ _HOME = {
     "drawing_of": "drawing",
     "explorer_html": "explorer",
     "joined": "trajectory",
+    "play": "newton_viewers",
     "record": "recording",
     "record_elites": "elites",
     "render": "video",

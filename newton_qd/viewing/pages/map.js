@@ -81,9 +81,11 @@
       }
     } else if (this.kind === "cells") {
       const d = run.low.length, c = run.map.centroids.data;
-      const side = d === 1 ? 1 : 360;
-      this.owner = new Map2(360, side);
       const total = c.length / d;
+      // a finer map of many cells would keep the page waiting
+      const fine = Math.min(360, Math.floor(Math.sqrt(2e8 / total)));
+      const side = d === 1 ? 1 : fine;
+      this.owner = new Map2(fine, side);
       const of = new Int32Array(total).fill(EMPTY);
       run.cells.data.forEach((cell, e) => { of[cell] = e; });
       const share = (cell, k) =>
@@ -96,16 +98,16 @@
       // nearest in the units of the descriptor, as the archive has it
       const wide = run.high[0] - run.low[0], high = d > 1 ? run.high[1] - run.low[1] : 0;
       for (let y = 0; y < side; y++) {
-        for (let x = 0; x < 360; x++) {
+        for (let x = 0; x < fine; x++) {
           let best = Infinity, at = 0;
           for (let i = 0; i < total; i++) {
-            const dx = (px[i] - (x + 0.5) / 360) * wide;
+            const dx = (px[i] - (x + 0.5) / fine) * wide;
             const dy = (py[i] - (y + 0.5) / side) * high;
             const away = dx * dx + dy * dy;
             if (away < best) { best = away; at = i; }
           }
           this.owner.set(x, y, of[at]);
-          this.owner.cell[y * 360 + x] = at;
+          this.owner.cell[y * fine + x] = at;
         }
       }
       run.cells.data.forEach((cell, e) => { this.u[e] = px[cell]; this.v[e] = py[cell]; });
