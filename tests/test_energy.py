@@ -47,7 +47,14 @@ def test_kinetic_energy_and_gravity(name: str) -> None:
         assert float(found.gravity) == pytest.approx(weight, rel=1e-10, abs=1e-10)
 
 
-@pytest.mark.parametrize("name", ["halfcheetah", "hexapod", "reacherangle"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("halfcheetah", marks=pytest.mark.slow),
+        pytest.param("hexapod", marks=pytest.mark.slow),
+        "reacherangle",
+    ],
+)
 def test_energy_is_the_work_of_the_motors(name: str) -> None:
     """Without friction and damping, up to what the scheme loses: of first order in h.
 

@@ -14,6 +14,7 @@ from newton_qd import physics
 from newton_qd.robots import HALFCHEETAH, REACHER
 
 
+@pytest.mark.slow
 def test_impulses_add_up_to_those_of_bodies(x64: None) -> None:
     """Of halfcheetah: bodies with two contacts, and a pair that is pressed together."""
     system = variant(HALFCHEETAH, "float64", substeps=3)

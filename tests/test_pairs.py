@@ -246,6 +246,7 @@ DEGENERATE = {
 }
 
 
+@pytest.mark.slow
 def test_degenerate_cases_are_finite(x64: None, tmp_path: Path) -> None:
     """Values and gradients, at rest and moving."""
     system = turning_rods(tmp_path)

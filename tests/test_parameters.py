@@ -82,7 +82,11 @@ def changed(system: System, params: Params) -> System:
     )
 
 
-@pytest.mark.parametrize("robot", [ANT, HOPPER], ids=lambda robot: robot.name)
+@pytest.mark.parametrize(
+    "robot",
+    [pytest.param(ANT, marks=pytest.mark.slow, id="ant"), HOPPER],
+    ids=lambda robot: robot.name,
+)
 def test_parameters_are_as_if_in_the_files(x64: None, robot: RobotSpec) -> None:
     system = physics.load_system(robot, "float64")
     state, control = inputs(system)
@@ -104,6 +108,7 @@ def test_parameters_are_as_if_in_the_files(x64: None, robot: RobotSpec) -> None:
         assert np.abs(at(after).v - at(plain).v).max() > 1e-3
 
 
+@pytest.mark.slow
 def test_defaults_change_no_digit(x64: None, device: Any) -> None:
     """Neither of what a step returns nor of its gradients."""
     system = physics.load_system(ANT, "float64")

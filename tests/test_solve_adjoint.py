@@ -132,7 +132,12 @@ class Solve:
 
 
 @pytest.mark.parametrize(
-    "name", ["hexapod", "free root with pairs", "slides and pairs"]
+    "name",
+    [
+        "hexapod",
+        pytest.param("free root with pairs", marks=pytest.mark.slow),
+        "slides and pairs",
+    ],
 )
 def test_every_input_of_a_solve(x64: None, tmp_path: Path, name: str) -> None:
     """To each number of each input; adjoints of the changes are 0 afterwards."""

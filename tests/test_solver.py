@@ -168,6 +168,7 @@ def test_same_trajectory_as_the_step(worlds: int, device: jax.Device) -> None:
     assert not loop.solver.fault.numpy().any()
 
 
+@pytest.mark.slow
 def test_bodies_are_written(device: jax.Device) -> None:
     loop = moving_ants(device)
     loop.step(0.01)

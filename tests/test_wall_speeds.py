@@ -236,6 +236,7 @@ def test_heavy_robot_with_a_light_link(tmp_path: Path, ratio: float) -> None:
     assert far < 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shot", [SPUN, dataclasses.replace(SPUN, glancing=1.4)])
 def test_several_iterations_hold_what_is_promised(tmp_path: Path, shot: Shot) -> None:
     """The damping factor follows the velocity, so long substeps hold less."""
