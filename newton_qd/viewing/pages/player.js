@@ -3,7 +3,8 @@
 
 (function () {
   const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 4];
-  const ARROW = 0.6; // length of the largest impulse's arrow [radii of the robot]
+  const ARROW = 0.6; // length of a strong impulse's arrow [radii of the robot]
+  const LONGEST = 2; // impulse of the longest arrow [strong impulses]
 
   // Makes a player inside an element. `options.keys` is whether it listens to keys.
   NQD.Player = function (container, drawing, worlds, options) {
@@ -243,14 +244,15 @@
         const at = 3 * (nc * (this.data.rewards.shape[1] * w + step) + i);
         const x = c.impulse.data[at], y = c.impulse.data[at + 1];
         const z = c.impulse.data[at + 2], size = Math.hypot(x, y, z);
-        if (size < 1e-3 * c.largest) continue;
+        if (size < 1e-3 * c.typical) continue;
         const b = 7 * (this.view.tree.size * w + c.body[i]);
         const local = c.position[i], f = this.view.frames;
         NQD.turn(f, b + 3, local[0], local[1], local[2], place, 0);
         const drop = c.ground[i] ? c.radius[i] : 0;
         const from = [f[b] + place[0], f[b + 1] + place[1] + this.view.shift[w],
           f[b + 2] + place[2] - drop];
-        const scale = ARROW * this.view.drawing.radius / c.largest;
+        const cut = Math.min(1, LONGEST * c.typical / size);
+        const scale = cut * ARROW * this.view.drawing.radius / c.typical;
         points.push(...from, from[0] + scale * x, from[1] + scale * y,
           from[2] + scale * z);
       }

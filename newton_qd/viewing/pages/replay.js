@@ -10,11 +10,15 @@
   if (trajectory.contacts) {
     const c = trajectory.contacts;
     c.impulse = NQD.decode(c.impulse);
-    c.largest = 1e-9;
+    const sizes = [];
     for (let i = 0; i < c.impulse.data.length; i += 3) {
-      c.largest = Math.max(c.largest, Math.hypot(
-        c.impulse.data[i], c.impulse.data[i + 1], c.impulse.data[i + 2]));
+      const size = Math.hypot(
+        c.impulse.data[i], c.impulse.data[i + 1], c.impulse.data[i + 2]);
+      if (size > 0) sizes.push(size);
     }
+    sizes.sort((a, b) => a - b);
+    // a single impact does not make all other arrows short
+    c.typical = sizes.length ? sizes[Math.floor(0.9 * (sizes.length - 1))] : 1;
   }
   document.getElementById("title").textContent = data.title;
   const worlds = trajectory.labels.length;

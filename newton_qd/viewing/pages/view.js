@@ -7,6 +7,7 @@
 (function () {
   const FIELD = 40; // vertical field of view of the camera [degrees]
   const TRAIL = 2000; // most points of a trail
+  const ARROWS = 64; // most contact impulses of a world
 
   const GRID = `
     varying vec2 vGrid;
@@ -177,7 +178,8 @@
       const c = each.shape.color;
       for (let w = 0; w < this.worlds; w++) {
         own.setRGB(c[0], c[1], c[2], "srgb");
-        if (this.worlds > 1 && each.body >= 0) {
+        if (!each.shape.visual) own.set(NQD.palette[0]);
+        else if (this.worlds > 1 && each.body >= 0) {
           own.lerp(mark.set(NQD.palette[w % NQD.palette.length]), 0.6);
         }
         each.mesh.setColorAt(w, own);
@@ -212,9 +214,14 @@
     this.origins.visible = false;
     this.origins.renderOrder = 10;
     this.scene.add(this.origins);
-    this.arrows = new THREE.LineSegments(
-      new THREE.BufferGeometry(),
-      new THREE.LineBasicMaterial({ color: 0xd1242f, depthTest: false, fog: false }));
+    // cones that are seen through the robot, as an impulse points into a foot
+    const cone = new THREE.CylinderGeometry(0, 0.035 * this.drawing.radius, 1, 12);
+    cone.rotateX(Math.PI / 2).translate(0, 0, 0.5);
+    this.arrows = new THREE.InstancedMesh(cone, new THREE.MeshStandardMaterial({
+      color: 0xd1242f, emissive: 0x8a1018, depthTest: false, transparent: true,
+      opacity: 0.85, fog: false,
+    }), Math.max(1, ARROWS * this.worlds));
+    this.arrows.count = 0;
     this.arrows.frustumCulled = false;
     this.arrows.renderOrder = 9;
     this.arrows.visible = false;
@@ -291,10 +298,24 @@
 
   // Draws arrows: six numbers each, start and end.
   View.impulses = function (points) {
-    const array = new THREE.BufferAttribute(new Float32Array(points), 3);
-    this.arrows.geometry.dispose();
-    this.arrows.geometry = new THREE.BufferGeometry();
-    this.arrows.geometry.setAttribute("position", array);
+    const out = this.arrows.instanceMatrix.array;
+    const count = Math.min(points.length / 6, out.length / 16);
+    const along = new THREE.Vector3(), first = new THREE.Vector3();
+    const second = new THREE.Vector3();
+    for (let i = 0; i < count; i++) {
+      const p = points.slice(6 * i, 6 * i + 6);
+      along.set(p[3] - p[0], p[4] - p[1], p[5] - p[2]);
+      first.set(1, 0, 0);
+      if (Math.abs(along.x) > 0.9 * along.length()) first.set(0, 1, 0);
+      second.copy(along).cross(first).normalize();
+      first.copy(second).cross(along).normalize();
+      [first, second, along].forEach((axis, c) => axis.toArray(out, 16 * i + 4 * c));
+      out.set(p.slice(0, 3), 16 * i + 12);
+      out[16 * i + 3] = out[16 * i + 7] = out[16 * i + 11] = 0;
+      out[16 * i + 15] = 1;
+    }
+    this.arrows.count = count;
+    this.arrows.instanceMatrix.needsUpdate = true;
   };
 
   // Looks at the robot from the side and above.
@@ -321,9 +342,9 @@
   };
 
   View.theme = function (name) {
-    const t = THEMES[name], r = this.drawing.radius;
+    const t = THEMES[name];
     this.scene.background = new THREE.Color(t.sky);
-    this.scene.fog = new THREE.Fog(t.sky, 12 * r, 70 * r);
+    this.scene.fog = new THREE.Fog(t.sky);
     this.plane.material.color.set(t.ground);
     this.grid.gridMinor.value.set(t.minor);
     this.grid.gridMajor.value.set(t.major);
@@ -340,6 +361,9 @@
   View.render = function () {
     const t = this.controls.target, r = this.drawing.radius;
     this.plane.position.set(t.x, t.y, 0);
+    const away = this.camera.position.distanceTo(t);
+    this.scene.fog.near = 12 * r + 1.5 * away;
+    this.scene.fog.far = 70 * r + 5 * away;
     this.sun.position.set(t.x - 3 * r, t.y - 4 * r, t.z + 8 * r);
     this.sun.target.position.copy(t);
     this.controls.update();
