@@ -43,7 +43,13 @@ PROGRAM_CACHE: dict[str, Any] = {
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Adds ``--optimized``."""
+    """Adds ``--optimized`` and ``--fuzz-cases``."""
+    parser.addoption(
+        "--fuzz-cases",
+        type=int,
+        default=150,
+        help="hostile files that tests/test_fuzz.py makes (default: 150)",
+    )
     parser.addoption(
         "--optimized",
         action="store_true",

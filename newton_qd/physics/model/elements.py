@@ -291,11 +291,15 @@ def by_name(reader: XmlReader, tag: str) -> dict[str, ElementTree.Element]:
     """Returns the elements with a tag, by name.
 
     Raises:
-        RobotDescriptionError: An element has no name, or two have the same name.
+        RobotDescriptionError: An element has no name, two have the same name, or one
+            has an apostrophe in it.
     """
     found: dict[str, ElementTree.Element] = {}
     for element in reader.root.findall(tag):
         name = reader.text(element, "name")
+        if "'" in name:  # Newton looks names up with a path in which it ends a name
+            allowed = "text without an apostrophe"
+            raise reader.refused(element, "name", name, allowed)
         if name in found:
             raise reader.error(
                 element, f"second {tag} of this name; line {reader.lines[found[name]]}"

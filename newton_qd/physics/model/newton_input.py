@@ -8,6 +8,7 @@ links about a wrong point.
 from __future__ import annotations
 
 import dataclasses
+import math
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -27,6 +28,7 @@ from newton_qd.physics.model.xml_reader import (
 from newton_qd.physics.reference import compose, inverse, rotation_matrix
 
 _READ = ("link", "joint", "material")
+_MOTION = ("axis", "dynamics", "limit")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -75,6 +77,7 @@ class NewtonInput:
             if child.tag not in _READ:
                 root.remove(child)
         _drop_prefixed(root)
+        _drop_unread(root)
         for capsule in root.iter("capsule"):
             if capsule.get("height") is None and capsule.get("length") is not None:
                 capsule.set("height", capsule.attrib["length"])
@@ -85,7 +88,9 @@ class NewtonInput:
                     parent.remove(element)
             elif element.tag == "color" and element.get("rgba"):
                 short = len(element.attrib["rgba"].split()) == 3  # no opacity
-                self._reader.numbers(element, "rgba", 3 if short else 4)
+                values = self._reader.numbers(element, "rgba", 3 if short else 4)
+                # NumPy, which Newton reads this with, knows fewer kinds of digits.
+                element.set("rgba", " ".join(map(repr, values.tolist())))
             elif element.tag in ("mesh", "texture") and "filename" in element.attrib:
                 above = parents.get(parent)
                 collides = above is not None and above.tag == "collision"
@@ -157,6 +162,25 @@ def _mesh_problem(mesh: Asset, new_builder: Callable[[], Any]) -> str:
         reason = " ".join(str(error).split())
         return f"which Newton cannot read ({type(error).__name__}: {reason})"
     return ""
+
+
+def _drop_unread(root: ElementTree.Element) -> None:
+    """Removes what this package does not read of joints, if Newton cannot read it."""
+    for joint in root.iter("joint"):
+        for child in list(joint):
+            # what a fixed joint says about its motion has no meaning
+            if joint.get("type") == "fixed" and child.tag in _MOTION:
+                joint.remove(child)
+            for name in ("effort", "velocity"):
+                if child.tag == "limit" and not _is_number(child.get(name, "0")):
+                    del child.attrib[name]
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return False
 
 
 def _drop_prefixed(element: ElementTree.Element) -> None:

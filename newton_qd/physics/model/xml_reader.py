@@ -12,6 +12,9 @@ import numpy as np
 from newton_qd.checks import message
 from newton_qd.physics.reference import rpy_quaternion
 
+LARGEST = 1e9
+"""Largest number of a file, in SI units. The square of a larger one may overflow."""
+
 IDENTITY = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
 IDENTITY.setflags(write=False)
 
@@ -143,7 +146,8 @@ class XmlReader:
 
         Raises:
             RobotDescriptionError: The attribute is missing, has the wrong number of
-                values, or one that is not finite (with ``finite=False``: not a number).
+                values, or one that is not finite or above ``LARGEST`` (with
+                ``finite=False``: not a number).
         """
         text = element.get(key, default)
         if text is None:
@@ -152,9 +156,10 @@ class XmlReader:
             values = np.array([float(part) for part in text.split()])
         except ValueError:
             values = np.empty(0)
-        valid = np.isfinite(values) if finite else ~np.isnan(values)
+        valid = np.abs(values) <= LARGEST if finite else ~np.isnan(values)
         if len(values) != count or not valid.all():
-            raise self.refused(element, key, text, f"{count} finite number(s)")
+            allowed = f"{count} finite number(s) up to {LARGEST:g}"
+            raise self.refused(element, key, text, allowed)
         return values
 
     def number(

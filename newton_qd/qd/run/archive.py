@@ -3,35 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-import io
 import os
-import zipfile
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
-from newton_qd.qd.run.checkpoint import npz_bytes
+from newton_qd.qd.run.checkpoint import DAMAGE, npz_bytes, read_npz
 
 ARCHIVE = "archive.npz"
 FORMAT = 1
 """Number of the file's format. Keep a reader for each earlier format."""
-
-
-# Errors of NumPy and zipfile for a damaged file.
-DAMAGE = (
-    AttributeError,
-    EOFError,
-    KeyError,
-    NotImplementedError,
-    OSError,
-    RuntimeError,
-    TypeError,
-    ValueError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
 
 
 class ArchiveError(RuntimeError):
@@ -77,11 +59,9 @@ def load_archive(folder: str | os.PathLike[str]) -> Archive:
         FileNotFoundError: The file does not exist.
     """
     path = Path(folder) / ARCHIVE
-    # NumPy does not close a file that it cannot read.
-    content = io.BytesIO(path.read_bytes())
+    content = path.read_bytes()
     try:
-        with np.load(content, allow_pickle=False) as arrays:
-            found = {name: arrays[name] for name in arrays.files}
+        found = read_npz(content)
     except DAMAGE as error:
         raise ArchiveError(f"{path} is damaged: {error}") from error
     # The first files of format 1 have no number.

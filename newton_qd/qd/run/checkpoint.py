@@ -9,14 +9,37 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import io
+import warnings
+import zipfile
+import zlib
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from newton_qd import memory
 from newton_qd.files import write_atomically
 
 # Change the number if the contents of a checkpoint or the columns of metrics change.
 _MAGIC = b"newton_qd checkpoint 2 "
+
+
+# Errors of NumPy and zipfile for a damaged file. A header may ask for any memory.
+DAMAGE = (
+    AttributeError,
+    EOFError,
+    LookupError,
+    MemoryError,
+    NotImplementedError,
+    OSError,
+    RuntimeError,
+    SyntaxError,
+    TypeError,
+    ValueError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
 
 
 class CheckpointError(RuntimeError):
@@ -88,14 +111,61 @@ def load_checkpoint(path: Path) -> Checkpoint:
         raise CheckpointError(
             f"{path} is damaged (checksum differs); delete it to start the run again"
         )
-    with np.load(io.BytesIO(payload), allow_pickle=False) as arrays:
-        fields = {
-            field.name: arrays[field.name]
-            for field in dataclasses.fields(Checkpoint)
-            if field.name != "emitter"
-        }
-        count = sum(name.startswith("emitter_") for name in arrays.files)
-        leaves = tuple(arrays[f"emitter_{i}"] for i in range(count))
+    try:
+        return _from_arrays(read_npz(payload))
+    except DAMAGE as error:
+        raise CheckpointError(
+            f"{path} does not hold a checkpoint ({error}); delete it to start the run "
+            "again"
+        ) from error
+
+
+def read_npz(content: bytes) -> dict[str, np.ndarray]:
+    """Returns the arrays of a ``.npz`` file. It runs no code and unpickles nothing.
+
+    Raises:
+        MemoryError: The arrays do not fit in memory.
+        ValueError: The file is damaged; other errors of ``DAMAGE`` are possible, too.
+    """
+    sizes = [item.file_size for item in zipfile.ZipFile(io.BytesIO(content)).infolist()]
+    most = memory.limit()
+    if most is not None and sum(sizes) > most:
+        raise MemoryError(f"arrays of {sum(sizes):,} bytes")
+    with warnings.catch_warnings():
+        # NumPy warns about headers that an old Python wrote, or that nobody did.
+        warnings.simplefilter("ignore")
+        with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+            found = {name: arrays[name] for name in arrays.files}
+    wrong = [name for name, array in found.items() if not isinstance(array, np.ndarray)]
+    if wrong:
+        raise ValueError(f"{wrong[0]!r} is not an array")
+    return found
+
+
+def _from_arrays(arrays: Mapping[str, np.ndarray]) -> Checkpoint:
+    """Makes a checkpoint from the arrays of its file.
+
+    Raises:
+        ValueError: Arrays are missing, or do not fit together.
+    """
+    fields: dict[str, Any] = {
+        field.name: arrays[field.name]
+        for field in dataclasses.fields(Checkpoint)
+        if field.name != "emitter"
+    }
+    count = sum(name.startswith("emitter_") for name in arrays)
+    leaves = tuple(arrays[f"emitter_{i}"] for i in range(count))
+    cells, size = fields["genotypes"].shape
+    width = fields["centroids"].shape[1]
+    shapes = {"fitnesses": (cells,), "descriptors": (cells, width)}
+    shapes |= {"centroids": (cells, width), "genotypes": (cells, size)}
+    for name, shape in shapes.items():
+        if fields[name].shape != shape or fields[name].dtype.kind != "f":
+            raise ValueError(f"{name} are {fields[name].dtype} {fields[name].shape}")
+    if fields["metrics"].ndim != 2 or fields["metrics"].dtype.kind != "f":
+        raise ValueError("the metrics are no table of numbers")
+    if fields["settings"].dtype.kind != "U" or fields["settings"].ndim:
+        raise ValueError("the settings are no text")
     fields["settings"] = str(fields["settings"])
     fields["iteration"] = int(fields["iteration"])
     return Checkpoint(**fields, emitter=leaves)
