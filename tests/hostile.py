@@ -130,7 +130,7 @@ def links(draw: st.DrawFn, name: str, numbers: st.SearchStrategy[str]) -> str:
     parts = []
     if draw(st.sampled_from([True, True, True, False])):
         moment = draw(numbers)
-        moments = dict.fromkeys(("ixx", "iyy", "izz"), moment)
+        moments: dict[str, str] = dict.fromkeys(("ixx", "iyy", "izz"), moment)
         moments |= dict.fromkeys(("ixy", "ixz", "iyz"), "0")
         if draw(st.integers(0, 9)) == 0:
             moments[draw(st.sampled_from(sorted(moments)))] = draw(NUMBERS)

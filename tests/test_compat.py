@@ -206,7 +206,7 @@ def test_no_fault_pays_in_a_scoring_function() -> None:
 
     states = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 2))
     actions = jnp.array([[0.1, 0.1], [jnp.nan, 0.0]])
-    found = evaluate(play, (states, actions), (0, 0), 5, lambda data, _: data[2][:, 0])
+    found = evaluate(play, (states, actions), (0, 0), 5, lambda data, _: data[2][:, 0])  # pyright: ignore
     assert np.isfinite(found[0][0]) and found[0][1] == -np.inf
 
 

@@ -113,14 +113,16 @@ def fuzz(
 ) -> None:
     """Calls a function with many cases; only documented errors may leave it."""
     sizes = []
+    cases_in_all: Any = config.getoption("--fuzz-cases")
+    all_checks: Any = list(HealthCheck)
 
     @settings(
-        max_examples=max(config.getoption("--fuzz-cases") // KINDS, 1),
+        max_examples=max(cases_in_all // KINDS, 1),
         deadline=None,
         database=None,
         derandomize=True,
         phases=[Phase.generate],  # what fails is shown as it is, after a bounded time
-        suppress_health_check=list(HealthCheck),
+        suppress_health_check=all_checks,
     )
     @given(cases)
     def run(case: Any) -> None:

@@ -48,7 +48,8 @@ def random_uniform(
     high: float | None = 1.0,
 ) -> jax.Array:
     """Returns uniform random numbers from ``low`` to ``high``."""
-    return jax.random.uniform(rng, shape, jnp.float32, low or 0.0, high)
+    most = 1.0 if high is None else high
+    return jax.random.uniform(rng, shape, jnp.float32, low or 0.0, most)
 
 
 def vec_to_arr(vector: Any) -> np.ndarray:

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from newton_qd import memory
+from newton_qd.checks import message
 from newton_qd.files import write_atomically
 
 # Change the number if the contents of a checkpoint or the columns of metrics change.
@@ -138,7 +139,7 @@ def read_npz(content: bytes) -> dict[str, np.ndarray]:
             found = {name: arrays[name] for name in arrays.files}
     wrong = [name for name, array in found.items() if not isinstance(array, np.ndarray)]
     if wrong:
-        raise ValueError(f"{wrong[0]!r} is not an array")
+        raise ValueError(message("array", wrong[0], "arrays of NumPy"))
     return found
 
 
@@ -161,11 +162,11 @@ def _from_arrays(arrays: Mapping[str, np.ndarray]) -> Checkpoint:
     shapes |= {"centroids": (cells, width), "genotypes": (cells, size)}
     for name, shape in shapes.items():
         if fields[name].shape != shape or fields[name].dtype.kind != "f":
-            raise ValueError(f"{name} are {fields[name].dtype} {fields[name].shape}")
+            raise ValueError(message(name, fields[name], f"floats of shape {shape}"))
     if fields["metrics"].ndim != 2 or fields["metrics"].dtype.kind != "f":
-        raise ValueError("the metrics are no table of numbers")
+        raise ValueError(message("metrics", fields["metrics"], "a table of floats"))
     if fields["settings"].dtype.kind != "U" or fields["settings"].ndim:
-        raise ValueError("the settings are no text")
+        raise ValueError(message("settings", fields["settings"], "text"))
     fields["settings"] = str(fields["settings"])
     fields["iteration"] = int(fields["iteration"])
     return Checkpoint(**fields, emitter=leaves)
