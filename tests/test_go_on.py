@@ -55,6 +55,7 @@ def test_a_run_goes_on_beyond_its_end(reference: Path, tmp_path: Path) -> None:
         run(SHORT, out=out, resume=True)
 
 
+@pytest.mark.slow
 def test_metrics_of_the_first_end_do_not_stay(tmp_path: Path) -> None:
     out = tmp_path / "run"
     run(AGAIN.replace(iterations=2), out=out)
@@ -99,7 +100,17 @@ def network_parameters(genotypes: np.ndarray) -> Any:
     return jax.vmap(policy.unravel)(jnp.asarray(genotypes))
 
 
-@pytest.mark.parametrize("kind", ["folder", "text", "run", "archive", "qdax", "ribs"])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "folder",
+        "qdax",
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in ("text", "run", "archive", "ribs")
+        ),
+    ],
+)
 def test_a_run_starts_from_any_archive(reference: Path, kind: str) -> None:
     opened = load_run(reference, task_factory=point_task)
     source: Any = reference
@@ -148,7 +159,7 @@ def test_unfit_elites_are_counted(reference: Path) -> None:
         np.concatenate([elites.descriptors, elites.descriptors[:9]]),
         np.concatenate([elites.centroids, elites.centroids[:9]]),
     )
-    config = SMALL.replace(batch_size=4, iterations=0)
+    config = SMALL.replace(batch_size=4, iterations=1)
     assert start_with(joined, config).metrics["rejected"][0] >= 9
 
 

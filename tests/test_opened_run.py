@@ -329,6 +329,7 @@ def test_a_scoring_function_of_ones_own_is_repeated(
     assert np.array_equal(again.fitnesses, result.archive.fitnesses[filled])
 
 
+@pytest.mark.slow
 def test_new_starts_cannot_be_repeated(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

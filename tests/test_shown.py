@@ -17,7 +17,7 @@ from newton_qd.wrappers import RandomParamsWrapper
 TESTS = Path(__file__).resolve().parent
 
 
-def test_text_of_an_environment() -> None:
+def test_text_and_attributes_of_an_environment() -> None:
     plain: Any = newton_qd.create("pointmaze", episode_length=7)
     assert repr(plain) == (
         "<pointmaze: observation 2, action 2, descriptor xy_position 2, 1 s; "
@@ -36,10 +36,7 @@ def test_text_of_an_environment() -> None:
     )
     moving = RandomParamsWrapper(newton_qd.create("ant_uni"), friction=(0.5, 1.5))
     assert "RandomParamsWrapper(ranges={'friction': (0.5, 1.5)})>" in repr(moving)
-
-
-def test_forwarded_attributes_are_listed() -> None:
-    env: Any = newton_qd.create("ant_uni", batch_size=3)
+    # what the wrappers forward
     names = dir(env)
     for name in ("batch_size", "episode_length", "system", "state_descriptor_limits"):
         assert name in names and hasattr(env, name)
