@@ -1,13 +1,16 @@
 """Compare the speed of robots with that of brax on one GPU, in one process.
 
     python benchmarks/compare_gpu.py [--robots ant ...] [--batches 4096 ...]
-        [--libraries newton_qd "brax v1" ...] [--gradients 1024 ...] [--out FILE.csv]
+        [--libraries newton_qd "brax v1" ...] [--gradients 1024 ...]
+        [--horizons 4 16 64] [--out FILE.csv]
 
 The libraries take turns, and the table has medians, in million environment steps per
 second. A step is the whole one: physics, observation, reward, episode and automatic
 reset, in a scan under uniform random actions; newton_qd computes the descriptors of the
 `_uni` tasks too. A gradient is that of the sum of rewards by the actions, forward and
-backward. A row counts if its rewards, and its gradient, are finite and not all equal.
+backward; ``--horizons`` is over how many steps, with ``--horizon-worlds`` worlds. A row
+counts if its rewards, and its gradient, are finite and not all equal.
+``benchmarks/gpu_figures.py`` draws the csv files.
 
 The peers need brax 0.12.3 (`pip install brax==0.12.3 gym==0.26.2`) in the same
 environment. "brax v1" is the legacy spring physics that QDax used.
@@ -105,9 +108,9 @@ LIBRARIES: dict[str, Callable[[str, int], Library]] = {
 }
 
 
-def prepare(library: Library, kind: str, worlds: int) -> Callable[[], Any]:
+def prepare(library: Library, kind: str, worlds: int, steps: int) -> Callable[[], Any]:
     """Returns a function that runs the steps and waits for their result."""
-    shape = (STEPS[kind], worlds, library.action_size)
+    shape = (steps, worlds, library.action_size)
     keys = jax.random.split(jax.random.PRNGKey(SEED), worlds)
     actions = jax.random.uniform(jax.random.PRNGKey(SEED), shape, minval=-1, maxval=1)
     start = library.reset(keys)
@@ -134,14 +137,19 @@ def counts(result: Any) -> bool:
 
 
 def compare(
-    robot: str, kind: str, worlds: int, libraries: list[str], repetitions: int
+    robot: str,
+    kind: str,
+    worlds: int,
+    steps: int,
+    libraries: list[str],
+    repetitions: int,
 ) -> list[dict[str, Any]]:
     """Returns a row for each library; they take turns."""
     runs, rows = {}, []
     for name in libraries:
         start = time.perf_counter()
         try:
-            run = prepare(LIBRARIES[name](robot, worlds), kind, worlds)
+            run = prepare(LIBRARIES[name](robot, worlds), kind, worlds, steps)
             valid = counts(run())
         # a peer may not fit this JAX or this GPU, and the others still count
         except PEER_ERRORS as error:
@@ -161,7 +169,7 @@ def compare(
             runs[name]()
             times[name].append(time.perf_counter() - start)
     speeds = {
-        name: worlds * STEPS[kind] / statistics.median(found) / 1e6
+        name: worlds * steps / statistics.median(found) / 1e6
         for name, found in times.items()
     }
     for row in rows:
@@ -169,11 +177,12 @@ def compare(
         if name in speeds:
             row["million steps/s"] = speeds[name]
             row["ours to it"] = speeds.get(OURS, float("nan")) / speeds[name]
-    return [{"robot": robot, "kind": kind, "worlds": worlds, **row} for row in rows]
+    job = {"robot": robot, "kind": kind, "worlds": worlds, "steps": steps}
+    return [job | row for row in rows]
 
 
-COLUMNS = ("robot", "kind", "worlds", "library", "million steps/s", "ours to it")
-COLUMNS += ("first call [s]", "note")
+COLUMNS = ("robot", "kind", "worlds", "steps", "library", "million steps/s")
+COLUMNS += ("ours to it", "first call [s]", "note")
 
 
 def show(row: dict[str, Any]) -> str:
@@ -181,6 +190,16 @@ def show(row: dict[str, Any]) -> str:
     cells = (row.get(name, "") for name in COLUMNS)
     texts = (f"{cell:.3g}" if isinstance(cell, float) else str(cell) for cell in cells)
     return "| " + " | ".join(texts) + " |"
+
+
+def write(path: Path, rows: list[dict[str, Any]]) -> None:
+    """Writes the rows that are there, so that a run that ends early keeps them."""
+    part = path.with_suffix(".part")
+    with part.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, COLUMNS)
+        writer.writeheader()
+        writer.writerows(rows)
+    part.replace(path)
 
 
 def main() -> None:
@@ -192,6 +211,8 @@ def main() -> None:
     batches = [4096, 16384, 65536]
     parser.add_argument("--batches", nargs="*", type=int, default=batches)
     parser.add_argument("--gradients", nargs="*", type=int, default=[])
+    parser.add_argument("--horizons", nargs="*", type=int, default=[])
+    parser.add_argument("--horizon-worlds", type=int, default=1024)
     names = list(LIBRARIES)
     parser.add_argument("--libraries", nargs="+", choices=names, default=names[:2])
     parser.add_argument("--repetitions", type=int, default=5)
@@ -199,22 +220,20 @@ def main() -> None:
     options = parser.parse_args()
     print(f"{jax.devices()[0].device_kind}, JAX {jax.__version__}")
     print(f"| {' | '.join(COLUMNS)} |\n|{'---|' * len(COLUMNS)}", flush=True)
-    jobs = [("forward", n) for n in options.batches]
-    jobs += [("gradient", n) for n in options.gradients]
+    jobs = [("forward", n, STEPS["forward"]) for n in options.batches]
+    jobs += [("gradient", n, STEPS["gradient"]) for n in options.gradients]
+    jobs += [("gradient", options.horizon_worlds, n) for n in options.horizons]
     found = []
     for robot in options.robots:
-        for kind, worlds in jobs:
-            rows = compare(robot, kind, worlds, options.libraries, options.repetitions)
+        for kind, worlds, steps in jobs:
+            rows = compare(
+                robot, kind, worlds, steps, options.libraries, options.repetitions
+            )
             for row in rows:
                 print(show(row), flush=True)
             found += rows
-    if options.out is not None:
-        text = options.out.with_suffix(".part")
-        with text.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, COLUMNS)
-            writer.writeheader()
-            writer.writerows(found)
-        text.replace(options.out)
+            if options.out is not None:
+                write(options.out, found)
 
 
 if __name__ == "__main__":

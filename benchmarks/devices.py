@@ -101,7 +101,7 @@ def compare(
         before = launched_on_cpu()
         found = [np.asarray(x) for x in run(genotypes, jax.random.key(1))[:2]]
         # the kernel with most launches is the step
-        launches, worlds = max([0, 0], *(launched_on_cpu() - before).tolist())
+        launches, worlds = max([[0, 0], *(launched_on_cpu() - before).tolist()])
         if launches:
             seen.add(("cpu", "step_forward", worlds // launches))
         first = found if first is None else first
