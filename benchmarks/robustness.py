@@ -12,12 +12,13 @@ from __future__ import annotations
 
 import argparse
 import time
+from typing import Any
 
 import numpy as np
 
 from newton_qd.qd import EvolveConfig, evolve
 
-SETTINGS = (
+SETTINGS: tuple[dict[str, Any], ...] = (
     {"starts": 1},
     {"starts": 1, "new_starts": True},
     {"starts": 4},
