@@ -23,6 +23,7 @@ import numpy as np
 
 import newton_qd
 from newton_qd.qd import load_run
+from newton_qd.tasks import ENVIRONMENTS
 from newton_qd.viewing import record, record_elites, render
 
 FOLDER = Path(__file__).with_name("gallery")
@@ -91,9 +92,8 @@ def evolved(folder: str) -> Path:
 def page() -> str:
     """Returns the text of the page."""
     text = HEAD
-    for name in newton_qd.registered_envs():
-        env = newton_qd.create(name)
-        about = inspect.getdoc(type(env.unwrapped)) or ""
+    for name, spec in ENVIRONMENTS.items():
+        about = inspect.getdoc(spec.base) or ""
         summary = " ".join(about.split("\n\n")[0].split())
         text += f"\n## {name}\n\n![{name}, moving](gallery/{name}.gif)\n\n{summary}\n"
     return text
