@@ -49,7 +49,7 @@ def until(page: Any, condition: str) -> None:
 
     Playwright's own function evaluates text in the page, which its policy forbids.
     """
-    for _ in range(400):
+    for _ in range(1600):  # 40 s: all cores may be busy
         if page.evaluate(condition):
             return
         page.wait_for_timeout(25)
