@@ -28,6 +28,12 @@ _RANDOM_STEPS = 250  # of an environment without a policy
 
 def add_parsers(commands: Commands) -> None:
     """Adds the commands to the subparsers of ``newton-qd``."""
+    _add_replay(commands)
+    _add_explore(commands)
+    _add_render(commands)
+
+
+def _add_replay(commands: Commands) -> None:
     parser = commands.add_parser(
         "replay",
         help="write a page that shows elites of a run, or an environment, moving",
@@ -44,6 +50,8 @@ def add_parsers(commands: Commands) -> None:
     )
     parser.set_defaults(run=replay)
 
+
+def _add_explore(commands: Commands) -> None:
     parser = commands.add_parser(
         "explore",
         help="write a page with the archive of a run: click a cell, watch its elite",
@@ -77,6 +85,8 @@ def add_parsers(commands: Commands) -> None:
     )
     parser.set_defaults(run=explore)
 
+
+def _add_render(commands: Commands) -> None:
     parser = commands.add_parser(
         "render",
         help="write a picture, a GIF or a video of elites, without a screen",
