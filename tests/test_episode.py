@@ -120,7 +120,8 @@ def test_scores(line: Any) -> None:
     assert jax.jit(mixed)(plans, KEY)[2]["gradients"].shape == (3, STEPS, 1, 2)
 
 
-def test_what_is_not_jitted_is_compiled_once() -> None:
+@pytest.mark.parametrize("every", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_what_is_not_jitted_is_compiled_once(every: bool) -> None:
     """The policy is traced in the first call only, also by gradients of a call."""
     traces = []
 
@@ -132,20 +133,22 @@ def test_what_is_not_jitted_is_compiled_once() -> None:
     weights = jnp.array([[0.1], [0.2]], jnp.float32)
     around = {"params": None, "samples": 2, "sigma": 0.1}
     calls = {
-        "call": lambda: episode(weights[0], KEY),
         "gradient": lambda: episode.gradient(weights, KEY),
+        "of a call": lambda: jax.grad(lambda w: episode(w, KEY).fitness)(weights[0]),
+    }
+    more = {
+        "call": lambda: episode(weights[0], KEY),
         "keywords": lambda: episode.gradient(genotypes=weights, start=KEY),
         "others": lambda: episode.gradient(genotypes=2 * weights, start=KEY),
         "mixed": lambda: episode.mixed(weights, KEY, **around),
         "scores": lambda: episode.scoring()(weights, KEY),
-        "of a call": lambda: jax.grad(lambda w: episode(w, KEY).fitness)(weights[0]),
         "of many": lambda: jax.vmap(episode, (0, None))(weights, KEY),
     }
-    for name, call in calls.items():
+    for name, call in (calls | more if every else calls).items():
         first = call()
         traces.clear()
         assert same(call(), first) and not traces, name
-        assert same(jax.jit(call)(), first), name
+        assert not every or same(jax.jit(call)(), first), name
     assert pickle.loads(pickle.dumps(Episode(Line(1.1), episode_length=2))) is not None
     assert not hasattr(dataclasses.replace(episode, episode_length=2), "_compiled")
 
