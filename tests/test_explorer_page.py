@@ -156,6 +156,9 @@ def test_two_runs_filter_colour_and_hostile_names(pages: Pages, tmp_path: Path) 
         assert np.allclose(
             last(page, world), expected(run, run.best()[0].cell), atol=1e-3
         )
+    for index, run in enumerate(runs):  # also the elite at the slider's first value
+        shown = page.evaluate(f"Array.from(NQD.maps[{index}].shown)")
+        assert shown == [1] * len(run.cells)
     least = float(np.median(runs[0].archive.fitnesses[runs[0].cells]))
     page.locator("#maps input[type=range]").fill(str(least))
     for index, run in enumerate(runs):

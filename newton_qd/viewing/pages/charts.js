@@ -10,8 +10,9 @@
     const length = data.lengths[w];
     const total = Math.max(1, Math.max(...data.lengths));
     const steps = data.rewards.shape[1];
+    const every = data.feet_most || 1; // a frame has the sum of several steps
     const reward = [];
-    for (let k = 0; k < length; k++) reward.push(data.rewards.data[w * steps + k]);
+    for (let k = 0; k < length; k++) reward.push(data.rewards.data[w * steps + k] / every);
     this.chart("reward", [reward], 1, total, ["reward"]);
     const nf = data.feet.shape[2];
     if (nf) this.feetChart(w, nf, length, total);

@@ -49,6 +49,7 @@
   filter.min = String(lowest);
   filter.max = String(highest);
   filter.value = String(lowest);
+  const start = filter.value; // the browser rounds it, perhaps above the lowest
 
   const maps = runs.map((run, index) => {
     const part = NQD.element("div", section, { name: "run" });
@@ -97,7 +98,7 @@
         high = Math.max(high, value);
       }
     }
-    const least = Number(filter.value);
+    const least = filter.value === start ? lowest : Math.min(Number(filter.value), highest);
     maps.forEach((map, r) => {
       fitness[r].forEach((value, e) => { map.shown[e] = value >= least ? 1 : 0; });
       map.colour(runs[r].metrics[index].values.data, low, high);
