@@ -74,7 +74,7 @@ def test_archives_without_a_number_have_the_first_format(tmp_path: Path) -> None
 
 def test_what_is_no_archive_is_refused(tmp_path: Path) -> None:
     arrays = {name: getattr(small(), name) for name in NAMES}
-    with pytest.raises(FileNotFoundError, match=r"archive\.npz"):
+    with pytest.raises(FileNotFoundError, match=r"has no archive\.npz; allowed"):
         load_archive(tmp_path)
     for change, message in (
         ({"format": np.asarray(2)}, r"has format 2; this version .* reads format 1"),

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from newton_qd.checks import Fact, message
 from newton_qd.qd.run.checkpoint import DAMAGE, npz_bytes, read_npz
 
 ARCHIVE = "archive.npz"
@@ -59,7 +60,12 @@ def load_archive(folder: str | os.PathLike[str]) -> Archive:
         FileNotFoundError: The file does not exist.
     """
     path = Path(folder) / ARCHIVE
-    content = path.read_bytes()
+    try:
+        content = path.read_bytes()
+    except FileNotFoundError as error:
+        allowed = "the folder of a run that has saved its archive or a checkpoint"
+        missing = message("folder", Fact(f"{folder}, which has no {ARCHIVE}"), allowed)
+        raise FileNotFoundError(missing) from error
     try:
         found = read_npz(content)
     except DAMAGE as error:
