@@ -39,6 +39,7 @@ def test_doctor_checks_the_installation(
     found = json.loads(capsys.readouterr().out)
     assert found["check"]["passed"] and found["kernel_cache"]["writable"]
     assert found["packages"]["jax"] and found["devices"]
+    assert found["packages"]["newton_qd"] == newton_qd.__version__
     assert len(json.dumps(found)) > 200
 
     def broken(*arguments: object, **options: object) -> None:

@@ -51,7 +51,11 @@ def _devices() -> list[str]:
     """Returns the devices that JAX uses."""
     import jax
 
-    return [f"{device.platform}:{device.id} {device}" for device in jax.devices()]
+    return [
+        f"{device.platform}:{device.id}"
+        + ("" if device.device_kind == device.platform else f" {device.device_kind}")
+        for device in jax.devices()
+    ]
 
 
 def _kernel_cache() -> dict[str, Any]:

@@ -284,6 +284,10 @@ def package_versions() -> dict[str, str | None]:
 
 
 def _version(package: str) -> str | None:
+    if package == "newton_qd":  # a checkout may be newer than what pip has noted
+        from newton_qd import __version__
+
+        return __version__
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
