@@ -196,7 +196,7 @@ def write(path: Path, rows: list[dict[str, Any]]) -> None:
     """Writes the rows that are there, so that a run that ends early keeps them."""
     part = path.with_suffix(".part")
     with part.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, COLUMNS)
+        writer: csv.DictWriter[str] = csv.DictWriter(file, COLUMNS)
         writer.writeheader()
         writer.writerows(rows)
     part.replace(path)

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import functools
 import statistics
 import time
 from collections.abc import Callable
@@ -100,7 +101,9 @@ def measure(
     if model.device.is_cuda:
         with wp.ScopedCapture() as capture:
             control_step()
-        run = lambda: wp.capture_launch(capture.graph)  # noqa: E731
+        graph = capture.graph
+        assert graph is not None  # the capture is over
+        run = functools.partial(wp.capture_launch, graph)
     else:
         run = control_step
     times = []

@@ -30,6 +30,7 @@ import numpy as np
 import newton_qd
 from newton_qd.envs.base import PhysicsEnv
 from newton_qd.physics.launch import LANES, lane_count
+from newton_qd.physics.tree import build_tree
 
 CLOCKS = {"wall": time.perf_counter, "processor": time.process_time}
 
@@ -169,10 +170,12 @@ def lanes(name: str, options: argparse.Namespace) -> None:
     print(f"{name} on {jax.devices()[0]}, thousand environment steps per second")
     print("| batch | lanes | forward | forward + backward |\n|---|---|---|---|")
     kernels = ("step_forward", "step_backward")
+    base: Any = newton_qd.create(name).unwrapped
+    branches = len(build_tree(base.system).limb_level) > 2
     for batch in options.batches:
         for count in (None, *LANES):
             os.environ.pop("NEWTON_QD_LANES", None)
-            chosen = [str(lane_count(kernel, batch)) for kernel in kernels]
+            chosen = [str(lane_count(kernel, batch, branches)) for kernel in kernels]
             text = f"default: {' and '.join(chosen)}"
             if count is not None:
                 os.environ["NEWTON_QD_LANES"] = text = str(count)
