@@ -1,0 +1,153 @@
+"""Long runs: does memory stay flat, and does ``kill -9`` lose nothing?
+
+    python benchmarks/soak.py steps [--count 200000]
+    python benchmarks/soak.py generations [--count 5000]
+    python benchmarks/soak.py kills [--count 50]
+
+``steps`` calls a jitted step and, every hundredth time, a jitted gradient.
+``generations`` runs ``evolve`` with small settings. Both print the memory of the
+process [MB] at twenty moments. The first fifth of a run fills caches; from then on
+memory may not grow by more than 2 %. ``kills`` stops ``newton-qd evolve`` with ``kill
+-9`` at random moments, continues it each time, and compares the archive with that of a
+run that nobody stopped, bit by bit. The exit code is 1 if something of this does not
+hold.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import random
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+
+MOMENTS = 20
+GROWTH = 1.02
+PAGE = os.sysconf("SC_PAGE_SIZE")
+EVOLVE = ("-m", "newton_qd", "evolve", "hopper_uni", "--batch-size", "16")
+EVOLVE += ("--episode-length", "20", "--checkpoint-seconds", "0")
+
+
+def resident() -> float:
+    """Memory of this process [MB]."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * PAGE / 1e6
+
+
+def flat(memory: list[float]) -> bool:
+    """Whether memory grew by less than 2 % after the first fifth; prints it."""
+    print("memory [MB]:", *(f"{value:.0f}" for value in memory))
+    start = max(memory[: max(len(memory) // 5, 1)])
+    print(f"end over start: {memory[-1] / start:.3f}")
+    return memory[-1] <= GROWTH * start
+
+
+def steps(count: int) -> bool:
+    """Steps one world, and differentiates a step now and then."""
+    import jax
+    import jax.numpy as jnp
+
+    import newton_qd
+
+    env = newton_qd.create("ant_uni", episode_length=250)
+    step, state = jax.jit(env.step), jax.jit(env.reset)(jax.random.key(0))
+    slope = jax.jit(jax.grad(lambda action, state: env.step(state, action).reward))
+    actions = jax.random.uniform(jax.random.key(1), (97, env.action_size), minval=-1.0)
+    actions, memory = list(actions), []
+    for n in range(count):
+        state = step(state, actions[n % 97])
+        if n % 100 == 0:
+            assert jnp.isfinite(slope(actions[n % 97], state)).all()
+        if (n + 1) % (count // MOMENTS) == 0:
+            jax.block_until_ready(state)
+            memory.append(resident())
+    newton_qd.check(state)
+    return flat(memory)
+
+
+def generations(count: int) -> bool:
+    """Runs ``evolve`` with small settings."""
+    from newton_qd.qd import EvolveConfig, evolve
+
+    config = EvolveConfig(
+        env_name="hopper_uni", batch_size=16, episode_length=20, iterations=count
+    )
+    memory: list[tuple[float, float]] = []
+    done = threading.Event()
+
+    def watch() -> None:
+        while not done.wait(0.2):
+            memory.append((time.monotonic(), resident()))
+
+    watcher = threading.Thread(target=watch, daemon=True)
+    watcher.start()
+    with tempfile.TemporaryDirectory() as folder:
+        evolve(config, out=Path(folder) / "run", progress=False)
+    done.set()
+    watcher.join()
+    every = max(len(memory) // MOMENTS, 1)
+    return flat([value for _, value in memory[every - 1 :: every]])
+
+
+def kills(count: int) -> bool:
+    """Stops a run with ``kill -9`` and continues it, until it is done."""
+    moments = random.Random(0)
+    with tempfile.TemporaryDirectory() as folder:
+        expected, out = Path(folder) / "expected", Path(folder) / "run"
+        arguments = [sys.executable, *EVOLVE, "--iterations", str(20 * count)]
+        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        begin = time.monotonic()
+        subprocess.run([*arguments, "--out", str(expected)], check=True, **quiet)
+        whole = time.monotonic() - begin
+        for attempt in range(count):
+            again = [*arguments, "--out", str(out), "--resume"]
+            process = subprocess.Popen(again, **quiet)
+            time.sleep(moments.uniform(0.0, min(whole, 15.0)))
+            process.kill()
+            process.wait()
+            print(f"kill {attempt + 1} of {count}", flush=True)
+        subprocess.run([*arguments, "--out", str(out), "--resume"], check=True, **quiet)
+        return same_archives(expected, out)
+
+
+def same_archives(expected: Path, found: Path) -> bool:
+    """Whether the archives of two folders are equal, bit by bit."""
+    import numpy as np
+
+    from newton_qd.qd import load_archive
+
+    pairs = [load_archive(folder) for folder in (expected, found)]
+    same = all(
+        np.array_equal(a, b, equal_nan=True)
+        for a, b in zip(
+            (pairs[0].fitnesses, pairs[0].descriptors, pairs[0].genotypes),
+            (pairs[1].fitnesses, pairs[1].descriptors, pairs[1].genotypes),
+            strict=True,
+        )
+    )
+    print("the same archive" if same else "ANOTHER archive")
+    return same
+
+
+RUNS = {"steps": (steps, 200_000), "generations": (generations, 5_000)}
+RUNS["kills"] = (kills, 50)
+
+
+def main() -> int:
+    """Runs one of the three, and returns the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("run", choices=list(RUNS))
+    parser.add_argument("--count", type=int, help="default: 200000, 5000 or 50")
+    options = parser.parse_args()
+    run, count = RUNS[options.run]
+    good = run(options.count or count)
+    print("holds" if good else "does NOT hold")
+    return 0 if good else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
