@@ -188,5 +188,9 @@ def test_a_large_archive_is_thinned(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_wrong_runs_are_named(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(ValueError, match="runs: got 0 runs; allowed: one run or two"):
         explorer_html([])
+    for command in ("explore", "replay", "render"):  # before anything is read
+        assert cli.main([command, "ant", "--out", "no_folder/x.gif"]) == 2
+        refused = "--out: got 'no_folder/x.gif', and no_folder is no folder; allowed: a"
+        assert refused in capsys.readouterr().err
     assert cli.main(["explore", "a", "b", "c"]) == 2
     assert "DIR: got 3 folders; allowed: one folder or two" in capsys.readouterr().err

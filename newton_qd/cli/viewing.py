@@ -215,6 +215,7 @@ def explore(arguments: argparse.Namespace, task_factory: TaskFactory = None) -> 
     out = arguments.out
     if out is None:
         out = arguments.folders[0] / "explorer.html"
+    _check_target(out, given=arguments.out is not None)
     runs = [_drawable(folder, task_factory) for folder in arguments.folders]
     from newton_qd.viewing import write_explorer
 
@@ -264,16 +265,28 @@ def _target(arguments: argparse.Namespace, name: str, ending: str) -> Path:
     """Returns the file to write: ``name`` in a results folder, or ENV with an ending.
 
     Raises:
-        ConfigError: It is a folder.
+        ConfigError: It is a folder, or lies in no folder.
     """
     folder = Path(arguments.what)
     out = arguments.out
     if out is None:
         out = folder / name if folder.is_dir() else Path(f"{arguments.what}{ending}")
+    _check_target(out, given=arguments.out is not None)
+    return out
+
+
+def _check_target(out: Path, *, given: bool) -> None:
+    """Checks the file to write, before the slow part.
+
+    Raises:
+        ConfigError: It is a folder, or lies in no folder.
+    """
     if out.is_dir():
         why = "which is a folder"
         raise ConfigError(message("--out", str(out), "a file", why=why))
-    return out
+    if given and not out.parent.is_dir():
+        why = f"and {out.parent} is no folder"
+        raise ConfigError(message("--out", str(out), "a file in a folder", why=why))
 
 
 def _trajectory(
