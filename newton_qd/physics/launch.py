@@ -261,8 +261,10 @@ class Launcher:
                 parameters=own,
                 fault=after["fault"].offset,
             )
+        # all that the arguments of the kernel depend on
+        solves = buffers.substep_solves(self.system)
         return add_plan(
-            (name, self.parametric, self.system),
+            (name, self.parametric, self.system, solves),
             cpu_entry(launch, adjoint),
             rows,
             number_bytes=number_bytes,
