@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
+import processes
 import pytest
 from point_runs import SMALL, point_task
 
@@ -283,13 +283,10 @@ def test_devices_by_name(tmp_path: Path) -> None:
 
 def test_a_reader_that_leaves_early_is_no_failure() -> None:
     code = "import sys; from newton_qd.cli import main; sys.exit(main(sys.argv[1:]))"
-    process = subprocess.Popen(
-        [sys.executable, "-c", code, "algorithms"],
-        cwd=TESTS,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
+    process = processes.start(
+        [sys.executable, "-c", code, "algorithms"], seconds=100.0, cwd=TESTS
     )
     assert process.stdout is not None and process.stderr is not None
     process.stdout.close()
-    assert process.stderr.read() == b""
+    assert process.stderr.read() == ""
     assert process.wait(timeout=60) == cli.OK
