@@ -120,7 +120,8 @@ def test_scores(line: Any) -> None:
     assert jax.jit(mixed)(plans, KEY)[2]["gradients"].shape == (3, STEPS, 1, 2)
 
 
-@pytest.mark.parametrize("every", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("every", [False, True])
 def test_what_is_not_jitted_is_compiled_once(every: bool) -> None:
     """The policy is traced in the first call only, also by gradients of a call."""
     traces = []

@@ -77,7 +77,9 @@ _OTHERS += ["humanoid_uni", "humanoid_omni", "humanoidtrap", "walker2d_uni"]
 SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in _OTHERS]
 
 
-@pytest.mark.parametrize("name", ["hopper_uni", "pointmaze", *SLOW])
+@pytest.mark.parametrize(
+    "name", ["hopper_uni", pytest.param("pointmaze", marks=pytest.mark.slow), *SLOW]
+)
 def test_scores_have_the_gradients_of_their_differences(x64: None, name: str) -> None:
     """32 steps, along the gradient itself: relative error below 1e-4."""
     task, count = task_of(name), 4
