@@ -377,3 +377,17 @@ def test_systems_are_cached(x64: None) -> None:
     assert load_system(dataclasses.replace(ANT), "float64") is double
     assert load_system(ANT) is not double
     assert load_system(ANT) is load_system(ANT, "float32")
+
+
+def test_an_edited_file_is_another_robot(tmp_path: Path) -> None:
+    path = tmp_path / "ant.urdf"
+    text = find_urdf(ANT.urdf).read_text(encoding="utf-8")
+    path.write_text(text, encoding="utf-8")
+    robot = dataclasses.replace(ANT, urdf=str(path))
+    before = load_system(robot)
+    assert load_system(robot) is before
+    mass = re.search(r'<mass value="([^"]+)"/>', text)
+    assert mass is not None
+    path.write_text(text.replace(mass[0], '<mass value="9"/>'), encoding="utf-8")
+    after = load_system(robot)
+    assert 9.0 in after.mass and 9.0 not in before.mass

@@ -296,7 +296,10 @@ def build_system(robot: RobotSpec, dtype: str, scene: Scene | None = None) -> Sy
 
 
 @functools.cache
-def _cached_system(robot: RobotSpec, dtype: str, scene: Scene | None) -> System:
+def _cached_system(
+    robot: RobotSpec, dtype: str, scene: Scene | None, files: tuple[bytes, ...]
+) -> System:
+    del files  # a file that somebody has edited is another robot
     return build_system(robot, dtype, scene)
 
 
@@ -329,7 +332,7 @@ def load_system(
     feet_tail: str = "exponential",
     reports_bodies: bool = False,
 ) -> System:
-    """Returns the system of a robot. A process builds it once for the same arguments.
+    """Returns the system of a robot. It is built once for the same arguments and files.
 
     A wall that does not hold the robot at 10 m/s gives a ``SoftWallWarning``:
     :func:`~newton_qd.physics.wall_speeds`. Substeps in which a joint can turn too far
@@ -360,7 +363,9 @@ def load_system(
     )
     checks.choice("feet_tail", feet_tail, TAILS)
     check_robot(robot)  # before the cache computes its hash
-    system = _cached_system(robot, dtype, scene)
+    files = [find_urdf(one.urdf) for one in (robot, scene) if one is not None]
+    contents = tuple(file.read_bytes() for file in files)
+    system = _cached_system(robot, dtype, scene, contents)
     for text, category in _cached_warnings(system):
         warnings.warn(text, category, stacklevel=2)
     width = system.feet_width if feet_width is None else feet_width
