@@ -363,6 +363,8 @@ def load_system(
     )
     checks.choice("feet_tail", feet_tail, TAILS)
     check_robot(robot)  # before the cache computes its hash
+    allowed = "a Scene such as newton_qd.scenes.TRAP"
+    checks.instance("scene", scene, Scene, allowed, optional=True)
     files = [find_urdf(one.urdf) for one in (robot, scene) if one is not None]
     contents = tuple(file.read_bytes() for file in files)
     system = _cached_system(robot, dtype, scene, contents)
