@@ -213,7 +213,10 @@ def round_a_corner(s: np.ndarray) -> np.ndarray:
     return np.concatenate([place, turned([1.0, 0.0, 0.0], 0.1 * s, np.eye(4)[3])], 1)
 
 
-@pytest.mark.parametrize("line", [tipping, over_an_edge, round_a_corner])
+@pytest.mark.parametrize(
+    "line",
+    [pytest.param(tipping, marks=pytest.mark.slow), over_an_edge, round_a_corner],
+)
 def test_step_is_smooth(
     x64: None, tmp_path: Path, line: Callable[[np.ndarray], np.ndarray]
 ) -> None:

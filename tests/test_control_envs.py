@@ -300,7 +300,7 @@ def test_gradient_of_an_episode(name: str, x64: None) -> None:
     assert errors.max() < 1e-4
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", EVERY_NAME)
 def test_a_thousand_random_steps_are_finite(name: str) -> None:
     env = make(name, auto_reset=True)
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 8))

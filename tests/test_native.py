@@ -69,6 +69,7 @@ def run(code: str) -> tuple[int, float]:
         return status, time.perf_counter() - begin
 
 
+@pytest.mark.slow
 def test_a_program_ends_with_work_in_flight(device: jax.Device) -> None:
     del device
     assert run(IN_FLIGHT + ENDS["end of the script"])[0] == 0

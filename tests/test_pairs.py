@@ -29,7 +29,7 @@ from newton_qd.robots import Contact, Material
 # Momentum
 
 
-@pytest.mark.parametrize("step", [0.005, 0.01])
+@pytest.mark.parametrize("step", [pytest.param(0.005, marks=pytest.mark.slow), 0.01])
 def test_two_balls_collide(x64: None, tmp_path: Path, step: float) -> None:
     """Off centre, masses 1 and 3: momentum is kept, energy only lost, they part."""
     balls = body("a", ball(0.1)), body("b", ball(0.1), mass=3.0)
@@ -262,6 +262,7 @@ def test_degenerate_cases_are_finite(x64: None, tmp_path: Path) -> None:
     assert not np.asarray(after[4]).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("steps", "bound"), [(1, 1e-6), (8, 1e-4)])
 def test_directional_derivatives(
     x64: None, tmp_path: Path, steps: int, bound: float

@@ -51,7 +51,7 @@ def check(env: Any) -> None:
     assert_same(jax.jit(jax.vmap(env.rollout))(states, actions), expected)
 
 
-@pytest.mark.parametrize("name", ["hopper_uni", "anttrap", "reacherangle"])
+@pytest.mark.parametrize("name", ["hopper_uni"])
 def test_states_are_those_of_steps(name: str) -> None:
     env = newton_qd.create(name, auto_reset=False, episode_length=7)
     assert _order(env) == RolloutOrder.IN_ORDER
@@ -124,8 +124,15 @@ def test_wrong_actions_are_refused() -> None:
             env.rollout(state, actions)
 
 
-@pytest.mark.parametrize("native", [True, False], ids=["native", "scan"])
-@pytest.mark.parametrize("own", [False, True], ids=["shared", "parameters"])
+@pytest.mark.parametrize(
+    ("native", "own"),
+    [
+        pytest.param(True, False, id="native-shared"),
+        pytest.param(True, True, id="native-parameters", marks=pytest.mark.slow),
+        pytest.param(False, False, id="scan-shared", marks=pytest.mark.slow),
+        pytest.param(False, True, id="scan-parameters", marks=pytest.mark.slow),
+    ],
+)
 def test_gradients_are_those_of_steps(
     x64: None, monkeypatch: pytest.MonkeyPatch, native: bool, own: bool
 ) -> None:

@@ -136,7 +136,7 @@ class Solve:
     [
         "hexapod",
         pytest.param("free root with pairs", marks=pytest.mark.slow),
-        "slides and pairs",
+        pytest.param("slides and pairs", marks=pytest.mark.slow),
     ],
 )
 def test_every_input_of_a_solve(x64: None, tmp_path: Path, name: str) -> None:

@@ -184,6 +184,7 @@ def test_bodies_are_written(device: jax.Device) -> None:
         np.testing.assert_allclose(twists[:, 3:], expected.angular_velocity, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_in_place_and_default_control(device: jax.Device) -> None:
     """``state_out`` may be ``state_in``; no control means the model's forces."""
     loop = moving_ants(device)
