@@ -76,21 +76,27 @@ def generations(count: int) -> bool:
     config = EvolveConfig(
         env_name="hopper_uni", batch_size=16, episode_length=20, iterations=count
     )
-    memory: list[tuple[float, float]] = []
+    memory: list[tuple[int, float]] = []
     done = threading.Event()
-
-    def watch() -> None:
-        while not done.wait(0.2):
-            memory.append((time.monotonic(), resident()))
-
-    watcher = threading.Thread(target=watch, daemon=True)
-    watcher.start()
     with tempfile.TemporaryDirectory() as folder:
-        evolve(config, out=Path(folder) / "run", progress=False)
-    done.set()
-    watcher.join()
-    every = max(len(memory) // MOMENTS, 1)
-    return flat([value for _, value in memory[every - 1 :: every]])
+        out = Path(folder) / "run"
+
+        def watch() -> None:
+            while not done.wait(0.2):
+                table = out / "metrics.csv"
+                rows = table.read_bytes().count(b"\n") if table.exists() else 0
+                memory.append((rows, resident()))
+
+        watcher = threading.Thread(target=watch, daemon=True)
+        watcher.start()
+        evolve(config, out=out, progress=False)
+        done.set()
+        watcher.join()
+    # what comes before the first generation and after the last is not repeated
+    moments = [count * moment // MOMENTS for moment in range(1, MOMENTS)]
+    return flat(
+        [next(value for rows, value in memory if rows >= moment) for moment in moments]
+    )
 
 
 def kills(count: int) -> bool:
