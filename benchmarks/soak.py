@@ -105,19 +105,25 @@ def kills(count: int) -> bool:
     with tempfile.TemporaryDirectory() as folder:
         expected, out = Path(folder) / "expected", Path(folder) / "run"
         arguments = [sys.executable, *EVOLVE, "--iterations", str(20 * count)]
-        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
         begin = time.monotonic()
-        subprocess.run([*arguments, "--out", str(expected)], check=True, **quiet)
+        run_to_end([*arguments, "--out", str(expected)])
         whole = time.monotonic() - begin
         for attempt in range(count):
             again = [*arguments, "--out", str(out), "--resume"]
-            process = subprocess.Popen(again, **quiet)
+            process = subprocess.Popen(
+                again, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+            )
             time.sleep(moments.uniform(0.0, min(whole, 15.0)))
             process.kill()
             process.wait()
             print(f"kill {attempt + 1} of {count}", flush=True)
-        subprocess.run([*arguments, "--out", str(out), "--resume"], check=True, **quiet)
+        run_to_end([*arguments, "--out", str(out), "--resume"])
         return same_archives(expected, out)
+
+
+def run_to_end(arguments: list[str]) -> None:
+    """Runs a command that must succeed."""
+    subprocess.run(arguments, check=True, capture_output=True)
 
 
 def same_archives(expected: Path, found: Path) -> bool:
