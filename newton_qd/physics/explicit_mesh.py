@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +22,30 @@ from jax.sharding import AxisType, NamedSharding, PartitionSpec
 Tree = TypeVar("Tree")
 Rows = Callable[..., jax.Array]
 """A function of arrays (..., size): a row for each world. It returns such an array."""
+
+
+def row_like(rows: Sequence[jax.Array], size: int) -> jax.ShapeDtypeStruct:
+    """Returns the type of a row (size,) that is computed from other rows.
+
+    Inside ``jax.shard_map`` a type tells over which axes of the mesh its values vary.
+
+    Args:
+        rows: The rows that it is computed from.
+        size: Its length.
+    """
+    kind = jax.ShapeDtypeStruct((size,), rows[0].dtype)
+    types: list[Any] = [jax.typeof(row) for row in rows]
+    named = hasattr(types[0], "manual_axis_type")  # since JAX 0.10
+    own = [one.manual_axis_type.varying if named else one.vma for one in types]
+    varying = frozenset().union(*own)
+    if not varying:
+        return kind
+    whole = NamedSharding(jax.sharding.get_abstract_mesh(), PartitionSpec())
+    sharding: Any = jax.sharding
+    if named:
+        axes = sharding.ManualAxisType(varying=varying)
+        return kind.update(manual_axis_type=axes, sharding=whole)
+    return kind.update(vma=varying, sharding=whole)
 
 
 def over_devices(

@@ -17,7 +17,7 @@ import numpy as np
 import warp as wp
 
 from newton_qd.physics import interrupts
-from newton_qd.physics.explicit_mesh import over_devices
+from newton_qd.physics.explicit_mesh import over_devices, row_like
 from newton_qd.physics.native import Plan
 from newton_qd.physics.native.library import library
 from newton_qd.physics.precision import SCALARS
@@ -194,7 +194,7 @@ def native_row_call(plan: Plan, target: str = "newton_qd_rows") -> RowCall:
     _register()
 
     def call(*rows: jax.Array, output_dims: int) -> tuple[jax.Array, ...]:
-        row = jax.ShapeDtypeStruct((output_dims,), rows[0].dtype)
+        row = row_like(rows, output_dims)
         run = jax.ffi.ffi_call(target, row, vmap_method="broadcast_all")
         return (run(*rows, plan=np.int64(plan.key)),)
 
