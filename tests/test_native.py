@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import gc
 import subprocess
 import sys
 import time
+import weakref
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +17,9 @@ import pytest
 import warp as wp
 
 from newton_qd import physics
-from newton_qd.physics import bridge
+from newton_qd.physics import bridge, layout
+from newton_qd.physics.launch import Launcher
+from newton_qd.physics.native import all_plans
 from newton_qd.physics.native.plans import _parts
 from newton_qd.robots import HOPPER
 
@@ -122,7 +126,20 @@ def test_a_plan_belongs_to_what_it_computes() -> None:
     ]
     keys = [plan.key for plan in plans]
     assert keys[:2] == keys[2:4] and len(set(keys)) == 4
-    assert plans[0] is plans[2]
+
+
+def test_a_plan_that_nobody_holds_gives_its_memory_back() -> None:
+    """As for the solver, which forgets step lengths."""
+    system = physics.load_system(HOPPER)
+    launcher = Launcher(system, wp.get_device("cpu"))
+    plan, known = launcher.plan("step_forward"), len(all_plans())
+    rows = layout.rows(system, "step_forward")
+    plan.run(1, [wp.zeros(row.size, wp.float32, device="cpu") for row in rows])
+    struct, held = plan._struct, weakref.ref(plan)
+    assert struct.pool and len(all_plans()) == known
+    del plan, launcher
+    gc.collect()
+    assert held() is None and not struct.pool
 
 
 def test_parts_tell_contents_apart() -> None:

@@ -8,7 +8,7 @@ import warp as wp
 
 from newton_qd.checks import Fact, listed, message
 from newton_qd.physics import row_calls
-from newton_qd.physics.native import add_plan
+from newton_qd.physics.native import Plan
 from newton_qd.physics.precision import SCALARS, Variant, build_kernels
 from newton_qd.physics.row_calls import (
     Differentiable,
@@ -39,7 +39,7 @@ def _episode_call(name: str, dtype: str, steps: int, nd: int) -> RowCall:
         content = (name, dtype, steps, nd)
         entry = cpu_entry(recorded, adjoint=False)
         bytes_ = wp.types.type_size_in_bytes(SCALARS[dtype])
-        return native_row_call(add_plan(content, entry, rows, number_bytes=bytes_))
+        return native_row_call(Plan(content, entry, rows, number_bytes=bytes_))
 
     def launch(x: wp.array, *arrays: wp.array) -> None:
         episodes = x.shape[0] // size

@@ -9,7 +9,7 @@ import warp as wp
 
 from newton_qd.checks import listed, message
 from newton_qd.physics import buffers, layout
-from newton_qd.physics.native import Plan, Rollouts, add_plan
+from newton_qd.physics.native import Plan, Rollouts
 from newton_qd.physics.native.library import usable_cores
 from newton_qd.physics.precision import pack_width
 from newton_qd.physics.system import System
@@ -263,7 +263,7 @@ class Launcher:
             )
         # all that the arguments of the kernel depend on
         solves = buffers.substep_solves(self.system)
-        return add_plan(
+        return Plan(
             (name, self.parametric, self.system, solves),
             cpu_entry(launch, adjoint),
             rows,

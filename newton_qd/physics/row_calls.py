@@ -192,6 +192,7 @@ def native_row_call(plan: Plan, target: str = "newton_qd_rows") -> RowCall:
         Function as :func:`row_call` returns it.
     """
     _register()
+    plan.register()
 
     def call(*rows: jax.Array, output_dims: int) -> tuple[jax.Array, ...]:
         row = row_like(rows, output_dims)

@@ -1,5 +1,5 @@
 """Kernels of a CPU that XLA calls without Python."""
 
-from newton_qd.physics.native.plans import Plan, Rollouts, add_plan, all_plans
+from newton_qd.physics.native.plans import Plan, Rollouts, all_plans
 
-__all__ = ["Plan", "Rollouts", "add_plan", "all_plans"]
+__all__ = ["Plan", "Rollouts", "all_plans"]

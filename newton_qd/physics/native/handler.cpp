@@ -461,6 +461,15 @@ void newton_qd_add(Plan* plan) {
     __atomic_store_n(bucket, plan, __ATOMIC_RELEASE);
 }
 
+void newton_qd_free(Plan* plan) {
+    for (Block* block = plan->pool; block;) {
+        Block* next = block->next;
+        free(block);
+        block = next;
+    }
+    plan->pool = nullptr;
+}
+
 // All kernels that run return an error soon, and so does every later call.
 void newton_qd_stop() { __atomic_store_n(&stopping, 1, __ATOMIC_RELAXED); }
 

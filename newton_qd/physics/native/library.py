@@ -61,17 +61,18 @@ class Library:
             find("newton_qd_run")
         )
         self._add = ctypes.CFUNCTYPE(None, pointer)(find("newton_qd_add"))
+        self._free = ctypes.CFUNCTYPE(None, pointer)(find("newton_qd_free"))
         self._stop = ctypes.CFUNCTYPE(None)(find("newton_qd_stop"))
         functions, initializers = _threading_functions()
         system = _System(*functions, usable_cores())
         begin = ctypes.CFUNCTYPE(None, pointer, pointer, pointer)
         begin(find("newton_qd_start"))(ctypes.addressof(system), *initializers)
 
-    def run(self, plan: int, worlds: int, arrays: list[int]) -> int:
-        """Runs the plan at an address on arrays of rows.
+    def run(self, plan: ctypes.Structure, worlds: int, arrays: list[int]) -> int:
+        """Runs a plan on arrays of rows.
 
         Args:
-            plan: Address of the plan.
+            plan: The plan.
             worlds: Number of worlds.
             arrays: Addresses of the arrays.
 
@@ -79,11 +80,15 @@ class Library:
             0, or the code of an error.
         """
         addresses = (ctypes.c_void_p * len(arrays))(*arrays)
-        return self._run(plan, worlds, ctypes.addressof(addresses))
+        return self._run(ctypes.addressof(plan), worlds, ctypes.addressof(addresses))
 
-    def add(self, plan: int) -> None:
-        """Lets XLA find the plan at an address by its key."""
-        self._add(plan)
+    def add(self, plan: ctypes.Structure) -> None:
+        """Lets XLA find a plan by its key. The plan must stay in memory."""
+        self._add(ctypes.addressof(plan))
+
+    def free(self, plan: ctypes.Structure) -> None:
+        """Frees the scratch memory of a plan that nobody runs any more."""
+        self._free(ctypes.addressof(plan))
 
     def stop(self) -> None:
         """Lets all kernels that run, and all later calls, end soon with an error."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 import ctypes
 import dataclasses
 import hashlib
+import threading
+import weakref
 from collections.abc import Sequence
 from enum import Enum
 
@@ -14,8 +16,9 @@ import warp as wp
 from newton_qd.physics.native.library import library
 from newton_qd.physics.warp_internals import CpuEntry
 
-_ARRAYS, _MEMORIES = 3, 2  # as in the source
+_ARRAYS, _MEMORIES, _EXHAUSTED = 3, 2, 8  # as in the source
 _plans: dict[int, Plan] = {}
+_lock = threading.Lock()
 
 
 class _Plan(ctypes.Structure):
@@ -68,38 +71,87 @@ class Rollouts:
     fault: int
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class Plan:
-    """A kernel of a system, as XLA calls it on a CPU.
+    """A kernel of a system, as the native code runs it on a CPU.
 
     Attributes:
         key: Number by which a compiled program finds the plan. It depends on what the
             plan computes only, so programs that JAX has stored find it in a later
             process.
-        entry: Kernel and arguments. They stay in memory as long as the plan.
-        address: Address of the plan in native memory.
-        struct: What is at this address.
     """
 
-    key: int
-    entry: CpuEntry
-    address: int
-    struct: _Plan
+    def __init__(
+        self,
+        content: object,
+        entry: CpuEntry,
+        rows: Sequence[int],
+        *,
+        number_bytes: int,
+        width: int = 1,
+        memory_bytes: int = 0,
+        packs_per_thread: int = 1,
+        rollouts: Rollouts | None = None,
+    ) -> None:
+        """Writes down what the native code needs.
+
+        Args:
+            content: All that the results depend on: see :func:`_parts`.
+            entry: Kernel and arguments. They stay in memory as long as the plan.
+            rows: Numbers of a row, for each array of the kernel.
+            number_bytes: Size of a number.
+            width: Worlds that a launch computes.
+            memory_bytes: Size of the scratch memory.
+            packs_per_thread: Launches for which another thread pays.
+            rollouts: What a rollout of the kernel reads; ``None``: there are none.
+        """
+        self.key = _key(content)
+        self._entry = entry
+        self._struct = struct = _Plan(key=self.key, kernel=entry.function)
+        struct.bounds = ctypes.addressof(entry.bounds)
+        struct.arguments = ctypes.addressof(entry.arguments)
+        struct.argument_bytes = ctypes.sizeof(entry.arguments)
+        if entry.adjoint_arguments is not None:
+            struct.adjoint_arguments = ctypes.addressof(entry.adjoint_arguments)
+        offsets = entry.offsets
+        arrays = list(offsets)[-len(rows) :]
+        memories = [name for name in offsets if name in ("scratch", "adjoints")]
+        struct.arrays, struct.memories = len(arrays), len(memories)
+        for n, name in enumerate(arrays):
+            struct.array_at[n], struct.row[n] = offsets[name], rows[n]
+        for n, name in enumerate(memories):
+            struct.memory_at[n] = offsets[name] + type(entry.values[name]).memory.offset
+        struct.worlds_at = offsets.get("worlds", -1)
+        struct.number_bytes, struct.width = number_bytes, width
+        struct.memory_bytes = memory_bytes
+        struct.packs_per_thread = packs_per_thread
+        for name, number in vars(rollouts or Rollouts(0, 0, 0, 0)).items():
+            setattr(struct, name, number)
+        # at the end of Python a kernel may still run
+        weakref.finalize(self, library().free, struct).atexit = False
+
+    def register(self) -> None:
+        """Lets compiled programs find the plan by its key, from now on.
+
+        The first plan of equal contents stays.
+        """
+        with _lock:
+            if _plans.setdefault(self.key, self) is self:
+                library().add(self._struct)
 
     @property
     def launches(self) -> int:
         """Number of launches until now."""
-        return self.struct.launches
+        return self._struct.launches
 
     @property
     def worlds(self) -> int:
         """Number of worlds of all launches until now."""
-        return self.struct.worlds
+        return self._struct.worlds
 
     @property
     def most_worlds(self) -> int:
         """Number of worlds of the largest launch until now."""
-        return self.struct.most_worlds
+        return self._struct.most_worlds
 
     def run(self, worlds: int, arrays: Sequence[wp.array]) -> None:
         """Runs the kernel on arrays of rows.
@@ -110,69 +162,24 @@ class Plan:
 
         Raises:
             MemoryError: There is no memory for the intermediate values.
+            RuntimeError: Python ends.
         """
         addresses = [array.ptr or 0 for array in arrays]
-        if library().run(self.address, worlds, addresses):
+        error = library().run(self._struct, worlds, addresses)
+        if error == _EXHAUSTED:
             raise MemoryError("the physics ran out of memory")
-
-
-def add_plan(
-    content: object,
-    entry: CpuEntry,
-    rows: Sequence[int],
-    *,
-    number_bytes: int,
-    width: int = 1,
-    memory_bytes: int = 0,
-    packs_per_thread: int = 1,
-    rollouts: Rollouts | None = None,
-) -> Plan:
-    """Returns the plan of a kernel. Equal contents have one plan.
-
-    Args:
-        content: All that the results depend on: see :func:`_parts`.
-        entry: Kernel and arguments.
-        rows: Numbers of a row, for each array of the kernel.
-        number_bytes: Size of a number.
-        width: Worlds that a launch computes.
-        memory_bytes: Size of the scratch memory.
-        packs_per_thread: Launches for which another thread pays.
-        rollouts: What a rollout of the kernel reads; ``None``: there are none.
-    """
-    digest = hashlib.sha256("\n".join(_parts(content)).encode()).digest()
-    key = int.from_bytes(digest[:8], "little", signed=True)
-    if key in _plans:
-        return _plans[key]
-    plan = _Plan()
-    plan.key = key
-    plan.kernel = entry.function
-    plan.bounds = ctypes.addressof(entry.bounds)
-    plan.arguments = ctypes.addressof(entry.arguments)
-    plan.argument_bytes = ctypes.sizeof(entry.arguments)
-    if entry.adjoint_arguments is not None:
-        plan.adjoint_arguments = ctypes.addressof(entry.adjoint_arguments)
-    offsets = entry.offsets
-    arrays = list(offsets)[-len(rows) :]
-    memories = [name for name in offsets if name in ("scratch", "adjoints")]
-    plan.arrays, plan.memories = len(arrays), len(memories)
-    for n, name in enumerate(arrays):
-        plan.array_at[n], plan.row[n] = offsets[name], rows[n]
-    for n, name in enumerate(memories):
-        plan.memory_at[n] = offsets[name] + type(entry.values[name]).memory.offset
-    plan.worlds_at = offsets.get("worlds", -1)
-    plan.number_bytes, plan.width = number_bytes, width
-    plan.memory_bytes, plan.packs_per_thread = memory_bytes, packs_per_thread
-    if rollouts is not None:
-        plan.state, plan.control = rollouts.state, rollouts.control
-        plan.parameters, plan.fault = rollouts.parameters, rollouts.fault
-    library().add(ctypes.addressof(plan))
-    _plans[key] = Plan(key, entry, ctypes.addressof(plan), plan)
-    return _plans[key]
+        if error:
+            raise RuntimeError("the physics was stopped, because Python ends")
 
 
 def all_plans() -> tuple[Plan, ...]:
-    """Returns the plans of this process."""
+    """Returns the plans of this process that compiled programs can find."""
     return tuple(_plans.values())
+
+
+def _key(content: object) -> int:
+    digest = hashlib.sha256("\n".join(_parts(content)).encode()).digest()
+    return int.from_bytes(digest[:8], "little", signed=True)
 
 
 def _parts(content: object) -> list[str]:
