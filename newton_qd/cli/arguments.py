@@ -51,3 +51,35 @@ def integers(text: str, separator: str) -> tuple[int, ...]:
         example = separator.join(("8", "8"))
         given = f"got {text!r}; allowed: integers like {example}"
         raise argparse.ArgumentTypeError(given) from error
+
+
+def numbers(text: str) -> tuple[float, ...]:
+    """Parses numbers with commas between them.
+
+    Raises:
+        argparse.ArgumentTypeError: A part is not a number.
+    """
+    try:
+        return tuple(float(part) for part in text.split(","))
+    except ValueError as error:
+        given = f"got {text!r}; allowed: numbers like 0.5,0.25"
+        raise argparse.ArgumentTypeError(given) from error
+
+
+def add_elite_choice(parser: argparse.ArgumentParser, best: str) -> None:
+    """Adds the arguments that name elites of a run.
+
+    Args:
+        parser: Parser of a command.
+        best: Help of ``--best``.
+    """
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument("--cell", type=int, metavar="N", help="the elite of one cell")
+    which.add_argument("--best", type=int, metavar="N", help=best)
+    which.add_argument(
+        "--near",
+        type=numbers,
+        metavar="X,X",
+        help="the elite with the nearest descriptor; write --near=-3,2 if the first "
+        "number is negative",
+    )

@@ -149,26 +149,7 @@ def _add_setting_arguments(parser: argparse.ArgumentParser) -> None:
         help="argument of newton_qd.create, for example healthy_reward=0.5, scene=maze "
         "or material.friction=0.8; may be repeated",
     )
-    group.add_argument(
-        "--statistic",
-        metavar="NAME",
-        help="mean or median of the results of several start states (default: "
-        f"{_DEFAULTS.statistic})",
-    )
-    group.add_argument(
-        "--new-starts",
-        action="store_const",
-        const=True,
-        help="other start states in each generation",
-    )
-    group.add_argument(
-        "--randomize",
-        type=_range,
-        action="append",
-        metavar="NAME=LOW,HIGH",
-        help="range of a physical parameter, for example friction=0.5,1.5; each start "
-        "state has its own; may be repeated",
-    )
+    _add_start_arguments(group)
     group.add_argument(
         "--hidden",
         type=widths,
@@ -188,6 +169,30 @@ def _add_setting_arguments(parser: argparse.ArgumentParser) -> None:
         type=int,
         metavar="N",
         help="number of cells of a centroidal Voronoi tessellation, instead of a grid",
+    )
+
+
+def _add_start_arguments(group: argparse._ArgumentGroup) -> None:
+    """Adds what an individual is evaluated from, beside the number of starts."""
+    group.add_argument(
+        "--statistic",
+        metavar="NAME",
+        help="mean or median of the results of several start states (default: "
+        f"{_DEFAULTS.statistic})",
+    )
+    group.add_argument(
+        "--new-starts",
+        action="store_const",
+        const=True,
+        help="other start states in each generation",
+    )
+    group.add_argument(
+        "--randomize",
+        type=_range,
+        action="append",
+        metavar="NAME=LOW,HIGH",
+        help="range of a physical parameter, for example friction=0.5,1.5; each start "
+        "state has its own; may be repeated",
     )
 
 

@@ -15,6 +15,7 @@ from newton_qd.cli.arguments import (
     FAILED,
     OK,
     Commands,
+    add_elite_choice,
     complain,
     warn_of_changes,
 )
@@ -40,16 +41,7 @@ def add_parsers(commands: Commands) -> None:
         "With --starts, evaluates them from other start states.",
     )
     parser.add_argument("folder", type=Path, metavar="DIR", help="results folder")
-    which = parser.add_mutually_exclusive_group()
-    which.add_argument("--cell", type=int, metavar="N", help="the elite of one cell")
-    which.add_argument("--best", type=int, metavar="N", help="the N fittest elites")
-    which.add_argument(
-        "--near",
-        type=numbers,
-        metavar="X,X",
-        help="the elite with the nearest descriptor; write --near=-3,2 if the first "
-        "number is negative",
-    )
+    add_elite_choice(parser, "the N fittest elites")
     parser.add_argument(
         "--starts",
         type=int,
@@ -77,19 +69,6 @@ def add_parsers(commands: Commands) -> None:
     )
     modules.add_argument(parser)
     parser.set_defaults(run=plot)
-
-
-def numbers(text: str) -> tuple[float, ...]:
-    """Parses numbers with commas between them.
-
-    Raises:
-        argparse.ArgumentTypeError: A part is not a number.
-    """
-    try:
-        return tuple(float(part) for part in text.split(","))
-    except ValueError as error:
-        given = f"got {text!r}; allowed: numbers like 0.5,0.25"
-        raise argparse.ArgumentTypeError(given) from error
 
 
 def opened(folder: Path, task_factory: TaskFactory) -> Run:

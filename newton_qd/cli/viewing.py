@@ -10,9 +10,16 @@ from typing import TYPE_CHECKING
 from newton_qd import checks
 from newton_qd.checks import Fact, message
 from newton_qd.cli import modules
-from newton_qd.cli.arguments import BAD_ARGUMENTS, OK, Commands, complain, integers
+from newton_qd.cli.arguments import (
+    BAD_ARGUMENTS,
+    OK,
+    Commands,
+    add_elite_choice,
+    complain,
+    integers,
+)
 from newton_qd.cli.progress import Progress
-from newton_qd.cli.runs import numbers, opened
+from newton_qd.cli.runs import opened
 from newton_qd.qd.config import ConfigError, EvolveConfig
 
 if TYPE_CHECKING:
@@ -147,20 +154,8 @@ def _add_choice(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "what", metavar="DIR|ENV", help="results folder, or environment"
     )
-    which = parser.add_mutually_exclusive_group()
-    which.add_argument("--cell", type=int, metavar="N", help="the elite of one cell")
-    which.add_argument(
-        "--best",
-        type=int,
-        metavar="N",
-        help="the N fittest elites (default: 1); of an environment, N worlds",
-    )
-    which.add_argument(
-        "--near",
-        type=numbers,
-        metavar="X,X",
-        help="the elite with the nearest descriptor; write --near=-3,2 if the first "
-        "number is negative",
+    add_elite_choice(
+        parser, "the N fittest elites (default: 1); of an environment, N worlds"
     )
     parser.add_argument(
         "--steps",
