@@ -16,7 +16,7 @@ from newton_qd import checks
 from newton_qd.checks import Fact, message
 from newton_qd.envs.env import Env
 from newton_qd.envs.state import select
-from newton_qd.extractors import Trajectories, check_extractor
+from newton_qd.extractors import check_extractor
 from newton_qd.gradients.compiled import compiled_once, without_compiled
 from newton_qd.gradients.exact import EpisodeGradient, EpisodeGradients, differentiate
 from newton_qd.gradients.flow import EXACT, GradientOptions, passed_back, scan_keeping
@@ -25,7 +25,7 @@ from newton_qd.gradients.mixed import (
     check_mixture,
     mixed_gradients,
 )
-from newton_qd.gradients.outcome import Outcome, at_fault, transition
+from newton_qd.gradients.outcome import Outcome, at_fault, finished, transition
 from newton_qd.gradients.plans import run_plan
 from newton_qd.gradients.scores import gradient_scores, scores
 from newton_qd.moved import moved_name
@@ -162,7 +162,7 @@ class Episode:
                 described = self.descriptor_extractor is not None
                 plan = self._plan(parameters)
                 ran = run_plan(self.env, first, plan, params, described=described)
-                return self._outcome(*ran, {})
+                return finished(self.descriptor_extractor, *ran, {})
         dtype, steps = first.reward.dtype, self.episode_length
         rows: dict[str, jax.Array | np.ndarray] = {}
         if not self.options.exact:
@@ -177,7 +177,7 @@ class Episode:
             steps,
             self.options.checkpoint_every,
         )
-        return self._outcome(fitness, readings, over, bad, taken)
+        return finished(self.descriptor_extractor, fitness, readings, over, bad, taken)
 
     @compiled_once
     def gradient(
@@ -342,32 +342,6 @@ class Episode:
                 "QD tasks, as ant_uni, or descriptor_extractor=None without transitions"
             )
             raise ValueError(message("env", given, allowed))
-
-    def _outcome(
-        self,
-        fitness: jax.Array,
-        readings: jax.Array | None,
-        over: jax.Array,
-        bad: jax.Array,
-        taken: dict[str, jax.Array],
-    ) -> Outcome:
-        """Returns the results of an episode.
-
-        Args:
-            fitness: () sum of rewards.
-            readings: (T, nd) state descriptors; ``None``: there is no descriptor.
-            over: (T,) whether the episode had ended before a step.
-            bad: () whether there was a fault.
-            taken: The steps.
-        """
-        descriptor = jnp.zeros((0,), fitness.dtype)
-        if self.descriptor_extractor is not None:
-            assert readings is not None
-            data, mask = Trajectories(readings[None]), over[None].astype(readings.dtype)
-            descriptor = self.descriptor_extractor(data, mask)[0]
-        bad = bad | ~jnp.isfinite(fitness) | ~jnp.all(jnp.isfinite(descriptor))
-        admitted = jnp.where(bad, -jnp.inf, fitness)
-        return Outcome(admitted, descriptor, bad, taken, fitness)
 
     def _plan(self, parameters: PyTree) -> jax.Array:
         """Returns open-loop actions (episode_length, nu).

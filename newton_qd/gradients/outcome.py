@@ -5,11 +5,13 @@ from __future__ import annotations
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 
 from newton_qd.envs.state import at_fault
-from newton_qd.types import Action, StateLike
+from newton_qd.extractors import Trajectories
+from newton_qd.types import Action, DescriptorExtractor, StateLike
 
-__all__ = ["Outcome", "at_fault", "transition"]
+__all__ = ["Outcome", "at_fault", "finished", "transition"]
 
 
 @jax.tree_util.register_dataclass
@@ -62,3 +64,30 @@ def transition(
         "state_desc": begin.info["state_descriptor"],
         "next_state_desc": end.info["state_descriptor"],
     }
+
+
+def finished(
+    extractor: DescriptorExtractor | None,
+    fitness: jax.Array,
+    readings: jax.Array | None,
+    over: jax.Array,
+    bad: jax.Array,
+    taken: dict[str, jax.Array],
+) -> Outcome:
+    """Returns the results of an episode of one world.
+
+    Args:
+        extractor: Descriptor extractor; ``None``: the descriptor is empty.
+        fitness: () sum of the rewards.
+        readings: (T, nd) state descriptors before each step; ``None``: there are none.
+        over: (T,) whether the episode had ended before a step.
+        bad: () whether there was a fault.
+        taken: The steps.
+    """
+    descriptor = jnp.zeros((0,), fitness.dtype)
+    if extractor is not None:
+        assert readings is not None
+        data, mask = Trajectories(readings[None]), over[None].astype(readings.dtype)
+        descriptor = extractor(data, mask)[0]
+    bad = bad | ~jnp.isfinite(fitness) | ~jnp.all(jnp.isfinite(descriptor))
+    return Outcome(jnp.where(bad, -jnp.inf, fitness), descriptor, bad, taken, fitness)
