@@ -52,6 +52,7 @@ LAYERS = (
 )
 # Leaves read every layer, and these leaves.
 LEAVES: dict[str, set[str]] = {
+    "adapters": {"viewing"},
     "compat": {"viewing"},
     "qd": {"compat"},
     "viewing": {"qd"},
@@ -67,13 +68,18 @@ HOMES = {
     "warp": ("physics/", "viewing/"),
     "newton": ("physics/model/build.py", "physics/solver.py", "viewing/"),
 }
-LEAF_HOMES = ("qd/", "viewing/", "compat/", "cli/")
+LEAF_HOMES = ("adapters/", "qd/", "viewing/", "compat/", "cli/")
+# each adapter is one door: no other module knows what is behind it
+HOMES["gymnasium"] = ("adapters/gymnasium",)
+HOMES["torch"] = ("adapters/torch",)
 # the gradient doctor's report draws itself
 HOMES["matplotlib"] = (*LEAF_HOMES, "gradients/report.py")
 # Never loaded by `import newton_qd`.
 HEAVY = {
     "brax",
+    "equinox",
     "flax",
+    "gymnasium",
     "matplotlib",
     "mujoco",
     "newton._src.viewer",
@@ -81,6 +87,7 @@ HEAVY = {
     "qdax",
     "ribs",
     "tensorboardX",
+    "torch",
     "tqdm",
 }
 CORE_DEPENDENCIES = {"jax", "newton", "numpy", "warp-lang"}

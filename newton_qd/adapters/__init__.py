@@ -1,0 +1,52 @@
+"""Doors to other libraries: each is one file around ``env.reset`` and ``env.step``.
+
+- ``make_gymnasium(name)``: an environment of Gymnasium;
+  ``make_gymnasium_vector(name, num_envs)``: many worlds, reset as they end
+
+Importing this package imports no other module of it. Each name is loaded when it is
+first used, and needs its extra: ``gym``.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from newton_qd.adapters.gymnasium import GymnasiumEnv, make_gymnasium
+    from newton_qd.adapters.gymnasium_vector import (
+        GymnasiumVectorEnv,
+        make_gymnasium_vector,
+    )
+
+__all__ = [
+    "GymnasiumEnv",
+    "GymnasiumVectorEnv",
+    "make_gymnasium",
+    "make_gymnasium_vector",
+]
+
+_HOME = {
+    "GymnasiumEnv": "gymnasium",
+    "GymnasiumVectorEnv": "gymnasium_vector",
+    "make_gymnasium": "gymnasium",
+    "make_gymnasium_vector": "gymnasium_vector",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Loads a name of this package when it is first used.
+
+    Raises:
+        AttributeError: The package has no such name.
+        MissingExtra: The other library is not installed.
+    """
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

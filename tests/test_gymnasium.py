@@ -1,0 +1,278 @@
+"""The door to Gymnasium: its own checks, and the same numbers as ``env.step``."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import tomllib
+import warnings
+from pathlib import Path
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import newton_qd
+from newton_qd.adapters import make_gymnasium, make_gymnasium_vector
+from newton_qd.authoring import State
+from newton_qd.envs.base import Env
+
+gymnasium = pytest.importorskip("gymnasium")
+NEXT, SAME, OFF = "NextStep", "SameStep", "Disabled"
+
+
+class Clock(Env):
+    """Counts steps from a random start; an action above 0.5 ends the episode."""
+
+    observation_size: Any = 2
+    action_size: Any = 1
+    dtype: Any = np.dtype("float32")
+    dt: Any = 0.5
+    name: Any = "clock"
+
+    def reset(self, rng: jax.Array) -> State:
+        start = jax.random.uniform(rng)
+        zero = jnp.zeros((), jnp.float32)
+        obs = jnp.stack([start, zero])
+        return State(None, obs, zero, zero, {"pressed": zero}, {})
+
+    def step(self, state: State, action: jax.Array, params: Any = None) -> State:
+        done = (action[0] > 0.5).astype(jnp.float32)
+        obs = state.obs.at[1].add(1.0)
+        return state.replace(
+            obs=obs, reward=obs[1], done=done, metrics={"pressed": done}
+        )
+
+
+def limited(length: int | None = None) -> Env:
+    from newton_qd.wrappers import EpisodeWrapper
+
+    return Clock() if length is None else EpisodeWrapper(Clock(), length, 1)
+
+
+def pressed(*worlds: int, of: int = 3) -> np.ndarray:
+    actions = np.zeros((of, 1))
+    actions[list(worlds)] = 1.0
+    return actions
+
+
+def only_unbounded_spaces(caught: list[warnings.WarningMessage]) -> bool:
+    """Whether Gymnasium warned of nothing but observations without limits."""
+    texts = [str(warning.message) for warning in caught]
+    return all("infinity" in text or "spec" in text for text in texts)
+
+
+@pytest.mark.parametrize("registered", [False, True])
+def test_gymnasiums_own_check(registered: bool) -> None:
+    from gymnasium.utils.env_checker import check_env
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        if registered:
+            env = gymnasium.make("newton_qd/pointmaze-v0").unwrapped
+            check_env(env, skip_render_check=True)
+        else:
+            check_env(make_gymnasium(limited(100)))
+    assert only_unbounded_spaces(caught)
+
+
+@pytest.mark.slow
+def test_gymnasiums_own_check_of_a_robot() -> None:
+    from gymnasium.utils.env_checker import check_env
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        name, size = "newton_qd/ant_uni-v0", {"width": 32, "height": 24}
+        env = gymnasium.make(name, render_mode="rgb_array", **size)
+        check_env(env.unwrapped, skip_render_check=True)
+        env.reset(seed=0)
+        picture = env.render()
+    assert only_unbounded_spaces(caught)
+    assert picture.shape == (24, 32, 3) and picture.dtype == np.uint8
+    assert len(np.unique(picture)) > 10
+
+
+def test_truncation_is_not_termination() -> None:
+    env = make_gymnasium(limited(3))
+    env.reset(seed=0)
+    ends = [env.step(np.zeros(1))[2:4] for _ in range(3)]
+    assert ends == [(False, False), (False, False), (False, True)]
+    env.reset()
+    env.step(np.zeros(1))
+    assert env.step(np.ones(1))[2:4] == (True, False)
+    env.reset()
+    for _ in range(2):
+        env.step(np.zeros(1))
+    assert env.step(np.ones(1))[2:4] == (True, False), "both: it ended by itself"
+
+
+def test_seeds() -> None:
+    env = make_gymnasium(limited())
+    for seed in (0, 7, 2**31, 2**32 - 1):
+        observation, _ = env.reset(seed=seed)
+        key = jax.random.key(np.uint32(seed))
+        assert np.array_equal(observation, Clock().reset(key).obs)
+    first = [env.reset(seed=1)[0][0], *(env.reset()[0][0] for _ in range(3))]
+    again = [env.reset(seed=1)[0][0], *(env.reset()[0][0] for _ in range(3))]
+    assert first == again and len(set(first)) == 4
+
+
+def test_worlds_of_a_vector_begin_as_single_ones() -> None:
+    many, one = make_gymnasium_vector(limited(), 3), make_gymnasium(limited())
+    observations, _ = many.reset(seed=5)
+    assert np.array_equal(observations, [one.reset(seed=5 + n)[0] for n in range(3)])
+    observations, _ = many.reset(seed=[9, 1, 4])
+    assert np.array_equal(observations, [one.reset(seed=n)[0] for n in (9, 1, 4)])
+
+
+@pytest.mark.parametrize("mode", [NEXT, SAME, OFF])
+def test_autoreset_as_gymnasiums_own_vector_does(mode: str) -> None:
+    """Ends, rewards and counts of the first 12 steps, with random ends."""
+    many = make_gymnasium_vector(limited(4), 3, autoreset_mode=mode)
+    assert many.metadata["autoreset_mode"] is gymnasium.vector.AutoresetMode(mode)
+    theirs = gymnasium.vector.SyncVectorEnv(
+        [lambda: make_gymnasium(limited(4))] * 3, autoreset_mode=mode
+    )
+    rows = np.random.default_rng(0).uniform(-1, 0.75, (12, 3, 1))
+    assert np.array_equal(many.reset(seed=2)[0], theirs.reset(seed=2)[0])
+    for actions in rows:
+        ours, other = many.step(actions), theirs.step(actions)
+        for a, b in zip(ours[1:4], other[1:4], strict=True):
+            assert np.array_equal(a, b)
+        assert np.array_equal(ours[0][:, 1], other[0][:, 1])
+        ended = ours[2] | ours[3]
+        if mode == SAME and ended.any():
+            final = np.stack(list(other[4]["final_obs"][ended]))
+            assert np.array_equal(ours[4]["final_obs"][ended, 1], final[:, 1])
+            assert np.array_equal(ours[4]["_final_obs"], ended)
+        if mode == OFF and ended.any():
+            options = {"reset_mask": ended}
+            mine = many.reset(options=dict(options))[0]
+            assert np.array_equal(mine[:, 1], theirs.reset(options=options)[0][:, 1])
+
+
+def test_new_episodes_begin_in_new_states_and_repeat_with_the_seed() -> None:
+    def starts() -> list[float]:
+        env = make_gymnasium_vector(limited(2), 2)
+        found = [*env.reset(seed=3)[0][:, 0]]
+        for _ in range(12):
+            observations, *_ = env.step(np.zeros((2, 1)))
+            found += [x for x, steps in observations if steps == 0]
+        return found
+
+    found = starts()
+    assert len(set(found)) == len(found) == 10 and found == starts()
+
+
+@pytest.mark.slow
+@pytest.mark.optimized
+def test_the_numbers_are_those_of_env_step() -> None:
+    env = newton_qd.create("ant_uni", episode_length=6, auto_reset=False)
+    step, reset = jax.jit(env.step), jax.jit(env.reset)
+    one = make_gymnasium("ant_uni", episode_length=6)
+    many = make_gymnasium_vector("ant_uni", 4, episode_length=6)
+    batch = newton_qd.create("ant_uni", 6, auto_reset=False, batch_size=4)
+    steps = jax.jit(batch.step)
+    state = reset(jax.random.key(3))
+    states = jax.jit(jax.vmap(env.reset))(jax.vmap(jax.random.key)(np.arange(3, 7)))
+    assert np.array_equal(one.reset(seed=3)[0], state.obs)
+    assert np.array_equal(many.reset(seed=3)[0], states.obs)
+    rng = np.random.default_rng(0)
+    for _ in range(6):
+        actions = rng.uniform(-1, 1, (4, 8)).astype(np.float32)
+        state, states = step(state, actions[0]), steps(states, actions)
+        for found, wanted in (
+            (one.step(actions[0]), state),
+            (many.step(actions), states),
+        ):
+            assert np.array_equal(found[0], wanted.obs)
+            assert np.array_equal(found[1], wanted.reward)
+            assert np.array_equal(np.asarray(found[2]) | found[3], wanted.done > 0)
+            for name, value in wanted.metrics.items():
+                assert np.array_equal(found[4][name], value)
+            described = wanted.info["state_descriptor"]
+            assert np.array_equal(found[4]["state_descriptor"], described)
+
+
+def test_wrappers_of_gymnasium() -> None:
+    env: Any = gymnasium.wrappers.vector.RecordEpisodeStatistics(
+        gymnasium.make_vec("newton_qd/pointmaze-v0", num_envs=2, max_episode_steps=3)
+    )
+    env.reset(seed=0)
+    info: dict[str, Any] = {}
+    for _ in range(3):
+        *_, info = env.step(env.action_space.sample())
+    assert list(info["episode"]["l"]) == [3, 3]
+
+
+def test_every_environment_is_registered() -> None:
+    names = {f"newton_qd/{name}-v0" for name in newton_qd.registered_envs()}
+    assert names <= set(gymnasium.registry)
+    path = Path(__file__).resolve().parent.parent / "pyproject.toml"
+    project = tomllib.loads(path.read_text(encoding="utf-8"))["project"]
+    module, name = project["entry-points"]["gymnasium.envs"]["newton_qd"].split(":")
+    getattr(importlib.import_module(module), name)()  # again: no second registration
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "text"),
+    [
+        (lambda: make_gymnasium("no_such"), NotImplementedError, "known names"),
+        (
+            lambda: make_gymnasium(cast("Any", 3)),
+            TypeError,
+            "env: got 3; allowed: a name of",
+        ),
+        (lambda: make_gymnasium(Clock(), episode_length=3), ValueError, "env: got an"),
+        (
+            lambda: make_gymnasium("pointmaze", render_mode="human"),
+            ValueError,
+            "render_mode: got 'human'; allowed: rgb_array",
+        ),
+        (
+            lambda: make_gymnasium(newton_qd.create("pointmaze")),
+            ValueError,
+            "env: got an environment with auto-reset; allowed: one world",
+        ),
+        (
+            lambda: make_gymnasium(newton_qd.create("pointmaze", batch_size=2)),
+            ValueError,
+            "env: got an environment with auto-reset; allowed: one world",
+        ),
+        (
+            lambda: make_gymnasium_vector(Clock(), 2, autoreset_mode="Never"),
+            ValueError,
+            "autoreset_mode: got 'Never'; allowed: NextStep, SameStep, Disabled",
+        ),
+        (
+            lambda: make_gymnasium_vector(Clock(), 2).reset(seed=[1]),
+            ValueError,
+            r"seed: got \[1\]; allowed: an integer, or 2 integers",
+        ),
+        (
+            lambda: make_gymnasium_vector(Clock(), 2).reset(
+                options={"reset_mask": np.zeros(2, bool)}
+            ),
+            ValueError,
+            r"options\['reset_mask'\]: got an array of shape \(2,\), bool",
+        ),
+        (
+            lambda: make_gymnasium(Clock()).step(np.zeros(1)),
+            gymnasium.error.ResetNeeded,
+            "call reset first",
+        ),
+    ],
+)
+def test_errors(make: Any, error: type[Exception], text: str) -> None:
+    with pytest.raises(error, match=text):
+        make()
+
+
+def test_a_missing_gymnasium_says_its_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "gymnasium", None)
+    for module in ("gymnasium", "gymnasium_vector"):
+        monkeypatch.delitem(sys.modules, f"newton_qd.adapters.{module}", raising=False)
+        with pytest.raises(newton_qd.MissingExtra, match=r"newton_qd\[gym\]"):
+            importlib.import_module(f"newton_qd.adapters.{module}")
