@@ -82,7 +82,12 @@ def measure(config: EvolveConfig, repetitions: int) -> dict[str, np.ndarray]:
         "environment": lambda: replay(actions, key),
         "shared": lambda: score_shared(genotypes, key),
         "tell": lambda: search._tell(
-            state.repertoire, state.emitter, genotypes, remembered, scores
+            state.repertoire,
+            state.emitter,
+            genotypes,
+            remembered,
+            scores,
+            np.float32(0),
         ),
     }
     return {name: durations(run, repetitions) for name, run in runs.items()}

@@ -69,8 +69,21 @@ def test_archive_rows_are_what_the_policies_do(reference: Path) -> None:
 def test_metrics_file(reference: Path) -> None:
     lines = (reference / "metrics.csv").read_text().splitlines()
     head = "iteration,evaluations,env_steps,rejected,qd_score,coverage,max_fitness"
-    assert lines[0] == head
+    assert lines[0] == head + ",mean_fitness,initial_fitness,qd_gain"
     assert [int(line.split(",")[0]) for line in lines[1:]] == list(range(13))
+
+
+def test_metrics_see_quality(reference: Path) -> None:
+    archive = load_archive(reference)
+    rows = np.loadtxt(reference / "metrics.csv", delimiter=",", skiprows=1)
+    mean, initial, gain = rows[:, -3:].T
+    found = archive.fitnesses[archive.filled]
+    np.testing.assert_allclose(mean[-1], found.mean(), rtol=1e-5)
+    np.testing.assert_allclose(
+        gain[-1], np.maximum(found - initial[0], 0).sum(), rtol=1e-5
+    )
+    assert np.all(initial == initial[0]) and np.isfinite(initial[0])
+    assert np.all(np.diff(gain) >= 0) and gain[-1] > gain[0] >= 0
 
 
 @pytest.mark.slow

@@ -376,7 +376,12 @@ def _finished(
     if not result.interrupted:
         if result.config.reevaluations:
             display.note("evaluating the elites again, for metrics without luck")
-        again = search.reevaluate(result.archive, lambda: stop.requested)
+        first = float(result.metrics["initial_fitness"][0])
+        again = search.reevaluate(
+            result.archive,
+            lambda: stop.requested,
+            untrained=first if np.isfinite(first) else None,
+        )
         seconds = time.monotonic() - begin
         result = dataclasses.replace(result, reevaluated=again, seconds=seconds)
     if folder is not None and result.iteration >= 0:

@@ -55,8 +55,12 @@ COLUMNS = (
     "qd_score",
     "coverage",
     "max_fitness",
+    "mean_fitness",
+    "initial_fitness",
+    "qd_gain",
 )
 _WHOLE_COLUMNS = 4
+_FIRST_COLUMNS = 7  # of runs before the last three columns
 
 
 class RunFolder:
@@ -247,6 +251,23 @@ class RunFolder:
         """Writes the metrics of re-evaluated elites."""
         text = json.dumps(metrics, indent=2) + "\n"
         write_atomically(self.path / REEVALUATED, text.encode())
+
+
+def complete_metrics(metrics: np.ndarray) -> np.ndarray:
+    """Returns metrics with all columns; those that an earlier version lacked are NaN.
+
+    Args:
+        metrics: (rows, columns) metrics of this or an earlier version.
+
+    Raises:
+        ValueError: The number of columns is not that of any version.
+    """
+    rows, columns = metrics.shape
+    if columns not in (_FIRST_COLUMNS, len(COLUMNS)):
+        allowed = f"{_FIRST_COLUMNS}, {len(COLUMNS)}"
+        raise ValueError(message("columns of metrics", columns, allowed))
+    missing = np.full((rows, len(COLUMNS) - columns), np.nan)
+    return np.hstack([metrics, missing])
 
 
 def metrics_to_csv(metrics: np.ndarray) -> str:

@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from newton_qd.qd.run import quality
 from newton_qd.types import ExtraScores, Genotype, PyTree, Repertoire
 
 
@@ -49,7 +50,10 @@ class Generation:
         """Returns archive, emitter's state and metrics after the initial population."""
         repertoire, told = self._added(repertoire, genotypes, scores)
         emitter = self.emitter.init(key=self.key, **told)
-        return repertoire, _strongly_typed(emitter), self._measured(repertoire, scores)
+        fitnesses = scores[0]
+        finite = jnp.where(jnp.isfinite(fitnesses), fitnesses, jnp.nan)
+        metrics = self._measured(repertoire, scores, jnp.nanmedian(finite))
+        return repertoire, _strongly_typed(emitter), metrics
 
     def tell(
         self,
@@ -58,12 +62,22 @@ class Generation:
         genotypes: Genotype,
         remembered: ExtraScores,
         scores: PyTree,
+        initial: jax.Array,
     ) -> PyTree:
-        """Returns archive, emitter's state and metrics after another generation."""
+        """Returns archive, emitter's state and metrics after another generation.
+
+        Args:
+            repertoire: The archive.
+            emitter: State of the emitter.
+            genotypes: (N, size) the individuals.
+            remembered: The emitter's data about them.
+            scores: Their scores.
+            initial: () median fitness of the initial population.
+        """
         repertoire, told = self._added(repertoire, genotypes, scores)
         told["extra_scores"] = {**told["extra_scores"], **remembered}
         emitter = self.emitter.state_update(emitter, **told)
-        metrics = self._measured(repertoire, scores)
+        metrics = self._measured(repertoire, scores, initial)
         metrics["rejected"] += jnp.sum(remembered.get("overflowed", 0))
         return repertoire, emitter, metrics
 
@@ -84,14 +98,26 @@ class Generation:
             "extra_scores": extra,
         }
 
-    def _measured(self, repertoire: Repertoire, scores: PyTree) -> PyTree:
-        """Returns QD score, coverage [%], best fitness and number of rejected ones."""
+    def _measured(
+        self, repertoire: Repertoire, scores: PyTree, initial: jax.Array
+    ) -> PyTree:
+        """Returns the metrics of the archive, and the number of rejected individuals.
+
+        Coverage is in percent. The other metrics are explained in ``quality``.
+        """
         from qdax.utils.metrics import default_qd_metrics
 
         fitnesses, found, _ = scores
         finite = jnp.isfinite(fitnesses) & jnp.all(jnp.isfinite(found), axis=1)
         metrics = default_qd_metrics(repertoire, qd_offset=self.offset)
-        return {**metrics, "rejected": jnp.sum(~finite)}
+        found = repertoire.fitnesses[:, 0]
+        return {
+            **metrics,
+            "rejected": jnp.sum(~finite),
+            "mean_fitness": quality.mean_fitness(found),
+            "initial_fitness": initial,
+            "qd_gain": quality.qd_gain(found, initial),
+        }
 
 
 def _strongly_typed(tree: PyTree) -> PyTree:

@@ -29,6 +29,7 @@ from newton_qd.qd.run.folder import (
     CONFIG,
     METRICS,
     REEVALUATED,
+    complete_metrics,
 )
 from newton_qd.qd.run.plot import grid_indices
 from newton_qd.qd.run.reevaluation import Reevaluated
@@ -398,7 +399,7 @@ def read_results(
             warnings.warn(text, stacklevel=3)
         else:
             arrays = [getattr(state, f.name) for f in dataclasses.fields(Archive)]
-            columns = np.asarray(state.metrics).T
+            columns = complete_metrics(np.asarray(state.metrics)).T
             return Archive(*arrays), dict(zip(COLUMNS, columns, strict=True))
     return load_archive(path), _metrics(path / METRICS)
 
@@ -412,9 +413,9 @@ def _metrics(path: Path) -> dict[str, np.ndarray]:
     with path.open(encoding="utf-8", newline="") as file:
         head, *rows = list(csv.reader(file)) or [[]]
     try:
-        table = np.asarray([[float(x) for x in row] for row in rows]).T
-        if tuple(head) == COLUMNS and table.shape[:1] == (len(COLUMNS),):
-            return dict(zip(COLUMNS, table, strict=True))
+        table = np.asarray([[float(x) for x in row] for row in rows])
+        if tuple(head) == COLUMNS[: len(head)] and table.shape[1:] == (len(head),):
+            return dict(zip(COLUMNS, complete_metrics(table).T, strict=True))
     except ValueError:
         pass
     allowed = f"numbers with the columns {', '.join(COLUMNS)}"

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from newton_qd.qd.run import quality
 from newton_qd.qd.run.archive import Archive
 from newton_qd.types import ScoringFunction
 
@@ -26,12 +27,17 @@ class Reevaluated:
         qd_score: QD score of this archive, with the task's reward offset.
         coverage: Its coverage [%].
         max_fitness: Its highest fitness.
+        mean_fitness: Its mean fitness; ``None`` in files of an earlier version.
+        qd_gain: Its QD score without offset; ``None`` if the fitness of an untrained
+            policy was not given.
     """
 
     reevaluations: int
     qd_score: float
     coverage: float
     max_fitness: float
+    mean_fitness: float | None = None
+    qd_gain: float | None = None
 
 
 def reevaluate(
@@ -41,6 +47,7 @@ def reevaluate(
     *,
     reevaluations: int,
     offset: float,
+    untrained: float | None = None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Reevaluated | None:
     """Evaluates the elites of an archive again.
@@ -51,10 +58,44 @@ def reevaluate(
         key: Key that is split into one key for each call.
         reevaluations: Number of calls.
         offset: Added to each elite's fitness in the QD score.
+        untrained: Fitness of an untrained policy, for the QD score without offset.
         stop: Called before each call of ``score``; true ends the re-evaluation.
 
     Returns:
         The metrics; ``None`` if ``stop`` returned true.
+    """
+    best = corrected_fitnesses(archive, score, key, reevaluations, stop)
+    if best is None:
+        return None
+    kept = best[np.isfinite(best)]
+    return Reevaluated(
+        reevaluations=reevaluations,
+        qd_score=float(np.sum(kept + offset)),
+        coverage=100.0 * len(kept) / len(best),
+        max_fitness=float(best.max()),
+        mean_fitness=float(quality.mean_fitness(best)),
+        qd_gain=None if untrained is None else float(quality.qd_gain(best, untrained)),
+    )
+
+
+def corrected_fitnesses(
+    archive: Archive,
+    score: ScoringFunction,
+    key: jax.Array,
+    reevaluations: int,
+    stop: Callable[[], bool] = lambda: False,
+) -> np.ndarray | None:
+    """Returns the fitness (cells,) of each cell after the elites were evaluated again.
+
+    Args:
+        archive: Archive with at least one elite.
+        score: Compiled scoring function; all elites share a start state in each call.
+        key: Key that is split into one key for each call.
+        reevaluations: Number of calls.
+        stop: Called before each call of ``score``.
+
+    Returns:
+        ``-inf`` in empty cells; ``None`` if ``stop`` returned true.
     """
     genotypes = jnp.asarray(archive.genotypes[archive.filled])
     fitnesses, descriptors = [], []
@@ -68,13 +109,7 @@ def reevaluate(
     cells = _cells(np.median(descriptors, axis=0), archive.centroids)
     best = np.full(len(archive.centroids), -np.inf)
     np.maximum.at(best, cells, fitness)
-    kept = best[np.isfinite(best)]
-    return Reevaluated(
-        reevaluations=reevaluations,
-        qd_score=float(np.sum(kept + offset)),
-        coverage=100.0 * len(kept) / len(best),
-        max_fitness=float(best.max()),
-    )
+    return best
 
 
 def _cells(descriptors: np.ndarray, centroids: np.ndarray) -> np.ndarray:

@@ -19,10 +19,15 @@ from newton_qd.qd.config import ConfigError, EvolveConfig, settings_text
 from newton_qd.qd.extras import require_extra
 from newton_qd.qd.run.archive import Archive
 from newton_qd.qd.run.cells import cell_centroids
-from newton_qd.qd.run.checkpoint import Checkpoint, CheckpointError
-from newton_qd.qd.run.folder import COLUMNS
+from newton_qd.qd.run.checkpoint import Checkpoint
+from newton_qd.qd.run.folder import COLUMNS, complete_metrics
 from newton_qd.qd.run.generation import Generation
-from newton_qd.qd.run.reevaluation import Reevaluated, reevaluate
+from newton_qd.qd.run.leaves import leaf_to_host, tree_to_device
+from newton_qd.qd.run.reevaluation import (
+    Reevaluated,
+    corrected_fitnesses,
+    reevaluate,
+)
 from newton_qd.qd.scoring.robust import robust_scoring, run_scoring
 from newton_qd.qd.scoring.rollout import (
     episode_of,
@@ -155,8 +160,9 @@ class Search:
             key = jax.random.fold_in(self._key_generations, iteration)
             genotypes, remembered = self._ask(state.repertoire, state.emitter, key)
             scores = self._score(genotypes, self._start(iteration))
+            initial = np.float32(state.metrics[0][COLUMNS.index("initial_fitness")])
             repertoire, emitter, metrics = self._tell(
-                state.repertoire, state.emitter, genotypes, remembered, scores
+                state.repertoire, state.emitter, genotypes, remembered, scores, initial
             )
             each = self._episodes
             before = state.metrics[-1][COLUMNS.index("evaluations")]
@@ -249,23 +255,43 @@ class Search:
             descriptors=np.asarray(repertoire.descriptors),
             centroids=np.asarray(repertoire.centroids),
             metrics=state.metrics,
-            emitter=tuple(_leaf_to_host(x) for x in jax.tree.leaves(state.emitter)),
+            emitter=tuple(leaf_to_host(x) for x in jax.tree.leaves(state.emitter)),
         )
 
     def reevaluate(
-        self, archive: Archive, stop: Callable[[], bool] = lambda: False
+        self,
+        archive: Archive,
+        stop: Callable[[], bool] = lambda: False,
+        *,
+        untrained: float | None = None,
     ) -> Reevaluated | None:
         """Evaluates the elites again; ``None`` if the settings do not ask for it."""
         if not self._config.reevaluations:
             return None
         return reevaluate(
             archive,
-            self._compiled(self._plain_scoring()),
+            self._again,
             self._key_reevaluations,
             reevaluations=self._config.reevaluations,
             offset=self._generation.offset,
+            untrained=untrained,
             stop=stop,
         )
+
+    def corrected(self, archive: Archive) -> np.ndarray:
+        """Returns the fitness (cells,) of each cell after another evaluation."""
+        if not self._config.reevaluations:
+            return archive.fitnesses
+        found = corrected_fitnesses(
+            archive, self._again, self._key_reevaluations, self._config.reevaluations
+        )
+        assert found is not None  # nothing stops it
+        return found
+
+    @functools.cached_property
+    def _again(self) -> Callable[..., Any]:
+        """The compiled scoring function of one start state."""
+        return self._compiled(self._plain_scoring())
 
     def restore(self, checkpoint: Checkpoint) -> SearchState:
         """Makes the state of a checkpoint.
@@ -286,7 +312,7 @@ class Search:
         return SearchState(
             checkpoint.iteration,
             repertoire,
-            checkpoint.metrics,
+            complete_metrics(checkpoint.metrics),
             self._restore_emitter(checkpoint.emitter),
         )
 
@@ -304,22 +330,7 @@ class Search:
         example = jax.eval_shape(self._generation.begin, repertoire, genotypes, scores)[
             1
         ]
-        expected, structure = jax.tree.flatten(example)
-        if len(leaves) != len(expected):
-            raise CheckpointError(
-                f"the checkpoint holds {len(leaves)} arrays of the algorithm "
-                f"{self._config.algorithm!r}; this version of it has {len(expected)}"
-            )
-        restored = [
-            _leaf_to_device(x, like) for x, like in zip(leaves, expected, strict=True)
-        ]
-        for index, (x, like) in enumerate(zip(restored, expected, strict=True)):
-            if x.shape != like.shape:
-                raise CheckpointError(
-                    f"array {index} of the algorithm {self._config.algorithm!r} has "
-                    f"shape {x.shape} in the checkpoint, {like.shape} in this version"
-                )
-        return jax.tree.unflatten(structure, restored)
+        return tree_to_device(leaves, example, self._config.algorithm)
 
     def _initial(self, key: jax.Array) -> jax.Array:
         """Returns weights (size,) of an individual of the initial population."""
@@ -383,17 +394,3 @@ def _runnable(config: EvolveConfig) -> AlgorithmSpec[Any]:
         allowed = "those of newton_qd, or any without jax_enable_x64"
         raise ConfigError(message("algorithm", config.algorithm, allowed, why=why))
     return spec
-
-
-def _leaf_to_host(leaf: Any) -> np.ndarray:
-    """Copies a leaf to the host; a key becomes its integers."""
-    if jnp.issubdtype(jnp.asarray(leaf).dtype, jax.dtypes.prng_key):
-        leaf = jax.random.key_data(leaf)
-    return np.asarray(leaf)
-
-
-def _leaf_to_device(leaf: np.ndarray, like: Any) -> jax.Array:
-    """Inverts ``_leaf_to_host``."""
-    if jnp.issubdtype(like.dtype, jax.dtypes.prng_key):
-        return jax.random.wrap_key_data(jnp.asarray(leaf))
-    return jnp.asarray(leaf, like.dtype)
