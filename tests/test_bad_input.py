@@ -170,6 +170,59 @@ def test_bad_states_are_named(name: str) -> None:
         newton_qd.create(name, auto_reset=False).step(inside, action)
 
 
+OTHERS = [
+    ("hopper", "hopper_uni", "info without 'state_descriptor'"),
+    ("ant_omni", "ant_uni", r"a state descriptor of shape \(2,\); .* shape \(4,\)"),
+    ("hopper_uni", "walker2d_uni", "a state descriptor of shape"),
+    ("halfcheetah_uni", "walker2d_uni", "metrics without 'reward_forward'; .*'walker"),
+    ("hopper", "walker2d", r"coordinates and velocities of shape \(6,\) and \(6,\);"),
+    ("pointmaze", "ant_omni", "a pipeline_state of type tuple; .* 'ant'"),
+    ("ant_omni", "pointmaze", r"obs of shape \(87,\); .* shape \(2,\)"),
+]
+
+
+@pytest.mark.parametrize(("other", "name", "words"), OTHERS)
+def test_states_of_another_environment_are_named(
+    other: str, name: str, words: str
+) -> None:
+    envs = [newton_qd.create(each, auto_reset=False) for each in (other, name)]
+    state = jax.eval_shape(envs[0].reset, jax.random.key(0))
+    action = jnp.zeros(envs[1].action_size)
+    with pytest.raises(ValueError, match=f"^state: got {words}"):
+        jax.eval_shape(envs[1].step, state, action)
+    own = jax.eval_shape(envs[1].reset, jax.random.key(0))
+    jax.eval_shape(envs[1].step, own, action)
+    jax.eval_shape(envs[1].step, own.replace(metrics={}), action)
+
+
+@pytest.mark.parametrize("name", ("ant_uni", "pointmaze"))
+def test_wrong_keys_are_named(name: str) -> None:
+    for env in (make(name), make(name, "batch")):
+        for wrong in (0, None, jnp.zeros(2), np.zeros(2, np.int64)):
+            with pytest.raises(
+                TypeError, match=r"^rng: got .*; allowed: one key, such"
+            ):
+                env.reset(wrong)  # pyright: ignore[reportArgumentType]
+        for kind in (jax.random.key, jax.random.PRNGKey):
+            with pytest.raises(ValueError, match=r"^rng: got an array .*use jax\.vmap"):
+                env.reset(jax.random.split(kind(0), 3))
+            jax.eval_shape(env.reset, kind(0))
+    with pytest.raises(TypeError, match=r"^key: got 3; allowed: one key"):
+        newton_qd.randomize_params(3, make("ant_uni"))  # pyright: ignore
+
+
+def test_check_of_no_state_is_named() -> None:
+    wrong: Any
+    for wrong in (3, None, {"info": 3}):
+        with pytest.raises(
+            TypeError, match=r"^state: got .*; allowed: a State that re"
+        ):
+            newton_qd.check(wrong)
+    state = jax.eval_shape(make("pointmaze").reset, jax.random.key(0))
+    with pytest.raises(ValueError, match=r"^state: got info without 'fault'; allowed"):
+        newton_qd.check(state.replace(info={}))
+
+
 @pytest.mark.parametrize("name", EVERY_NAME)
 def test_actions_of_numpy_and_weak_types_are_taken(name: str) -> None:
     env = make(name)

@@ -264,9 +264,12 @@ class PhysicsEnv(Env):
         """Begins an episode in the default pose with noise on the joints.
 
         Raises:
-            ValueError: The environment is float64 and JAX x64 is off.
+            TypeError: ``rng`` is not a key.
+            ValueError: ``rng`` is several keys, or the environment is float64 and JAX
+                x64 is off.
         """
         checks.x64(self._dtype)
+        inputs.require_key("rng", rng)
         root_key, angle_key, velocity_key = jax.random.split(rng, 3)
         rest = split_as([rng], self._rest())
         q = self.reset_pose(root_key, rest.q)
@@ -297,7 +300,7 @@ class PhysicsEnv(Env):
                 the environment is float64 and JAX x64 is off.
         """
         checks.x64(self._dtype)
-        inputs.require_state(state, "fault")
+        inputs.require_robot_state(state, self.system, self._metrics)
         action = inputs.checked_action(action, self.action_size, self._dtype)
         given = (state, action, params)
         state, action, params = split_as([state.obs, action], given)

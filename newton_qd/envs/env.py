@@ -38,7 +38,9 @@ class Env(abc.ABC):
             rng: One key, ``jax.random.key(0)`` or ``jax.random.PRNGKey(0)``.
 
         Raises:
-            ValueError: The environment is float64 and JAX x64 is off.
+            TypeError: ``rng`` is not a key.
+            ValueError: ``rng`` is several keys, or the environment is float64 and JAX
+                x64 is off.
         """
 
     @abc.abstractmethod

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from newton_qd import checks
 from newton_qd.checks import Fact, message
 from newton_qd.envs.state import State
-from newton_qd.physics.system import System
+from newton_qd.physics.system import PhysicsState, System
 from newton_qd.types import Action, Params
 
 
@@ -36,6 +39,33 @@ def refuse_params(params: Params) -> None:
         raise ValueError(message("params", params, "None", why=why))
 
 
+OWN_STATE = "a state that reset or step of this environment returned, wrappers included"
+
+
+def require_key(name: str, key: Any, *, several: bool = False) -> None:
+    """Checks that a value is a random key.
+
+    Args:
+        name: Name of the argument.
+        key: Its value.
+        several: Whether an array of keys is allowed too.
+
+    Raises:
+        TypeError: It is not a key.
+        ValueError: It is an array of keys.
+    """
+    allowed = "one key, such as jax.random.key(0)"
+    if several:
+        allowed += ", or an array of keys, such as jax.random.split(key, 8)"
+    dtype: Any = key.dtype if checks.is_array(key) else None
+    typed = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key)
+    if not typed and dtype != np.uint32:  # keys of the old kind are numbers (2,)
+        raise TypeError(message(name, key, allowed))
+    if not several and len(key.shape) != (0 if typed else 1):
+        allowed += " (for a batch, use jax.vmap or create(..., batch_size=...))"
+        raise ValueError(message(name, key, allowed))
+
+
 def require_state(state: State, *keys: str) -> None:
     """Checks that a value is a state, and that its ``info`` has some keys.
 
@@ -50,12 +80,54 @@ def require_state(state: State, *keys: str) -> None:
     checks.instance("state", state, State, "a State that reset or step returned")
     for key in keys:
         if key not in state.info:
-            allowed = (
-                "a state that reset or step of this environment returned, wrappers "
-                "included"
-            )
             given = Fact(f"info without {key!r}")
-            raise ValueError(message("state", given, allowed))
+            raise ValueError(message("state", given, OWN_STATE))
+
+
+def require_robot_state(state: State, system: System, metrics: tuple[str, ...]) -> None:
+    """Checks that a state is one of a simulated robot, and of the same kind.
+
+    Args:
+        state: Argument of a step.
+        system: The robot.
+        metrics: Names of the metrics of its environment.
+
+    Raises:
+        TypeError: It is not a ``State``.
+        ValueError: It is a state of another environment.
+    """
+    require_state(state, "fault")
+    found = state.pipeline_state
+    allowed = f"{OWN_STATE} (the robot is {system.robot.name!r})"
+    if not isinstance(found, PhysicsState):
+        given = Fact(f"a pipeline_state of type {type(found).__name__}")
+        raise ValueError(message("state", given, allowed))
+    sizes = jnp.shape(found.q), jnp.shape(found.v)
+    if sizes != ((system.nq,), (system.nv,)):
+        given = Fact(f"coordinates and velocities of shape {sizes[0]} and {sizes[1]}")
+        allowed += f" of shape {(system.nq,)} and {(system.nv,)} (for a batch, use "
+        allowed += "jax.vmap or create(..., batch_size=...))"
+        raise ValueError(message("state", given, allowed))
+    missing = [name for name in metrics if name not in state.metrics]
+    if missing and state.metrics:  # a user may drop all metrics
+        given = Fact(f"metrics without {missing[0]!r}")
+        raise ValueError(message("state", given, allowed))
+
+
+def require_point_state(state: State) -> None:
+    """Checks that a state is one of a point, whose observation is its position.
+
+    Args:
+        state: Argument of a step.
+
+    Raises:
+        TypeError: It is not a ``State``.
+        ValueError: It is a state of another environment.
+    """
+    require_state(state, "fault")
+    if jnp.shape(state.obs) != (2,):
+        given = Fact(f"obs of shape {jnp.shape(state.obs)}")
+        raise ValueError(message("state", given, f"{OWN_STATE}, so obs of shape (2,)"))
 
 
 def checked_action(action: Action, size: int, dtype: np.dtype) -> Action:

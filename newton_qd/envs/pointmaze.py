@@ -14,7 +14,8 @@ from newton_qd.envs.base import QDEnv
 from newton_qd.envs.inputs import (
     checked_action,
     refuse_params,
-    require_state,
+    require_key,
+    require_point_state,
 )
 from newton_qd.envs.state import State
 from newton_qd.envs.vectors import length, rounded
@@ -103,9 +104,12 @@ class PointMaze(QDEnv):
         """Begins an episode at a random position at the bottom of the box.
 
         Raises:
-            ValueError: The environment is float64 and JAX x64 is off.
+            TypeError: ``rng`` is not a key.
+            ValueError: ``rng`` is several keys, or the environment is float64 and JAX
+                x64 is off.
         """
         checks.x64(self._dtype)
+        require_key("rng", rng)
         _, x_key, y_key = jax.random.split(rng, 3)
         (left, bottom), (right, _) = self._low, self._high
         x = jax.random.uniform(x_key, (), self._dtype, left, right) / _START_FRACTION
@@ -131,7 +135,7 @@ class PointMaze(QDEnv):
                 JAX x64 is off.
         """
         checks.x64(self._dtype)
-        require_state(state, "fault")
+        require_point_state(state)
         refuse_params(params)
         action = checked_action(action, self.action_size, self._dtype)
         old = state.obs

@@ -12,6 +12,7 @@ from jax.typing import ArrayLike
 from newton_qd import checks
 from newton_qd.checks import Fact, message
 from newton_qd.envs.base import Env
+from newton_qd.envs.inputs import require_key
 from newton_qd.physics.parameters import FIELDS, PhysicsParams, check_bounds
 from newton_qd.types import RNGKey
 
@@ -57,10 +58,11 @@ def randomize_params(
         Parameters for ``env.step``, or for its ``vmap`` if ``worlds`` is given.
 
     Raises:
-        TypeError: ``env`` is not an environment.
+        TypeError: ``env`` is not an environment, or ``key`` is not a key.
         ValueError: The environment has no physical parameters, ``worlds`` is not an
-            integer above 0, or a range is wrong.
+            integer above 0, ``key`` is several keys, or a range is wrong.
     """
+    require_key("key", key)
     default = _default(env, worlds)
     given = {
         "gravity": gravity,

@@ -89,7 +89,7 @@ def _in_order(
 
 def _foresee(base: Any, state: State, actions: Action, params: Params) -> Foreseen:
     """Runs the physics of a :class:`~newton_qd.envs.base.PhysicsEnv` for a plan."""
-    inputs.require_state(state, "fault")
+    inputs.require_robot_state(state, base.system, ())
     start = state.pipeline_state
     actions = jax.vmap(
         lambda action: inputs.checked_action(action, base.action_size, base.dtype)

@@ -120,7 +120,8 @@ def check(state: State) -> None:
     Raises:
         FaultError: A world has a fault, or a value of its state is not finite. The
             error names the worlds, and their steps if ``info`` has them.
-        TypeError: ``state`` is traced.
+        TypeError: ``state`` is traced, or is no state.
+        ValueError: ``state`` does not say whether it has a fault.
     """
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(state)):
         allowed = (
@@ -128,7 +129,12 @@ def check(state: State) -> None:
             "info['fault'])"
         )
         raise TypeError(message("state", Fact("traced values"), allowed))
+    allowed = "a State that reset or step returned"
+    if not isinstance(getattr(state, "info", None), Mapping):
+        raise TypeError(message("state", state, allowed))
     info: Mapping[str, Any] = state.info
+    if "fault" not in info:
+        raise ValueError(message("state", Fact("info without 'fault'"), allowed))
     faulty = np.asarray(info["fault"]) != 0
     steps = np.asarray(info["steps"]) if "steps" in info else None
     found = []

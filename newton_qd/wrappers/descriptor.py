@@ -10,8 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from newton_qd.checks import message
+from newton_qd.checks import Fact, message
 from newton_qd.envs.base import Env, QDEnv
+from newton_qd.envs.inputs import OWN_STATE, require_state
 from newton_qd.envs.rollouts import RolloutOrder
 from newton_qd.envs.state import State
 from newton_qd.extractors import get_mean_state_descriptor
@@ -78,6 +79,13 @@ class DescriptorWrapper(Wrapper, QDEnv):
             TypeError: The state or the action has the wrong type.
             ValueError: The state or the action is of another environment.
         """
+        require_state(state, "state_descriptor")
+        size = (self.state_descriptor_length,)
+        found = jnp.shape(state.info["state_descriptor"])
+        if found[-1:] != size:
+            given = Fact(f"a state descriptor of shape {found}")
+            allowed = f"{OWN_STATE}, so a state descriptor of shape {size}"
+            raise ValueError(message("state", given, allowed))
         return self._described(self.env.step(state, action, params))
 
     def _described(self, state: State) -> State:

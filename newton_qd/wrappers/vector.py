@@ -11,6 +11,7 @@ import numpy as np
 from newton_qd import checks, memory
 from newton_qd.checks import Fact, message
 from newton_qd.envs.base import Env
+from newton_qd.envs.inputs import require_key
 from newton_qd.envs.state import State
 from newton_qd.types import Action, Params, RNGKey
 from newton_qd.wrappers.base import Wrapper
@@ -54,8 +55,11 @@ class VectorWrapper(Wrapper):
         """Begins an episode in every world, from one key.
 
         Raises:
-            ValueError: The environment is float64 and JAX x64 is off.
+            TypeError: ``rng`` is not a key.
+            ValueError: ``rng`` is several keys, or the environment is float64 and JAX
+                x64 is off.
         """
+        require_key("rng", rng)
         return jax.vmap(self.env.reset)(jax.random.split(rng, self.batch_size))
 
     def step(self, state: State, action: Action, params: Params = None) -> State:
