@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 _LONGEST = 100  # characters of a value in an error
 _MOST = 2**31 - 1  # JAX counts in 32 bits
+_NAME = 100  # characters of a name that becomes a file
 _FLOATS = ("float32", "float64")
 
 Error = type[Exception]
@@ -216,14 +217,19 @@ def text(
 def identifier(
     name: str, value: object, *, optional: bool = False, error: Error = ValueError
 ) -> None:
-    """Checks that a value is a name as Python's variables have, so never a path.
+    """Checks that a value is a short name of ASCII characters, so never a path.
 
     Raises:
-        ValueError: The value is not text, is empty, or has other characters.
+        ValueError: The value is not text, is empty, is too long, or has other
+            characters.
     """
     text(name, value, optional=optional, error=error)
-    if isinstance(value, str) and not value.isidentifier():
-        allowed = "letters, digits and _, not beginning with a digit"
+    if not isinstance(value, str):
+        return
+    # accents have two encodings, which some file systems mix up
+    if not (value.isidentifier() and value.isascii() and len(value) <= _NAME):
+        allowed = "letters, digits and _ of ASCII, not beginning with a digit, up to "
+        allowed += f"{_NAME} characters"
         raise error(message(name, value, allowed))
 
 

@@ -198,7 +198,8 @@ def _check_wrappers(wrappers: object) -> None:
     """Checks the ``wrappers`` of ``register``.
 
     Raises:
-        TypeError: They are not a sequence of ``WrapperSpec``.
+        TypeError: They are not a sequence of ``WrapperSpec``, or a wrapper does not
+            take one of its options.
     """
     if not isinstance(wrappers, Sequence) or isinstance(wrappers, str):
         allowed = "a tuple or list of WrapperSpec, such as "
@@ -211,6 +212,7 @@ def _check_wrappers(wrappers: object) -> None:
         checks.function(f"{name}.wrapper", spec.wrapper, "a class or a function")
         allowed = "a mapping of keyword arguments"
         checks.instance(f"{name}.options", spec.options, Mapping, allowed)
+        spec.check_options(f"{name}.options", spec.options)
 
 
 def create(
@@ -359,7 +361,8 @@ def _wrapper_options(
     """Returns the keyword arguments of each wrapper of a spec.
 
     Raises:
-        TypeError: They are not a sequence of dictionaries.
+        TypeError: They are not a sequence of dictionaries, or a wrapper does not take
+            an argument.
         ValueError: Their number is not the number of wrappers.
     """
     if given is None:
@@ -376,4 +379,6 @@ def _wrapper_options(
         allowed += f"({listed(names, 'no wrapper')})"
         count = Fact(f"{len(given)} entries")
         raise ValueError(message("qdax_wrappers_kwargs", count, allowed))
+    for index, wrapper_spec in enumerate(spec.wrappers):
+        wrapper_spec.check_options(f"qdax_wrappers_kwargs[{index}]", given[index])
     return list(given)

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import inspect
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from newton_qd.checks import listed, message
 from newton_qd.envs.acrobot import Acrobot
 from newton_qd.envs.ant import Ant
 from newton_qd.envs.base import Env
@@ -63,6 +65,27 @@ class WrapperSpec:
 
     wrapper: Callable[..., Env]
     options: Mapping[str, object] = dataclasses.field(default_factory=dict)
+
+    def check_options(self, where: str, options: Mapping[str, Any]) -> None:
+        """Checks that the wrapper takes keyword arguments.
+
+        Args:
+            where: Name of ``options`` in errors.
+            options: Values by name.
+
+        Raises:
+            TypeError: The wrapper does not take one of them.
+        """
+        parameters = [*inspect.signature(self.wrapper).parameters.values()]
+        if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
+            return
+        allowed = [p.name for p in parameters[2:]]  # after the environment and its name
+        for name, value in options.items():
+            if name not in allowed:
+                owner = getattr(self.wrapper, "__name__", repr(self.wrapper))
+                why = f"which is not an argument of {owner}"
+                known = listed(allowed, "no argument")
+                raise TypeError(message(f"{where}, {name}", value, known, why=why))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -95,11 +95,20 @@ def test_wrong_options_of_the_environment(
         ("batch_size=3", "got 'batch_size', which evolve sets itself; allowed"),
         ("material=3", "material: got 3; allowed: a table of fields of Material"),
         ("material.colour=3", "unexpected keyword argument 'colour'"),
+        ("material.frictio=1", "env_options: material.frictio: got 1, an unexpected k"),
+        ("material.frictio=1", "; allowed: friction, static_penetration, support"),
+        ("scene.name=x", "scene: got a table without 'urdf'; allowed: a table with"),
+        ("scene.colour=x", "scene.colour: got 'x', an unexpected keyword argument"),
+        ("qdax_wrappers_kwargs=[{'smooth': 1}]", "_kwargs[0], smooth: got 1, which is"),
         ("qdax_wrappers_kwargs=[{}, {}]", "got 2 entries; allowed: None, or 1 for"),
         ("fixed_init_state=3", "fixed_init_state: got 3"),
     ):
         assert cli.main([*ant, option]) == cli.BAD_ARGUMENTS, option
         assert text in capsys.readouterr().err
+    assert cli.main([*ant[:2], "--randomize", "fric=1,2"]) == cli.BAD_ARGUMENTS
+    error = capsys.readouterr().err
+    assert "randomize: fric: got (1.0, 2.0), which is no physical parameter; " in error
+    assert "allowed: gravity, friction, " in error
     assert not list(tmp_path.iterdir())
     with pytest.raises(SystemExit):
         cli.main([*ant, "healthy_reward"])

@@ -349,7 +349,10 @@ def test_register_refuses_before_it_stores(
     assert "ant" in list(newton_qd.tables.FEET_NAMES)
 
 
-@pytest.mark.parametrize("name", ["../../evil", "a/b", "a b", "1st", "a-b", ".", "a\n"])
+@pytest.mark.parametrize(
+    "name",
+    ["../../evil", "a/b", "a b", "1st", "a-b", ".", "a\n", "r\u00e4uber", "a" * 101],
+)
 def test_a_name_is_never_a_path(name: str, rows: None) -> None:
     for names in ({"env_name": name}, {"env_name": "mine", "base_name": name}):
         wrong = list(names)[-1]
@@ -375,6 +378,15 @@ def test_a_base_makes_an_environment(rows: None) -> None:
         newton_qd.create("later", size=3)
     newton_qd.register("maze", lambda **options: PointMaze(**options))
     assert isinstance(newton_qd.create("maze").unwrapped, PointMaze)
+
+
+def test_arguments_of_wrappers_are_named() -> None:
+    words = r"^qdax_wrappers_kwargs\[0\], smooth: got 1, which is not an argument of "
+    words += "FeetContactWrapper; allowed: smooth_width, straight_through, smooth_tail$"
+    with pytest.raises(TypeError, match=words):
+        newton_qd.create("ant_uni", qdax_wrappers_kwargs=[{"smooth": 1}])
+    with pytest.raises(TypeError, match=r"of MazeWrapper; allowed: no argument$"):
+        newton_qd.create("antmaze", qdax_wrappers_kwargs=[{}, {"wall": 1}])
 
 
 def test_register_takes_numbers_of_numpy(rows: None) -> None:

@@ -6,10 +6,12 @@ from typing import Any
 
 import jax
 
+from newton_qd.checks import listed, message
 from newton_qd.envs.base import Env
 from newton_qd.envs.inputs import require_state
 from newton_qd.envs.randomization import Range, randomize_params
 from newton_qd.envs.state import State
+from newton_qd.physics.parameters import FIELDS
 from newton_qd.types import Action, Params, RNGKey
 from newton_qd.wrappers.base import Wrapper
 
@@ -43,6 +45,10 @@ class RandomParamsWrapper(Wrapper):
             ValueError: The environment has no physical parameters, or a range is wrong.
         """
         del env_name
+        for name in ranges:
+            if name not in FIELDS:
+                why = "which is no physical parameter"
+                raise TypeError(message(name, ranges[name], listed(FIELDS), why=why))
         super().__init__(env)
         self.ranges = dict(ranges)
         jax.eval_shape(lambda: self._drawn(jax.random.key(0)))

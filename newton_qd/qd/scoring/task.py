@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from newton_qd import checks, tasks
-from newton_qd.checks import listed, message
+from newton_qd.checks import Fact, listed, message
 from newton_qd.qd.config import ConfigError, EvolveConfig
 from newton_qd.robots import ROBOTS, Material
 from newton_qd.scenes import SCENES, Scene
@@ -150,6 +150,7 @@ def _material(env_name: str, fields: Any) -> Material:
         TypeError: ``fields`` is not a table, or a field does not exist.
     """
     checks.instance("material", fields, Mapping, "a table of fields of Material")
+    _check_fields("material", fields, Material)
     spec = tasks.ENVIRONMENTS[env_name]
     robot = spec.robot or ROBOTS.get(spec.base_name)
     return dataclasses.replace(
@@ -157,13 +158,33 @@ def _material(env_name: str, fields: Any) -> Material:
     )
 
 
+def _check_fields(name: str, given: Mapping[str, Any], kind: type) -> None:
+    """Checks the fields of a table.
+
+    Raises:
+        TypeError: The dataclass ``kind`` does not have such a field, or one is missing.
+    """
+    fields = dataclasses.fields(kind)
+    known = [field.name for field in fields]
+    for key, value in given.items():
+        if key not in known:
+            why = f"an unexpected keyword argument {key!r}"
+            raise TypeError(message(f"{name}.{key}", value, listed(known), why=why))
+    needed = [f.name for f in fields if f.default is dataclasses.MISSING]
+    missing = [key for key in needed if key not in given]
+    if missing:
+        given_text = Fact(f"a table without {missing[0]!r}")
+        raise TypeError(message(name, given_text, f"a table with {listed(needed)}"))
+
+
 def _scene(value: Any) -> Scene:
     """Returns a scene from its name, its URDF file or its fields.
 
     Raises:
-        TypeError: It is none of them, or a field does not exist.
+        TypeError: It is none of them, a field does not exist, or one is missing.
     """
     if isinstance(value, Mapping):
+        _check_fields("scene", value, Scene)
         return Scene(**value)
     if isinstance(value, str) and value in SCENES:
         return SCENES[value]
