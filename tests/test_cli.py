@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import signal
@@ -15,7 +16,7 @@ from point_runs import SMALL, point_task
 
 import newton_qd
 from newton_qd import cli
-from newton_qd.qd.config import EvolveConfig
+from newton_qd.qd.config import EvolveConfig, config_to_json
 from newton_qd.qd.run.archive import load_archive
 from newton_qd.qd.scoring.task import Task
 
@@ -97,6 +98,51 @@ def test_files_of_others_are_never_a_run(
     assert found == ["cat.png", "evil.toml", "photos"]
 
 
+def test_other_arguments_come_before_a_used_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "cat.png").touch()
+    for wrong, text in (
+        (["--algorithm", "no"], "algorithm: got 'no', which does not exist"),
+        (["--option", "courage=1"], "courage"),
+        (["--device", "tpu"], "device: got 'tpu'; allowed"),
+        (["--devices", "999"], "devices: got 999; allowed"),
+        ([], "which is not empty"),
+    ):
+        assert call(*POINT, "--out", tmp_path, *wrong) == cli.BAD_ARGUMENTS
+        assert text in capsys.readouterr().err
+    (tmp_path / "cat.png").unlink()
+    other = tmp_path / "other"
+    other.mkdir()
+    config = EvolveConfig(env_name="hopper_uni", grid=(64,))
+    (other / "config.json").write_text(config_to_json(config, {}))
+    resume = ["evolve", "point", "--resume", "--quiet", "--out", other]
+    assert call(*resume) == cli.BAD_ARGUMENTS
+    error = capsys.readouterr().err
+    assert "env_name: got 'point'; allowed: 'hopper_uni', as the run in" in error
+    assert call("evolve", "--resume", "--out", tmp_path / "no") == cli.BAD_ARGUMENTS
+    error = capsys.readouterr().err
+    assert f"out: got {tmp_path / 'no'}, which holds no run; allowed: the res" in error
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_a_terminal_gets_no_broken_words(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "40")
+    plain, terminal = io.StringIO(), Terminal()
+    for stream in (plain, terminal):
+        with monkeypatch.context() as patch:
+            patch.setattr(sys, "stderr", stream)
+            assert cli.main(["evolve", "ant_unicorn"]) == cli.BAD_ARGUMENTS
+    assert plain.getvalue().count("\n") == 1
+    lines = terminal.getvalue().splitlines()
+    assert len(lines) > 3 and max(map(len, lines)) <= 40
+    assert " ".join(lines) == plain.getvalue().rstrip("\n")
+
+
 @pytest.mark.slow
 def test_resume_starts_a_run_that_was_killed_too_early(tmp_path: Path) -> None:
     out = tmp_path / "run"
@@ -138,6 +184,7 @@ def test_a_signal_before_the_first_generation(
         (["evolve", "ant_uni", "--iso-sigma", "nan"], "iso_sigma: got nan; allowed"),
         (["evolve", "ant_uni", "--checkpoint-seconds", "nan"], "checkpoint_seconds"),
         (["evolve", "--config", "none.json"], "cannot read none.json"),
+        (["evolve", "ant_uni", "--grid", "5"], "5, which has 1 dimension;"),
     ],
 )
 def test_bad_arguments_write_nothing(

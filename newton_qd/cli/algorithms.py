@@ -20,12 +20,15 @@ def add_parser(commands: Commands) -> None:
     parser = commands.add_parser(
         "algorithms",
         help="list the algorithms of evolve, or the options of one",
-        description="Lists the algorithms of evolve. With NAME, lists the options "
-        "that this algorithm alone has, with their defaults; evolve takes them as "
-        "--option NAME=VALUE.",
+        description="Lists the algorithms of evolve. With ALGORITHM, lists the "
+        "options of this one, with their defaults; evolve takes them as --option "
+        "NAME=VALUE.",
     )
     parser.add_argument(
-        "name", nargs="?", metavar="NAME", help="algorithm, for example me-gradient"
+        "name",
+        nargs="?",
+        metavar="ALGORITHM",
+        help="algorithm, for example me-gradient",
     )
     modules.add_argument(parser)
     parser.set_defaults(run=run)

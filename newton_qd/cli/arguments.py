@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 import sys
-from typing import TypeAlias
+from typing import TextIO, TypeAlias
 
 from newton_qd.qd.config import changed_facts, environment_facts
+from newton_qd.qd.run.progress import for_stream
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 """The subparsers of ``newton-qd``."""
@@ -16,8 +17,19 @@ OK, FAILED, BAD_ARGUMENTS = 0, 1, 2
 
 def complain(arguments: argparse.Namespace, what: object, code: int) -> int:
     """Prints an error of the command to standard error and returns the exit code."""
-    print(f"newton-qd {arguments.command}: error: {what}", file=sys.stderr)
+    say(f"newton-qd {arguments.command}: error: {what}", sys.stderr)
     return code
+
+
+def say(text: str, stream: TextIO | None = None) -> None:
+    """Prints sentences. A terminal gets line breaks between words.
+
+    Args:
+        text: One or more lines.
+        stream: Where to; ``None``: standard output.
+    """
+    target: TextIO = sys.stdout if stream is None else stream
+    print(for_stream(text, target), file=target)
 
 
 def warn_of_changes(facts: dict[str, object], when: str) -> None:
@@ -28,9 +40,9 @@ def warn_of_changes(facts: dict[str, object], when: str) -> None:
         when: When they held.
     """
     for name, old, new in changed_facts(facts, environment_facts()) if facts else ():
-        print(
+        say(
             f"warning: {name} was {old} {when} and is {new} now; the result may differ",
-            file=sys.stderr,
+            sys.stderr,
         )
 
 

@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING
 
 from newton_qd import checks
 from newton_qd.cli.algorithms import details
-from newton_qd.cli.arguments import FAILED, OK, Commands, complain
+from newton_qd.cli.arguments import FAILED, OK, Commands, complain, say
 from newton_qd.cli.evolve_arguments import add_arguments, settle
 from newton_qd.qd.algorithms import algorithm_named
 from newton_qd.qd.config import ConfigError, EvolveConfig
+from newton_qd.qd.run.folder import RunFolder
 from newton_qd.qd.run.interrupt import INTERRUPTED, graceful_stop
 
 if TYPE_CHECKING:
@@ -45,8 +46,13 @@ def run(
     checks.number(
         "checkpoint_seconds", seconds, least=0, endless=True, error=ConfigError
     )
+    algorithm_named(config.algorithm).read_options(config)
     if arguments.device == "cpu" and "jax" not in sys.modules:
         os.environ["JAX_PLATFORMS"] = "cpu"  # so that JAX reserves no GPU memory
+    if arguments.device is arguments.devices is None:  # else they are checked first
+        folder = RunFolder(out)
+        folder.check(resume=arguments.resume)
+        folder.compare_environment(config.env_name)
     # These imports load JAX and the physics. They come after the argument checks, so
     # that argument errors are fast. The signal is delayed until the imports end,
     # because an exception during the import of an extension module can crash Python.
@@ -100,17 +106,17 @@ def _report(result: EvolveResult, out: Path, modules: Sequence[str]) -> None:
             {name: values[index] for name, values in result.metrics.items()}
             for index in (0, -1)
         )
-        print(
+        say(
             f"{config.env_name}: {last['evaluations']:,.0f} evaluations in "
             f"{result.iteration} generations; this call took {result.seconds:.0f} s"
         )
-        print(
+        say(
             f"QD score {first['qd_score']:,.0f} -> {last['qd_score']:,.0f}, "
             f"coverage {first['coverage']:.1f} -> {last['coverage']:.1f} %, "
             f"best fitness {first['max_fitness']:.1f} -> {last['max_fitness']:.1f}"
         )
         if (again := result.reevaluated) is not None:
-            print(
+            say(
                 f"reevaluated ({again.reevaluations} evaluations of each elite): "
                 f"QD score {again.qd_score:,.0f}, coverage {again.coverage:.1f} %, "
                 f"best fitness {again.max_fitness:.1f}"
@@ -126,7 +132,5 @@ def _report(result: EvolveResult, out: Path, modules: Sequence[str]) -> None:
                 "everything up to it is saved"
             )
         own = "".join(f" --module {shlex.quote(name)}" for name in modules)
-        print(
-            f"interrupted {when}; continue with:\n"
-            f"  newton-qd evolve --resume --out {shlex.quote(str(out))}{own}"
-        )
+        say(f"interrupted {when}; continue with:")
+        print(f"  newton-qd evolve --resume --out {shlex.quote(str(out))}{own}")

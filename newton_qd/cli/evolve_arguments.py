@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from newton_qd import checks
-from newton_qd.checks import message
+from newton_qd.checks import Fact, message
 from newton_qd.cli import modules
 from newton_qd.cli.arguments import Commands, integers, warn_of_changes, widths
 from newton_qd.qd.algorithms import ALGORITHMS
@@ -138,7 +138,7 @@ def _add_setting_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         metavar="NAME=VALUE",
         help="option of the algorithm, for example discount=0.95; may be "
-        "repeated; 'newton-qd algorithms NAME' lists them",
+        "repeated; 'newton-qd algorithms ALGORITHM' lists them",
     )
     group.add_argument(
         "--env-option",
@@ -239,7 +239,8 @@ def settle(arguments: argparse.Namespace) -> tuple[EvolveConfig, Path]:
     """Combines the settings of the arguments, the config file and the run to resume.
 
     Raises:
-        ConfigError: No environment is named, or a setting is not allowed.
+        ConfigError: No environment is named, or a setting is not allowed. The results
+            folder is not checked, because other wrong arguments come first.
     """
     from newton_qd.qd.run.folder import CONFIG, RunFolder
 
@@ -262,11 +263,15 @@ def settle(arguments: argparse.Namespace) -> tuple[EvolveConfig, Path]:
         checks.identifier("env_name", named.env_name, error=ConfigError)
         out = Path("results") / f"{named.env_name}-seed{named.seed}"
     folder = RunFolder(out)
-    folder.check(resume=arguments.resume)
     if base is None and arguments.resume and folder.has_config:
         base = read_config(out / CONFIG)[0]
     if base is None and "env_name" not in given:
-        raise ConfigError(_UNNAMED)
+        folder.check(resume=arguments.resume)
+        if not arguments.resume:
+            raise ConfigError(_UNNAMED)
+        why = "which holds no run"
+        refused = message("out", Fact(out), "the results folder of a run", why=why)
+        raise ConfigError(f"{refused}. To start a run there: {_UNNAMED}")
     base = base or _DEFAULTS
     # A grid replaces centroids of the config, and centroids replace its grid.
     if "grid" in given:

@@ -172,7 +172,9 @@ class EvolveConfig:
             return dataclasses.replace(self, grid=DEFAULT_GRIDS[descriptor_length])
         if len(self.grid) != descriptor_length:
             cells = "x".join(map(str, self.grid))
-            given = Fact(f"{cells}, which has {len(self.grid)} dimensions")
+            count = len(self.grid)
+            plural = "" if count == 1 else "s"
+            given = Fact(f"{cells}, which has {count} dimension{plural}")
             allowed = f"as many as the descriptor of {self.env_name!r} has: "
             allowed += str(descriptor_length)
             raise ConfigError(message("grid", given, allowed))

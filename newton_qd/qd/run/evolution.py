@@ -18,6 +18,7 @@ from jax.sharding import Mesh
 from newton_qd import checks
 from newton_qd.checks import Fact, message
 from newton_qd.physics import interrupts
+from newton_qd.qd.algorithms import algorithm_named
 from newton_qd.qd.config import ConfigError, EvolveConfig, environment_facts
 from newton_qd.qd.extras import require_extra
 from newton_qd.qd.run.archive import Archive
@@ -124,9 +125,11 @@ def evolve(
     begin = time.monotonic()
     allowed = "an EvolveConfig, such as EvolveConfig(env_name='ant_uni')"
     checks.instance("config", config, EvolveConfig, allowed, error=ConfigError)
-    folder = _folder(out, resume, tensorboard)
+    algorithm_named(config.algorithm).read_options(config)
     mesh = _mesh(devices, resume)
     chosen = _device(device, devices)
+    # after the other arguments, whose errors would come one by one otherwise
+    folder = _folder(out, config, resume, tensorboard)
     interrupts.install()  # before the handlers below, so that it outlives them
     with ExitStack() as stack:
         stop = stack.enter_context(graceful_stop())
@@ -155,12 +158,16 @@ def evolve(
 
 
 def _folder(
-    out: str | os.PathLike[str] | None, resume: bool, tensorboard: bool
+    out: str | os.PathLike[str] | None,
+    config: EvolveConfig,
+    resume: bool,
+    tensorboard: bool,
 ) -> RunFolder | None:
     """Checks folder and packages before the slow part of a run.
 
     Raises:
-        ConfigError: The folder is in use, or TensorBoard's files have no folder.
+        ConfigError: The folder is in use, its run is of another environment, or
+            TensorBoard's files have no folder.
         MissingExtra: QDax, matplotlib or tensorboardX is not installed.
     """
     require_extra("qdax", "qd")
@@ -172,6 +179,7 @@ def _folder(
         return None
     folder = RunFolder(out)
     folder.check(resume=resume)
+    folder.compare_environment(config.env_name)
     require_extra("matplotlib", "viz")
     if tensorboard:
         require_extra("tensorboardX", "tensorboard")

@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from newton_qd import checks
 from newton_qd.checks import Fact, message
 from newton_qd.files import temporary_name, write_atomically
 from newton_qd.qd.config import (
@@ -75,7 +76,12 @@ class RunFolder:
 
         Args:
             path: Folder. It does not have to exist yet.
+
+        Raises:
+            ConfigError: ``path`` is no path.
         """
+        kinds = (str, os.PathLike)
+        checks.instance("out", path, kinds, "a folder", error=ConfigError)
         self.path = Path(path)
 
     @property
@@ -192,10 +198,25 @@ class RunFolder:
             if longer:
                 continue
             old = f"{old!r} or more" if name == "iterations" else repr(old)
-            allowed = f"{old}, as the run in {self.path} has; or start a new run in "
-            allowed += "another folder"
-            raise ConfigError(message(name, new, allowed))
+            raise self._other_run(name, old, new)
         return stored, facts
+
+    def compare_environment(self, env_name: str) -> None:
+        """Checks that the run here, if there is one, is of this environment.
+
+        All other settings depend on it, so their errors would mislead.
+
+        Raises:
+            ConfigError: It is of another environment.
+        """
+        if self.has_config:
+            stored, _ = read_config(self.path / CONFIG)
+            if stored.env_name != env_name:
+                raise self._other_run("env_name", repr(stored.env_name), env_name)
+
+    def _other_run(self, name: str, old: str, new: object) -> ConfigError:
+        allowed = f"{old}, as the run in {self.path} has; or start a new run in "
+        return ConfigError(message(name, new, f"{allowed}another folder"))
 
     def restore(
         self, config: EvolveConfig, facts: dict[str, object]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import sys
+import textwrap
 import time
 from typing import TextIO
 
@@ -12,6 +13,25 @@ _REDRAW_SECONDS = 0.1
 _BAR_WIDTH = 20
 _LONG_SECONDS = 60.0  # a run whose time is worth an estimate of its own
 _COMPILING_UPDATES = 2  # first updates compile, so their time is not typical
+
+
+def for_stream(text: str, stream: TextIO) -> str:
+    """Returns text with line breaks between words, if a terminal would break words.
+
+    Other streams get the text as it is, so that scripts find whole sentences.
+
+    Args:
+        text: One or more lines.
+        stream: Where the text will be written.
+    """
+    if not stream.isatty():
+        return text
+    columns = shutil.get_terminal_size().columns
+    lines = (
+        textwrap.fill(line, columns, break_long_words=False, break_on_hyphens=False)
+        for line in text.split("\n")
+    )
+    return "\n".join(lines)
 
 
 class Progress:
@@ -53,7 +73,7 @@ class Progress:
         if not self._enabled:
             return
         self.close()
-        self._write(text + "\n")
+        self._write(for_stream(text, self._stream) + "\n")
 
     def update(self, iteration: int, row: dict[str, float]) -> None:
         """Shows the state after a generation.
