@@ -87,6 +87,25 @@ def test_wrong_cells_are_named(found: Run) -> None:
             found.nearest(descriptor)
     with pytest.raises(ValueError, match="count: got 0"):
         found.best(0)
+    with pytest.raises(ValueError, match="descriptor: got 'a'; allowed: 2 finite num"):
+        found.nearest("a")  # type: ignore[arg-type]
+    for cell in ("a", "ab", ("a", "b"), 1.5, None):
+        with pytest.raises(IndexError, match=r"^cell: got .*; allowed: "):
+            found.elite(cell)  # type: ignore[arg-type]
+    with pytest.raises(IndexError, match=r"^cell: got 1\.5"):
+        found.evaluate(np.array([1.5]))
+    with pytest.raises(LookupError, match=r"^cell: got \[\], which names none"):
+        found.evaluate([])
+    with pytest.raises(TypeError, match=r"^keys: got 3; allowed: one key, .*an array"):
+        found.evaluate(int(found.cells[0]), 3)  # type: ignore[arg-type]
+    alone = dataclasses.replace(found.task, labels=("height",))
+    with pytest.raises(ValueError, match=r"allowed: 1 finite number: height$"):
+        dataclasses.replace(found, task=alone).nearest([0.1, 0.2])
+    for load in (load_run, load_archive):
+        with pytest.raises(
+            TypeError, match=r"^folder: got None; allowed: a results fo"
+        ):
+            load(None)  # type: ignore[arg-type]
 
 
 def test_an_evaluation_repeats_the_archive_bitwise(found: Run) -> None:
@@ -177,6 +196,10 @@ def test_eval_says_that_the_bits_are_the_same(
     assert call("eval", reference, "--near", "0.1,0.9", "--starts", 4) == cli.OK
     printed = capsys.readouterr().out
     assert "deviation" in printed and "medians over 4 start states" in printed
+    assert "their median" not in printed  # of a single elite
+    for best, over in ((["--best", 3], "these 3 elites"), ([], "all elites")):
+        assert call("eval", reference, *best, "--starts", 4) == cli.OK
+        assert f"their median over {over} is" in capsys.readouterr().out
     out = tmp_path / "run"
     shutil.copytree(reference, out)
     text = (out / "config.json").read_text()
@@ -193,6 +216,7 @@ def test_eval_says_that_the_bits_are_the_same(
         (("--near", "1,2,3"), "2 finite numbers: left, right"),
         (("--best", "0"), "--best: got 0"),
         (("--starts", "-1"), "--starts: got -1"),
+        (("--seed", "3"), "--seed: got 3, which has no effect without --starts"),
     ],
 )
 def test_eval_refuses(
@@ -223,6 +247,8 @@ def test_plot_writes_both_pictures(
 
 
 def test_curves_have_all_values() -> None:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
     rows = np.arange(5.0)
     names = ("evaluations", "qd_score", "coverage", "max_fitness")
     again = Reevaluated(reevaluations=8, qd_score=3.0, coverage=2.0, max_fitness=1.0)
@@ -235,6 +261,14 @@ def test_curves_have_all_values() -> None:
         line, mark = axes.lines
         assert np.array_equal(line.get_ydata(), rows)
         assert np.array_equal(mark.get_xydata(), [[4.0, last]])
+    (legend,) = figure.legends  # not on a curve
+    FigureCanvasAgg(figure).draw()
+    top = legend.get_window_extent().y1
+    assert all(axes.get_tightbbox().y0 >= top for axes in figure.axes)
+    assert [text.get_text() for text in legend.get_texts()] == [
+        "archive",
+        "elites evaluated again, medians of 8",
+    ]
 
 
 def test_cells_of_a_tessellation_fill_the_box() -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from newton_qd import checks
+from newton_qd.checks import message
 from newton_qd.cli import modules
 from newton_qd.cli.arguments import (
     BAD_ARGUMENTS,
@@ -17,6 +18,7 @@ from newton_qd.cli.arguments import (
     Commands,
     add_elite_choice,
     complain,
+    say,
     warn_of_changes,
 )
 from newton_qd.files import write_atomically
@@ -50,7 +52,7 @@ def add_parsers(commands: Commands) -> None:
         help="evaluate from N other start states (default: only from that of the run)",
     )
     parser.add_argument(
-        "--seed", type=int, default=0, metavar="N", help="seed of --starts (default: 0)"
+        "--seed", type=int, metavar="N", help="seed of --starts (default: 0)"
     )
     modules.add_argument(parser)
     parser.set_defaults(run=evaluate)
@@ -91,8 +93,7 @@ def evaluate(arguments: argparse.Namespace, task_factory: TaskFactory = None) ->
     Raises:
         ConfigError: An argument is not allowed.
     """
-    checks.integer("--starts", arguments.starts, least=0, error=ConfigError)
-    checks.integer("--seed", arguments.seed, least=0, error=ConfigError)
+    seed = checked_starts(arguments)
     if arguments.best is not None:
         checks.integer("--best", arguments.best, error=ConfigError)
     run = opened(arguments.folder, task_factory)
@@ -107,10 +108,26 @@ def evaluate(arguments: argparse.Namespace, task_factory: TaskFactory = None) ->
     if arguments.starts:
         import jax
 
-        keys = jax.random.split(jax.random.key(arguments.seed), arguments.starts)
-        _print_starts(elites, run.evaluate(cells, keys))
+        keys = jax.random.split(jax.random.key(seed), arguments.starts)
+        _print_starts(elites, run.evaluate(cells, keys), whole)
         return OK
     return _print_repeated(run, elites, run.evaluate(cells), whole)
+
+
+def checked_starts(arguments: argparse.Namespace) -> int:
+    """Returns the seed of ``--starts``.
+
+    Raises:
+        ConfigError: An argument is not allowed, or has no effect.
+    """
+    checks.integer("--starts", arguments.starts, least=0, error=ConfigError)
+    if arguments.seed is None:
+        return 0
+    checks.integer("--seed", arguments.seed, least=0, error=ConfigError)
+    if not arguments.starts:
+        why = "which has no effect without --starts"
+        raise ConfigError(message("--seed", arguments.seed, "with --starts", why=why))
+    return arguments.seed
 
 
 def _chosen(run: Run, arguments: argparse.Namespace) -> list[Elite]:
@@ -149,23 +166,27 @@ def _print_repeated(
         print(f"... and {len(shown) - _MOST_SHOWN} more")
     count = "1 elite" if len(elites) == 1 else f"{len(elites)} elites"
     if run.config.new_starts and not same.all():
-        print(
+        say(
             f"{count} of {run.path}: each generation had start states of its own, so "
             f"{len(same) - same.sum()} have other results"
         )
         return OK
     if same.all():
-        print(f"{count} of {run.path}: fitness and descriptor are bitwise the same")
+        say(f"{count} of {run.path}: fitness and descriptor are bitwise the same")
         return OK
-    print(f"{count} of {run.path}: {len(same) - same.sum()} have other results")
+    say(f"{count} of {run.path}: {len(same) - same.sum()} have other results")
     return FAILED
 
 
-def _print_starts(elites: Sequence[Elite], found: Evaluation) -> None:
-    """Prints results from several start states."""
+def _print_starts(elites: Sequence[Elite], found: Evaluation, whole: bool) -> None:
+    """Prints results from several start states, of chosen elites or the whole run."""
     import numpy as np
 
-    median, spread = np.median(found.fitnesses, axis=1), found.fitnesses.std(axis=1)
+    median = np.median(found.fitnesses, axis=1)
+    # after a fault, a fitness is -inf, from which no finite deviation exists
+    spread = [
+        row.std() if np.isfinite(row).all() else np.inf for row in found.fitnesses
+    ]
     middle = np.median(found.descriptors, axis=1)
     rows = [
         (
@@ -184,10 +205,12 @@ def _print_starts(elites: Sequence[Elite], found: Evaluation) -> None:
     if len(elites) > _MOST_SHOWN:
         print(f"... and {len(elites) - _MOST_SHOWN} more")
     starts, lost = found.fitnesses.shape[1], _lost(elites, median)
-    print(
-        f"again: medians over {starts} start states; their median over all elites is "
-        f"{np.median(median):.6g}, {lost:.0%} lost more than a tenth of their fitness"
-    )
+    over = "all elites" if whole else f"these {len(elites)} elites"
+    text = f"again: medians over {starts} start state{'s' if starts > 1 else ''}"
+    if len(elites) > 1:
+        text += f"; their median over {over} is {np.median(median):.6g}, {lost:.0%} "
+        text += "lost more than a tenth of their fitness"
+    say(text)
 
 
 def _lost(elites: Sequence[Elite], medians: Any) -> float:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from newton_qd import checks
 from newton_qd.checks import Fact, message
 from newton_qd.qd.run.checkpoint import DAMAGE, npz_bytes, read_npz
 
@@ -58,7 +59,9 @@ def load_archive(folder: str | os.PathLike[str]) -> Archive:
     Raises:
         ArchiveError: The file is damaged, or was written by a later version.
         FileNotFoundError: The file does not exist.
+        TypeError: ``folder`` is no path.
     """
+    checks.instance("folder", folder, (str, os.PathLike), "a results folder of evolve")
     path = Path(folder) / ARCHIVE
     try:
         content = path.read_bytes()

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import functools
-import json
 import os
-import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,21 +15,18 @@ import numpy as np
 
 from newton_qd import checks
 from newton_qd.checks import Fact, message
+from newton_qd.envs.inputs import require_key
 from newton_qd.qd.algorithms import ALGORITHMS, algorithm_named
 from newton_qd.qd.config import ConfigError, EvolveConfig, read_config
 from newton_qd.qd.extras import require_extra
-from newton_qd.qd.run.archive import ARCHIVE, Archive, load_archive
-from newton_qd.qd.run.checkpoint import CheckpointError, load_checkpoint
+from newton_qd.qd.run.archive import Archive
 from newton_qd.qd.run.folder import (
-    CHECKPOINT,
-    COLUMNS,
     CONFIG,
-    METRICS,
     REEVALUATED,
-    complete_metrics,
 )
 from newton_qd.qd.run.plot import grid_indices
 from newton_qd.qd.run.reevaluation import Reevaluated
+from newton_qd.qd.run.results import read_reevaluated, read_results
 from newton_qd.qd.run.search import start_key
 from newton_qd.qd.scoring.robust import robust_scoring, run_scoring
 from newton_qd.qd.scoring.rollout import (
@@ -182,10 +176,14 @@ class Run:
                 is not an integer from 1.
         """
         checks.integer("count", count)
-        wanted = np.asarray(descriptor, np.float64)
         length = self.task.descriptor_length
+        try:
+            wanted = np.asarray(descriptor, np.float64)
+        except (TypeError, ValueError):
+            wanted = np.full(length, np.nan)
         if wanted.shape != (length,) or not np.all(np.isfinite(wanted)):
-            allowed = f"{length} finite numbers: {', '.join(self.task.labels)}"
+            numbers = "1 finite number" if length == 1 else f"{length} finite numbers"
+            allowed = f"{numbers}: {', '.join(self.task.labels)}"
             raise ValueError(message("descriptor", descriptor, allowed))
         low, high = self.task.limits
         cells = self.cells
@@ -209,11 +207,17 @@ class Run:
 
         Raises:
             IndexError: A cell does not exist.
-            LookupError: A cell is empty.
+            LookupError: A cell is empty, or there is none.
+            TypeError: ``keys`` are no keys.
         """
+        if keys is not None:
+            require_key("keys", keys, several=True)
         alone = cell is not None and np.ndim(cell) == 0
         rows = self.cells if cell is None else np.atleast_1d(np.asarray(cell))
-        genotypes = np.stack([self.elite(int(row)).genotype for row in rows])
+        if not len(rows):
+            allowed = "at least one; without cell, an archive with elites"
+            raise LookupError(message("cell", cell, allowed, why="which names none"))
+        genotypes = np.stack([self.elite(row).genotype for row in rows.tolist()])
         if keys is None:
             fitnesses, found = self._chunks(self._score, genotypes)
         else:
@@ -249,9 +253,9 @@ class Run:
             IndexError: The cell does not exist.
         """
         count, grid = len(self.archive.centroids), self.config.grid
-        if isinstance(cell, Sequence) and grid is not None:
+        if isinstance(cell, Sequence) and grid is not None and cell != str(cell):
             table = grid_indices(self.archive.centroids, grid, self.task.limits)
-            if len(cell) == len(grid):
+            if len(cell) == len(grid) and all(map(checks.is_integer, cell)):
                 rows = np.flatnonzero((table == np.asarray(cell)).all(axis=1))
                 if len(rows) == 1:
                     return int(rows[0])
@@ -349,8 +353,10 @@ def load_run(
         CheckpointError: The checkpoint is damaged, and there is no ``archive.npz``.
         FileNotFoundError: The run was stopped before its first checkpoint.
         MissingExtra: QDax is not installed.
+        TypeError: ``folder`` is no path.
         UnknownEnvironment: The environment of the run is not registered.
     """
+    checks.instance("folder", folder, (str, os.PathLike), "a results folder of evolve")
     require_extra("qdax", "qd")
     path = Path(folder)
     config, facts = read_config(path / CONFIG)
@@ -372,67 +378,6 @@ def load_run(
         policy=policy,
         archive=archive,
         metrics=metrics,
-        reevaluated=_reevaluated(path / REEVALUATED),
+        reevaluated=read_reevaluated(path / REEVALUATED),
         start_key=start_key(config.seed),
     )
-
-
-def read_results(
-    folder: str | os.PathLike[str],
-) -> tuple[Archive, dict[str, np.ndarray]]:
-    """Returns archive and metrics of a results folder, from the newest files.
-
-    Raises:
-        ArchiveError: ``archive.npz`` is damaged, and there is no checkpoint.
-        CheckpointError: The checkpoint is damaged, and there is no ``archive.npz``.
-        FileNotFoundError: The run was stopped before its first checkpoint.
-    """
-    path = Path(folder)
-    checkpoint = path / CHECKPOINT
-    if checkpoint.is_file():  # never older than the archive
-        try:
-            state = load_checkpoint(checkpoint)
-        except CheckpointError as error:
-            if not (path / ARCHIVE).is_file():
-                raise
-            text = f"{error}; its archive and metrics are read from {ARCHIVE} instead"
-            warnings.warn(text, stacklevel=3)
-        else:
-            arrays = [getattr(state, f.name) for f in dataclasses.fields(Archive)]
-            columns = complete_metrics(np.asarray(state.metrics)).T
-            return Archive(*arrays), dict(zip(COLUMNS, columns, strict=True))
-    return load_archive(path), _metrics(path / METRICS)
-
-
-def _metrics(path: Path) -> dict[str, np.ndarray]:
-    """Reads ``metrics.csv``.
-
-    Raises:
-        ConfigError: It has other columns, or values that are not numbers.
-    """
-    with path.open(encoding="utf-8", newline="") as file:
-        head, *rows = list(csv.reader(file)) or [[]]
-    try:
-        table = np.asarray([[float(x) for x in row] for row in rows])
-        if tuple(head) == COLUMNS[: len(head)] and table.shape[1:] == (len(head),):
-            return dict(zip(COLUMNS, complete_metrics(table).T, strict=True))
-    except ValueError:
-        pass
-    allowed = f"numbers with the columns {', '.join(COLUMNS)}"
-    raise ConfigError(message(str(path), Fact("other content"), allowed))
-
-
-def _reevaluated(path: Path) -> Reevaluated | None:
-    """Reads ``corrected.json``, if there is one.
-
-    Raises:
-        ConfigError: It has other content.
-    """
-    if not path.is_file():
-        return None
-    try:
-        return Reevaluated(**json.loads(path.read_text(encoding="utf-8")))
-    except (TypeError, ValueError) as error:
-        names = ", ".join(f.name for f in dataclasses.fields(Reevaluated))
-        given = Fact("other content")
-        raise ConfigError(message(str(path), given, f"an object of {names}")) from error

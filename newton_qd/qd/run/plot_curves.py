@@ -47,15 +47,14 @@ def curves_figure(
         axes.plot(evaluations, metrics[name], marker=alone, label="archive")
         if reevaluated is not None:
             times = reevaluated.reevaluations
+            median = f", medians of {times}" if times > 1 else ""
             axes.plot(
                 evaluations[-1:],
                 [getattr(reevaluated, name)],
                 "o",
                 clip_on=False,
-                label=f"elites evaluated {times} times again",
+                label=f"elites evaluated again{median}",
             )
-            if name == "qd_score":
-                axes.legend(loc="lower right")
         axes.set_xlabel("evaluations")
         axes.set_ylabel(label)
         axes.set_xlim(left=0.0)
@@ -65,4 +64,8 @@ def curves_figure(
             axes.yaxis.set_major_formatter(EngFormatter(sep=""))
         if name == "coverage":
             axes.set_ylim(bottom=0.0)
+    if reevaluated is not None:
+        # below the panels: inside, it would hide a part of the curves
+        shown = figure.axes[0].get_legend_handles_labels()
+        figure.legend(*shown, loc="outside lower center", ncols=2, frameon=False)
     return figure

@@ -15,7 +15,7 @@ from newton_qd.checks import Fact, message
 from newton_qd.qd.config import ConfigError
 from newton_qd.qd.run.archive import ARCHIVE
 from newton_qd.qd.run.folder import CHECKPOINT
-from newton_qd.qd.run.opened import read_results
+from newton_qd.qd.run.results import read_results
 from newton_qd.qd.scoring.rollout import Policy
 from newton_qd.types import PyTree
 

@@ -1,0 +1,85 @@
+"""The files of a results folder, read: archive, metrics, re-evaluated elites."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import os
+import warnings
+from pathlib import Path
+
+import numpy as np
+
+from newton_qd.checks import Fact, message
+from newton_qd.qd.config import ConfigError
+from newton_qd.qd.run.archive import ARCHIVE, Archive, load_archive
+from newton_qd.qd.run.checkpoint import CheckpointError, load_checkpoint
+from newton_qd.qd.run.folder import (
+    CHECKPOINT,
+    COLUMNS,
+    METRICS,
+    complete_metrics,
+)
+from newton_qd.qd.run.reevaluation import Reevaluated
+
+
+def read_results(
+    folder: str | os.PathLike[str],
+) -> tuple[Archive, dict[str, np.ndarray]]:
+    """Returns archive and metrics of a results folder, from the newest files.
+
+    Raises:
+        ArchiveError: ``archive.npz`` is damaged, and there is no checkpoint.
+        CheckpointError: The checkpoint is damaged, and there is no ``archive.npz``.
+        FileNotFoundError: The run was stopped before its first checkpoint.
+    """
+    path = Path(folder)
+    checkpoint = path / CHECKPOINT
+    if checkpoint.is_file():  # never older than the archive
+        try:
+            state = load_checkpoint(checkpoint)
+        except CheckpointError as error:
+            if not (path / ARCHIVE).is_file():
+                raise
+            text = f"{error}; its archive and metrics are read from {ARCHIVE} instead"
+            warnings.warn(text, stacklevel=3)
+        else:
+            arrays = [getattr(state, f.name) for f in dataclasses.fields(Archive)]
+            columns = complete_metrics(np.asarray(state.metrics)).T
+            return Archive(*arrays), dict(zip(COLUMNS, columns, strict=True))
+    return load_archive(path), _metrics(path / METRICS)
+
+
+def _metrics(path: Path) -> dict[str, np.ndarray]:
+    """Reads ``metrics.csv``.
+
+    Raises:
+        ConfigError: It has other columns, or values that are not numbers.
+    """
+    with path.open(encoding="utf-8", newline="") as file:
+        head, *rows = list(csv.reader(file)) or [[]]
+    try:
+        table = np.asarray([[float(x) for x in row] for row in rows])
+        if tuple(head) == COLUMNS[: len(head)] and table.shape[1:] == (len(head),):
+            return dict(zip(COLUMNS, complete_metrics(table).T, strict=True))
+    except ValueError:
+        pass
+    allowed = f"numbers with the columns {', '.join(COLUMNS)}"
+    raise ConfigError(message(str(path), Fact("other content"), allowed))
+
+
+def read_reevaluated(path: Path) -> Reevaluated | None:
+    """Reads ``corrected.json``, if there is one.
+
+    Raises:
+        ConfigError: It has other content.
+    """
+    if not path.is_file():
+        return None
+    try:
+        return Reevaluated(**json.loads(path.read_text(encoding="utf-8")))
+    except (TypeError, ValueError) as error:
+        names = ", ".join(f.name for f in dataclasses.fields(Reevaluated))
+        given = Fact("other content")
+        raise ConfigError(message(str(path), given, f"an object of {names}")) from error
