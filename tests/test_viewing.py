@@ -20,9 +20,18 @@ from newton_qd import cli
 from newton_qd.assets import find_urdf
 from newton_qd.physics.model import build_system
 from newton_qd.physics.reference import body_frames as reference_frames
+from newton_qd.qd import load_run
 from newton_qd.robots import ROBOTS
 from newton_qd.scenes import SCENES
-from newton_qd.viewing import drawing_of, html, joined, record, render, replay_html
+from newton_qd.viewing import (
+    drawing_of,
+    html,
+    joined,
+    record,
+    record_elites,
+    render,
+    replay_html,
+)
 from newton_qd.viewing.drawing import body_frames, drawing_of_system
 from newton_qd.viewing.trajectory import Trajectory
 
@@ -199,6 +208,9 @@ def test_an_environment_that_cannot_be_drawn(
 def test_wrong_arguments_of_replay(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["replay", "antt"]) == 2
     assert "does not exist" in capsys.readouterr().err
+    assert cli.main(["replay", "antt", "--cell", "3"]) == 2
+    error = capsys.readouterr().err
+    assert "DIR|ENV: got 'antt', which does not exist; allowed: a results f" in error
     assert cli.main(["replay", "ant", "--cell", "3"]) == 2
     assert "--cell: got 3; allowed: a results folder" in capsys.readouterr().err
     assert cli.main(["replay", "ant", "--best", "0"]) == 2
@@ -213,6 +225,40 @@ def test_frames_of_bodies_are_those_of_the_reference() -> None:
         q = system.rest_q + rng.uniform(-1, 1, (2, 3, system.nq))
         found = body_frames(drawing, q)
         assert np.allclose(found[1, 2], reference_frames(system, q[1, 2]))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--gif", "--time", "1"], "--time: got 1.0, which has no effect on ant.gif;"),
+        (["--png", "--rate", "5"], "--rate: got 5.0, which has no effect on ant.png;"),
+    ],
+)
+def test_render_refuses_what_it_would_ignore(
+    capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    assert cli.main(["render", "ant", *arguments]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_moments_beyond_the_end_are_refused(walk: Trajectory, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"time: got 99; allowed: numbers .* to 0\.25"):
+        render(walk, tmp_path / "late.png", time=99)
+    with pytest.raises(ValueError, match=r"time: got 0\.1, and a \.gif file shows all"):
+        render(walk, tmp_path / "walk.gif", time=0.1)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_an_episode_has_its_length(
+    reference: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    drawn = load_run(reference, task_factory=point_task)
+    with pytest.raises(ValueError, match=r"steps: got 10; allowed: None, or .* 1 to 9"):
+        record_elites(drawn, drawn.cells[:1], steps=10)
+    arguments = ["replay", str(reference), "--seed", "1"]
+    assert cli.main(arguments, task_factory=point_task) == 2
+    assert "--seed: got 1, and elites begin where their run" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from newton_qd import checks
-from newton_qd.checks import Fact, message
+from newton_qd.checks import Fact, listed, message
 from newton_qd.cli import modules
 from newton_qd.cli.arguments import (
     BAD_ARGUMENTS,
@@ -19,7 +19,7 @@ from newton_qd.cli.arguments import (
     integers,
 )
 from newton_qd.cli.progress import Progress
-from newton_qd.cli.runs import opened
+from newton_qd.cli.runs import checked_starts, opened
 from newton_qd.qd.config import ConfigError, EvolveConfig
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ def _add_explore(commands: Commands) -> None:
         help="also evaluate each elite from N other start states (default: 0)",
     )
     parser.add_argument(
-        "--seed", type=int, default=0, metavar="N", help="seed of --starts (default: 0)"
+        "--seed", type=int, metavar="N", help="seed of --starts (default: 0)"
     )
     parser.set_defaults(run=explore)
 
@@ -124,14 +124,13 @@ def _add_render(commands: Commands) -> None:
         help="size of the picture of one world [px] (default: 480x360)",
     )
     parser.add_argument(
-        "--time", type=float, metavar="S", help="moment of a picture [s]"
+        "--time", type=float, metavar="S", help="moment of a picture with --png [s]"
     )
     parser.add_argument(
         "--rate",
         type=float,
-        default=20.0,
         metavar="N",
-        help="pictures per second (default: 20)",
+        help="pictures per second of a GIF or video (default: 20)",
     )
     parser.set_defaults(run=render)
 
@@ -167,7 +166,6 @@ def _add_choice(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--seed",
         type=int,
-        default=0,
         metavar="N",
         help="seed of an environment's start and actions (default: 0)",
     )
@@ -180,8 +178,8 @@ def replay(arguments: argparse.Namespace, task_factory: TaskFactory = None) -> i
     """Writes a replay page. Returns the exit code.
 
     Raises:
-        ConfigError: An argument is not allowed, or the archive cannot be read.
-        UnknownEnvironment: There is neither a folder nor an environment of this name.
+        ConfigError: An argument is not allowed, the archive cannot be read, or there
+            is neither a folder nor an environment of this name.
     """
     out = _target(arguments, "replay.html", ".html")
     from newton_qd.viewing import write_replay
@@ -202,8 +200,7 @@ def explore(arguments: argparse.Namespace, task_factory: TaskFactory = None) -> 
     Raises:
         ConfigError: An argument is not allowed, or an archive cannot be read.
     """
-    checks.integer("--starts", arguments.starts, least=0, error=ConfigError)
-    checks.integer("--seed", arguments.seed, least=0, error=ConfigError)
+    seed = checked_starts(arguments)
     if len(arguments.folders) > 2:
         given = Fact(f"{len(arguments.folders)} folders")
         raise ConfigError(message("DIR", given, "one folder or two"))
@@ -214,7 +211,7 @@ def explore(arguments: argparse.Namespace, task_factory: TaskFactory = None) -> 
     runs = [_drawable(folder, task_factory) for folder in arguments.folders]
     from newton_qd.viewing import write_explorer
 
-    options = {"starts": arguments.starts, "seed": arguments.seed}
+    options = {"starts": arguments.starts, "seed": seed}
     try:
         with Progress("elites") as progress:
             write_explorer(runs, out, progress=progress, **options)
@@ -228,12 +225,12 @@ def render(arguments: argparse.Namespace, task_factory: TaskFactory = None) -> i
     """Writes a picture, a GIF or a video. Returns the exit code.
 
     Raises:
-        ConfigError: An argument is not allowed, or the archive cannot be read.
+        ConfigError: An argument is not allowed, the archive cannot be read, or there
+            is neither a folder nor an environment of this name.
         MissingExtra: Pillow or imageio-ffmpeg is not installed.
-        UnknownEnvironment: There is neither a folder nor an environment of this name.
     """
     checks.number("--time", arguments.time, least=0, optional=True, error=ConfigError)
-    checks.number("--rate", arguments.rate, above=0, error=ConfigError)
+    checks.number("--rate", arguments.rate, above=0, optional=True, error=ConfigError)
     chosen = [kind for kind in ("png", "gif", "mp4") if getattr(arguments, kind)]
     ending = f".{chosen[0]}" if chosen else ".gif"
     out = _target(arguments, f"elites{ending}", ending)
@@ -243,15 +240,20 @@ def render(arguments: argparse.Namespace, task_factory: TaskFactory = None) -> i
     if out.suffix not in FORMATS or (chosen and out.suffix != ending):
         allowed = f"files that end with {ending if chosen else ', '.join(FORMATS)}"
         raise ConfigError(message("--out", str(out), allowed))
+    unused = "rate" if out.suffix == ".png" else "time"
+    if getattr(arguments, unused) is not None:
+        allowed = "with --png" if unused == "time" else "with --gif or --mp4"
+        given, why = getattr(arguments, unused), f"which has no effect on {out.name}"
+        raise ConfigError(message(f"--{unused}", given, allowed, why=why))
     require(out.suffix)  # before the slow part
+    width, height = arguments.size
+    options = {"width": width, "height": height, "rate": arguments.rate or 20.0}
     try:
         trajectory, _ = _trajectory(arguments, task_factory)
+        with Progress("pictures") as progress:
+            write(trajectory, out, time=arguments.time, progress=progress, **options)
     except (LookupError, ValueError) as error:
         return complain(arguments, error, BAD_ARGUMENTS)
-    width, height = arguments.size
-    options = {"width": width, "height": height, "rate": arguments.rate}
-    with Progress("pictures") as progress:
-        write(trajectory, out, time=arguments.time, progress=progress, **options)
     print(f"written: {out}")
     return OK
 
@@ -290,14 +292,19 @@ def _trajectory(
     """Records what the arguments choose; returns it with a title.
 
     Raises:
-        ConfigError: A number is not allowed, or the environment cannot be drawn.
-        UnknownEnvironment: There is neither a folder nor an environment of this name.
+        ConfigError: A number is not allowed, there is neither a folder nor an
+            environment of this name, or the environment cannot be drawn.
     """
+    seed = arguments.seed
     checks.integer("--steps", arguments.steps, optional=True, error=ConfigError)
-    checks.integer("--seed", arguments.seed, least=0, error=ConfigError)
+    checks.integer("--seed", seed, least=0, optional=True, error=ConfigError)
     checks.integer(
         "--best", arguments.best, most=_MOST_WORLDS, optional=True, error=ConfigError
     )
+    if Path(arguments.what).is_dir() and seed is not None:
+        allowed = "an environment in the place of the results folder"
+        why = "and elites begin where their run began"
+        raise ConfigError(message("--seed", seed, allowed, why=why))
     if not Path(arguments.what).is_dir():
         return _random_trajectory(arguments), f"{arguments.what}, random actions"
     from newton_qd.viewing import record_elites
@@ -350,23 +357,29 @@ def _random_trajectory(arguments: argparse.Namespace) -> Trajectory:
     """Records an environment with random actions.
 
     Raises:
-        ConfigError: An option needs a results folder.
-        UnknownEnvironment: No environment has this name.
+        ConfigError: An option needs a results folder, or there is neither a folder nor
+            an environment of this name.
     """
+    import newton_qd
+
+    if arguments.what not in newton_qd.registered_envs():
+        why = "is a file" if Path(arguments.what).exists() else "does not exist"
+        allowed = f"a results folder, or one of {listed(newton_qd.registered_envs())}"
+        refused = message("DIR|ENV", arguments.what, allowed, why=f"which {why}")
+        raise ConfigError(f"{refused}; --module NAME adds environments of yours")
     for name in ("cell", "near"):
         if getattr(arguments, name) is not None:
             allowed = "a results folder in the place of the environment"
             raise ConfigError(message(f"--{name}", getattr(arguments, name), allowed))
     import jax
 
-    import newton_qd
     from newton_qd.physics.precision import quiet
     from newton_qd.viewing import record
 
     quiet()
     steps, worlds = arguments.steps or _RANDOM_STEPS, arguments.best or 1
     env = newton_qd.create(arguments.what, episode_length=steps, auto_reset=False)
-    start, noise = jax.random.split(jax.random.key(arguments.seed))
+    start, noise = jax.random.split(jax.random.key(arguments.seed or 0))
     shape = (worlds, steps, env.action_size)
     actions = jax.random.uniform(noise, shape, env.dtype, -1, 1)
     return record(env, actions, start, contacts=arguments.contacts)

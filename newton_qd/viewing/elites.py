@@ -9,6 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from newton_qd import checks
+from newton_qd.checks import message
 from newton_qd.viewing.html import short
 from newton_qd.viewing.recording import Recorder
 from newton_qd.viewing.trajectory import Trajectory, joined
@@ -32,18 +34,23 @@ def record_elites(
     Args:
         run: The run, from ``newton_qd.qd.load_run(DIR)``.
         cells: (N,) rows of the archive, with at least one.
-        steps: Control steps; ``None``: the episode length of the run.
+        steps: Control steps, up to the episode length of the run; ``None``: all.
         contacts: Whether to record the impulse of every contact.
         progress: Called after each batch with the number of recorded elites and N.
 
     Raises:
         TypeError: The environment cannot be drawn.
-        ValueError: There are no cells.
+        ValueError: There are no cells, or ``steps`` is not allowed.
         IndexError: A cell does not exist.
         LookupError: A cell is empty.
     """
     elites = [run.elite(int(cell)) for cell in cells]
-    steps = run.config.episode_length if steps is None else steps
+    length = run.config.episode_length
+    checks.integer("steps", steps, optional=True)
+    if steps is not None and steps > length:
+        allowed = f"None, or integers from 1 to {length}, the length of an episode"
+        raise ValueError(message("steps", steps, f"{allowed} of the run"))
+    steps = length if steps is None else steps
     policy = run.policy
     record = Recorder(run.task.env, policy.apply, steps, contacts=contacts)
     unravel = jax.jit(jax.vmap(policy.unravel))

@@ -55,7 +55,8 @@ def render(
         path: A file that ends with ``.png``, ``.gif`` or ``.mp4``.
         width: Width of the picture of one world [px].
         height: Height of the picture of one world [px].
-        time: Moment of a picture [s]; ``None``: the middle.
+        time: Moment of a picture [s], up to the end of the longest episode; ``None``:
+            the middle. Only for ``.png``.
         rate: Pictures per second of a GIF or a video [1/s].
         zoom: Size of the robot in the picture; 1: as in the pages.
         progress: Called after each picture with its number from 1 and their count.
@@ -64,6 +65,7 @@ def render(
         The path of the file.
 
     Raises:
+        TypeError: A number has the wrong type.
         ValueError: The path has another ending, or a number is not allowed.
         MissingExtra: Pillow (for ``.png`` and ``.gif``) or imageio-ffmpeg (for
             ``.mp4``) is not installed.
@@ -74,9 +76,9 @@ def render(
     if ending not in FORMATS:
         raise ValueError(message("path", str(path), f"files with {listed(FORMATS)}"))
     checks.number("rate", rate, above=0)
-    checks.number("time", time, least=0, optional=True)
-    require(ending)
     last = int(trajectory.lengths.max())
+    _check_time(time, ending, last * trajectory.dt)
+    require(ending)
     if ending == ".png":
         middle = last // 2 if time is None else round(time / trajectory.dt)
         frames = np.array([min(middle, last)])
@@ -95,6 +97,24 @@ def render(
     finally:
         temporary.unlink(missing_ok=True)
     return target
+
+
+def _check_time(time: float | None, ending: str, end: float) -> None:
+    """Checks the moment of a picture.
+
+    Raises:
+        TypeError: It is not a number.
+        ValueError: It is not in the trajectory, or the file is no picture.
+    """
+    checks.number("time", time, least=0, optional=True)
+    if time is None:
+        return
+    if ending != ".png":
+        why = f"and a {ending} file shows all moments"
+        raise ValueError(message("time", time, "None, or a file .png", why=why))
+    if time > end * (1.0 + 1e-6):  # an end in decimal digits may be rounded up
+        allowed = f"numbers from 0 to {end:.6g}, the end of the longest episode [s]"
+        raise ValueError(message("time", time, allowed))
 
 
 def _write_images(
