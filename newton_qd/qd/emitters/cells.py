@@ -7,6 +7,8 @@ import jax.numpy as jnp
 
 from newton_qd.types import Repertoire
 
+_ROUNDINGS = 16
+
 
 def draw_cells(key: jax.Array, wanted: jax.Array, count: int) -> jax.Array:
     """Draws cells uniformly, with replacement.
@@ -22,6 +24,33 @@ def draw_cells(key: jax.Array, wanted: jax.Array, count: int) -> jax.Array:
     weights = (wanted | ~jnp.any(wanted)).astype(jnp.float32)
     probabilities = weights / jnp.sum(weights)
     return jax.random.choice(key, wanted.shape[0], (count,), p=probabilities)
+
+
+def accepted_cells(
+    repertoire: Repertoire, genotypes: jax.Array, descriptors: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Finds the individuals that a repertoire has accepted.
+
+    An individual was accepted if its cell contains it now. This is correct for every
+    rule of addition.
+
+    Args:
+        repertoire: Repertoire after the addition.
+        genotypes: (N, size) the individuals.
+        descriptors: (N, D) their descriptors.
+
+    Returns:
+        (N,) the cell of each individual, and (N,) whether the cell contains it.
+    """
+    from qdax.core.containers.mapelites_repertoire import get_cells_indices
+
+    cells = get_cells_indices(descriptors, repertoire.centroids)
+    elites = repertoire.genotypes[cells]
+    # XLA may compute a genotype twice, for the repertoire and for the emitter, with
+    # different rounding errors.
+    allowed = _ROUNDINGS * jnp.finfo(elites.dtype).eps
+    distance = jnp.max(jnp.abs(elites - genotypes), axis=-1)
+    return cells, distance <= allowed * jnp.max(jnp.abs(elites), axis=-1)
 
 
 def empty_targets(repertoire: Repertoire, key: jax.Array, count: int) -> jax.Array:

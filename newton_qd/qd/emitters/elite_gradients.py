@@ -11,12 +11,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from qdax.core.containers.mapelites_repertoire import get_cells_indices
 from qdax.core.emitters.emitter import Emitter, EmitterState
 from qdax.core.emitters.repertoire_selectors.selector import Selector
 
 from newton_qd import checks
 from newton_qd.checks import message
+from newton_qd.qd.emitters.cells import accepted_cells
 from newton_qd.qd.scoring.gradient_scores import Scores, read_scores
 from newton_qd.types import (
     ExtraScores,
@@ -25,8 +25,6 @@ from newton_qd.types import (
     Repertoire,
     ScoringFunction,
 )
-
-_ROUNDINGS = 16
 
 
 class EliteGradients(EmitterState):
@@ -48,20 +46,12 @@ class EliteGradients(EmitterState):
     def add(self, repertoire: Repertoire, scores: Scores) -> EliteGradients:
         """Stores the gradients of the individuals that the repertoire accepted.
 
-        An individual was accepted if its cell contains it now. This is correct for
-        every rule of addition.
-
         Args:
             repertoire: Repertoire after the addition.
             scores: The evaluated individuals.
         """
-        cells = get_cells_indices(scores.descriptors, repertoire.centroids)
-        elites, fitnesses = repertoire.genotypes[cells], repertoire.fitnesses[cells, 0]
-        # XLA may compute a genotype twice, for the repertoire and for this state, with
-        # different rounding errors.
-        allowed = _ROUNDINGS * jnp.finfo(elites.dtype).eps
-        distance = jnp.max(jnp.abs(elites - scores.genotypes), axis=-1)
-        held = distance <= allowed * jnp.max(jnp.abs(elites), axis=-1)
+        cells, held = accepted_cells(repertoire, scores.genotypes, scores.descriptors)
+        fitnesses = repertoire.fitnesses[cells, 0]
         target = jnp.where(held & scores.finite, cells, self.fitnesses.shape[0])
         return EliteGradients(
             gradients=self.gradients.at[target].set(scores.gradients, mode="drop"),
