@@ -48,6 +48,9 @@ OPTIONS: dict[str, dict[str, Any]] = {
         **{"actors": 2, "branches": 1, "copies": 4, "updates": 1, "lifetime": 3},
         **{"worlds": 2, "window": 4, "batches": 2, "critic": (8,)},
     },
+    "ascii-me": {"epochs": 2},
+    "ascii-me-exact": {"epochs": 2, "branches": 4, "window": 4},
+    "me-conditioned": {"worlds": 2, "window": 4, "batches": 2, "critic": (8,)},
     "omg-mega": {},
     "cma-mega": {"points": 2},
     "cma-maega": {"points": 2, "adam": 0.05},
@@ -81,7 +84,7 @@ def test_every_algorithm_is_tested() -> None:
 def test_defaults_of_an_environment_are_accepted(env_name: str) -> None:
     task = make_task(EvolveConfig(env_name=env_name))
     names = [spec.name for spec in ALGORITHMS if spec.gradients is not None]
-    assert len(names) == 5
+    assert len(names) == 7
     for name in names:
         config = EvolveConfig(
             env_name=env_name,
@@ -133,6 +136,8 @@ def test_a_stop_changes_nothing(
     # What is differentiated counts, too: two parents, two solution points, the
     # sixteen control steps of two actors.
     more = {"me-gradient": 2, "me-actor-critic": 1, "cma-mega": 2, "cma-maega": 2}
+    # two parents, each once for its actions and once for the gradient
+    more |= {"ascii-me-exact": 4, "me-conditioned": 1}
     each = 16 + {"me-es": 1, **more}.get(name, 0)
     np.testing.assert_array_equal(np.diff(metrics["evaluations"]), each)
     assert not metrics["rejected"].any()
@@ -203,6 +208,20 @@ def test_shares_of_a_batch_that_do_not_fit_are_refused() -> None:
             "steered: got 2.0; allowed: .* from 0 to 1",
         ),
         ("me-actor-critic", {}, r"copies: got \(.*, 8\); allowed: .*batch_size = 16"),
+        (
+            "me-conditioned",
+            {"copies": 0.9, "between": 0.9},
+            r"copies, between: got \(0.9, 0.9\); allowed: .* batch_size = 16",
+        ),
+        ("me-conditioned", {"tolerance": 0}, "tolerance: got 0.0; allowed: .*above 0"),
+        ("ascii-me", {"share": 0.01}, "share: got 0.01; allowed: at least 1 / batch"),
+        ("ascii-me", {"deviation": 0}, "deviation: got 0.0; allowed: .*above 0"),
+        (
+            "ascii-me-exact",
+            {"branches": 9},
+            "share: got .* holds a parent with branches = 9",
+        ),
+        ("ascii-me-exact", {"slowest": 1.0}, r"rates: got \(1.0, 0.01\); allowed"),
         ("me-actor-critic", {"fitness": float("nan")}, "fitness: got nan; allowed"),
         ("omg-mega", {"sigma_g": 0.0}, "sigma_g: got 0.0; allowed: .*above 0"),
         ("omg-mega", {"window": -1}, "window: got -1; allowed: integers from 0"),

@@ -13,12 +13,14 @@ from typing import Any
 
 from newton_qd import checks
 from newton_qd.checks import listed, message
+from newton_qd.qd.algorithms.ascii_me import ASCII_ME, ASCII_ME_EXACT
 from newton_qd.qd.algorithms.cma_maega import CMA_MAEGA
 from newton_qd.qd.algorithms.cma_me import CMA_ME
 from newton_qd.qd.algorithms.cma_mega import CMA_MEGA
 from newton_qd.qd.algorithms.dcrl_me import DCRL_ME
 from newton_qd.qd.algorithms.me import ME
 from newton_qd.qd.algorithms.me_actor_critic import ME_ACTOR_CRITIC
+from newton_qd.qd.algorithms.me_conditioned import ME_CONDITIONED
 from newton_qd.qd.algorithms.me_es import ME_ES
 from newton_qd.qd.algorithms.me_gradient import ME_GRADIENT
 from newton_qd.qd.algorithms.omg_mega import OMG_MEGA
@@ -41,8 +43,11 @@ ALGORITHMS: tuple[AlgorithmSpec[Any], ...] = (
     PGA_ME,
     DCRL_ME,
     ME_ES,
+    ASCII_ME,
     ME_GRADIENT,
+    ASCII_ME_EXACT,
     ME_ACTOR_CRITIC,
+    ME_CONDITIONED,
     OMG_MEGA,
     CMA_MEGA,
     CMA_MAEGA,

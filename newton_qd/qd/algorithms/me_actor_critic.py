@@ -59,7 +59,7 @@ def _make(context: EmitterContext, options: ActorCriticOptions) -> Any:
     task = differentiable(context.task, options)
     method = ActorCritic(
         task.env,
-        lambda weights, obs: policy.apply(policy.unravel(weights), obs),
+        policy.of_weights,
         measure_of(task),
         config.episode_length,
         options,

@@ -2,6 +2,9 @@
 
 - ``ActorCriticEmitter``: policies of actors that learn over short horizons with
   ``ActorCritic``
+- ``ConditionedActorEmitter``: policies of one such actor that is told the descriptor
+- ``AsciiEmitter``: parents move towards the better actions of other individuals
+- ``ExactAsciiEmitter``: the same with the gradient of the physics
 - ``OMGMEGAEmitter``: random steps along the gradients of elites
 - ``CMAMEGAEmitter``: CMA-ES searches for the steps along the gradients of a solution
   point
@@ -10,10 +13,11 @@
 - ``GradientVariationEmitter``: elites climb their fitness, or move along descriptors
 - ``SteeringEmitter``: elites move towards empty cells
 
-``ActorCriticEmitter`` and ``GradientLineEmitter`` evaluate gradients themselves. All
-others read ``extra_scores["gradients"]``, see ``scoring/gradient_scores.py``. All
-emitters work with ``jax.jit`` and ``jax.lax.scan``, and together with QDax's emitters
-in its ``MultiEmitter``.
+The emitters of actors, ``ExactAsciiEmitter`` and ``GradientLineEmitter`` evaluate
+gradients themselves. ``AsciiEmitter`` reads ``extra_scores["transitions"]``. All others
+read ``extra_scores["gradients"]``, see ``scoring/gradient_scores.py``. All emitters
+work with ``jax.jit`` and ``jax.lax.scan``, and together with QDax's emitters in its
+``MultiEmitter``.
 """
 
 from __future__ import annotations
@@ -27,8 +31,11 @@ if TYPE_CHECKING:
     from newton_qd.qd.emitters.actor_critic import ActorCriticEmitter
     from newton_qd.qd.emitters.actor_critic_learner import ActorCritic
     from newton_qd.qd.emitters.actor_critic_settings import ActorCriticSettings
+    from newton_qd.qd.emitters.ascii import AsciiEmitter, ExactAsciiEmitter
+    from newton_qd.qd.emitters.behaviors import Interpolation
     from newton_qd.qd.emitters.cma_maega import CMAMAEGAEmitter
     from newton_qd.qd.emitters.cma_mega import CMAMEGAEmitter
+    from newton_qd.qd.emitters.conditioned import ConditionedActorEmitter
     from newton_qd.qd.emitters.gradient_line import GradientLineEmitter
     from newton_qd.qd.emitters.gradient_variation import GradientVariationEmitter
     from newton_qd.qd.emitters.omg_mega import OMGMEGAEmitter
@@ -40,11 +47,15 @@ __all__ = [
     "ActorCritic",
     "ActorCriticEmitter",
     "ActorCriticSettings",
+    "AsciiEmitter",
     "CMAMAEGAEmitter",
     "CMAMEGAEmitter",
+    "ConditionedActorEmitter",
+    "ExactAsciiEmitter",
     "GradientLineEmitter",
     "GradientVariationEmitter",
     "GradientsError",
+    "Interpolation",
     "OMGMEGAEmitter",
     "RestartRule",
     "SteeringEmitter",
@@ -54,11 +65,15 @@ _HOME = {
     "ActorCritic": "newton_qd.qd.emitters.actor_critic_learner",
     "ActorCriticEmitter": "newton_qd.qd.emitters.actor_critic",
     "ActorCriticSettings": "newton_qd.qd.emitters.actor_critic_settings",
+    "AsciiEmitter": "newton_qd.qd.emitters.ascii",
     "CMAMAEGAEmitter": "newton_qd.qd.emitters.cma_maega",
     "CMAMEGAEmitter": "newton_qd.qd.emitters.cma_mega",
+    "ConditionedActorEmitter": "newton_qd.qd.emitters.conditioned",
+    "ExactAsciiEmitter": "newton_qd.qd.emitters.ascii",
     "GradientLineEmitter": "newton_qd.qd.emitters.gradient_line",
     "GradientVariationEmitter": "newton_qd.qd.emitters.gradient_variation",
     "GradientsError": "newton_qd.qd.scoring.gradient_scores",
+    "Interpolation": "newton_qd.qd.emitters.behaviors",
     "OMGMEGAEmitter": "newton_qd.qd.emitters.omg_mega",
     "RestartRule": "newton_qd.qd.emitters.restarts",
     "SteeringEmitter": "newton_qd.qd.emitters.steering",

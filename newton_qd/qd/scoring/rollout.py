@@ -48,6 +48,10 @@ class Policy:
     ravel: Callable[[PyTree], jax.Array]
     network: Any
 
+    def of_weights(self, weights: jax.Array, observation: Observation) -> jax.Array:
+        """Returns the action (A,) of a policy with weights (size,)."""
+        return self.apply(self.unravel(weights), observation)
+
     def weights(self, genotypes: Genotype) -> jax.Array:
         """Returns genotypes (N, size) as floating-point numbers.
 

@@ -1,0 +1,118 @@
+"""MAP-Elites with one actor that is told the target descriptor."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+from newton_qd import checks
+from newton_qd.checks import message
+from newton_qd.qd.algorithms.gradient_options import (
+    SHORT,
+    WINDOW,
+    DifferentiableOptions,
+    differentiable,
+    initial_scale,
+)
+from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext
+from newton_qd.qd.algorithms.variation import with_isoline
+from newton_qd.qd.config import ConfigError, EvolveConfig
+from newton_qd.qd.emitters.actor_critic_settings import ActorCriticSettings
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ConditionedOptions(DifferentiableOptions, ActorCriticSettings):
+    """Options of MAP-Elites with an actor that is told the target descriptor.
+
+    Attributes:
+        copies: Share of a generation that are copies of the actor for targets [-].
+        between: Share of a generation that lies between the actor and elites [-]; the
+            rest are iso+line variations.
+        updates: Updates of the actor in a generation.
+        empty: Share of the targets that are empty cells [-].
+        tolerance: Allowed distance to a target, in units of half of the descriptor's
+            extent [-].
+        dual_rate: Largest change of a multiplier's logit by one policy [-].
+        conditioned: Whether the actor is told its target; if not, it increases the
+            return alone.
+    """
+
+    worlds: int = 32
+    window: int = WINDOW
+    rate: float = 2e-3
+    copies: float = 0.125
+    between: float = 0.25
+    updates: int = 1
+    empty: float = 0.5
+    tolerance: float = 0.1
+    dual_rate: float = 0.3
+    conditioned: bool = True
+
+    def numbers(self, config: EvolveConfig) -> tuple[int, int]:
+        """Returns the numbers of copies, and of individuals between actor and elites.
+
+        Raises:
+            ConfigError: They are more than a generation, or none.
+        """
+        for name in ("copies", "between"):
+            value = getattr(self, name)
+            name = f"options: {name}"
+            checks.number(name, value, least=0, most=1, error=ConfigError)
+        found = tuple(int(x * config.batch_size) for x in (self.copies, self.between))
+        if not 1 <= sum(found) <= config.batch_size:
+            given = self.copies, self.between
+            allowed = f"from 1 to batch_size = {config.batch_size} individuals together"
+            raise ConfigError(message("options: copies, between", given, allowed))
+        return found[0], found[1]
+
+    def episodes(self, config: EvolveConfig) -> int:
+        """Returns the control steps of a generation's updates, counted in episodes."""
+        return -(-self.updates * self.worlds * self.window // config.episode_length)
+
+
+def _make(context: EmitterContext, options: ConditionedOptions) -> Any:
+    """MAP-Elites with the policies of an actor that is told the target descriptor."""
+    from newton_qd.qd.emitters import ActorCritic, ConditionedActorEmitter
+    from newton_qd.qd.emitters.aims import AimedEnv, ConditionedPolicy, no_measure
+
+    config = context.config
+    copies, between = options.numbers(config)
+    task = differentiable(context.task, options)
+    env = AimedEnv(task, config.episode_length)
+    policy = ConditionedPolicy(context.policy, task.descriptor_length)
+    emitter = ConditionedActorEmitter(
+        ActorCritic(env, policy.act, no_measure, config.episode_length, options),
+        env,
+        policy,
+        task.env.reset(context.reset_key),
+        copies=copies,
+        between=between,
+        updates=options.updates,
+        empty=options.empty,
+        tolerance=options.tolerance,
+        dual_rate=options.dual_rate,
+        conditioned=options.conditioned,
+    )
+    return with_isoline(emitter, config)
+
+
+def _gradients(config: EvolveConfig, options: ConditionedOptions) -> int:
+    return options.episodes(config)
+
+
+def _evaluations(config: EvolveConfig, options: ConditionedOptions) -> int:
+    return config.batch_size + options.episodes(config)
+
+
+ME_CONDITIONED = AlgorithmSpec(
+    name="me-conditioned",
+    summary="MAP-Elites with one actor for the whole archive that is told the target "
+    "descriptor; it learns over short windows from gradients of the physics, and a "
+    "part of the offspring are its policies for cells of the archive",
+    make=_make,
+    options=ConditionedOptions,
+    tuned={"halfcheetah_uni": SHORT},
+    evaluations=_evaluations,
+    gradients=_gradients,
+    initial_scale=initial_scale,
+)

@@ -1,0 +1,309 @@
+"""The ASCII operator, against its definition, on a point that is pushed about."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from qdax.core.containers.mapelites_repertoire import (
+    MapElitesRepertoire,
+    compute_euclidean_centroids,
+)
+
+from newton_qd.qd.emitters import AsciiEmitter, ExactAsciiEmitter, Interpolation
+from newton_qd.qd.emitters.ascii import improved
+from newton_qd.qd.emitters.behaviors import (
+    Behavior,
+    behavior_of,
+    interpolated,
+    preference,
+)
+
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
+
+# These programs run for milliseconds: they need no optimizer.
+compiled = functools.partial(
+    jax.jit, compiler_options={"xla_backend_optimization_level": 0}
+)
+SIZE, LENGTH, POLICIES = 6, 7, 4
+SETTINGS = Interpolation(epochs=3, deviation=0.5, clip=0.2, similarity=0.25)
+RATE, DISCOUNT = 0.05, 0.9
+
+
+def policy(weights: jax.Array, obs: jax.Array) -> jax.Array:
+    return jnp.tanh(obs @ weights.reshape(3, 2))
+
+
+def steps(seed: int = 0) -> dict[str, np.ndarray]:
+    """Transitions of four policies; one is over after 5 steps, one is broken."""
+    draw = np.random.default_rng(seed).normal
+    dones = np.zeros((POLICIES, 2 * LENGTH), np.float32)
+    dones[1, 4] = dones[1, 9] = 1
+    found = {
+        "obs": draw(size=(POLICIES, 2 * LENGTH, 3)).astype(np.float32),
+        "actions": np.tanh(draw(size=(POLICIES, 2 * LENGTH, 2))).astype(np.float32),
+        "rewards": draw(size=(POLICIES, 2 * LENGTH)).astype(np.float32),
+        "dones": dones,
+    }
+    found["obs"][3, 2] = np.nan
+    return found
+
+
+def seen(seed: int = 0) -> Behavior:
+    return compiled(lambda x: behavior_of(x, LENGTH, DISCOUNT))(steps(seed))
+
+
+def test_returns_are_sums_of_later_rewards() -> None:
+    found, given = seen(), steps()
+    for row, last in ((0, LENGTH), (1, 5), (2, LENGTH), (3, 0)):
+        expected = np.zeros(LENGTH)
+        for begin in range(last):
+            for step in range(begin, last):
+                gain = DISCOUNT ** (step - begin) * given["rewards"][row, step]
+                expected[begin] += gain
+        np.testing.assert_allclose(found.returns[row], expected, rtol=1e-4, atol=1e-6)
+        np.testing.assert_array_equal(found.counts[row], np.arange(LENGTH) < last)
+    np.testing.assert_array_equal(found.obs[0], given["obs"][0, :LENGTH])
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
+
+
+def row(found: Behavior, index: Any) -> Behavior:
+    return jax.tree.map(lambda leaf: leaf[index], found)
+
+
+def defined_preference(own: Behavior, other: Behavior) -> np.ndarray:
+    """The definition, step by step."""
+    found = np.zeros(LENGTH)
+    for step in range(LENGTH):
+        one, two = np.asarray(own.obs[step]), np.asarray(other.obs[step])
+        cosine = one @ two / np.linalg.norm(one) / np.linalg.norm(two)
+        cosine = max(cosine, 0.25) if own.counts[step] else 0.25
+        gain = float(other.returns[step]) - float(own.returns[step])
+        found[step] = cosine * gain * float(other.counts[step])
+    return found
+
+
+@pytest.mark.parametrize(("own", "other"), [(0, 2), (1, 0), (0, 1)])
+def test_preference_is_similarity_times_the_gain_in_return(
+    own: int, other: int
+) -> None:
+    pair = row(seen(), own), row(seen(), other)
+    found = preference(*pair, 0.25)
+    np.testing.assert_allclose(found, defined_preference(*pair), rtol=1e-4, atol=1e-6)
+    assert (np.asarray(found) != 0).any()
+
+
+def test_a_broken_behavior_moves_nobody() -> None:
+    np.testing.assert_array_equal(preference(row(seen(), 0), row(seen(), 3), 0.25), 0)
+
+
+def defined_offspring(
+    weights: np.ndarray, behavior: Behavior, preferred: np.ndarray
+) -> np.ndarray:
+    """The definition: Jacobian times change of behavior, and Adam by hand."""
+    theta = np.array(weights, np.float64)
+    obs, wanted = (np.asarray(x, np.float64) for x in (behavior.obs, behavior.actions))
+    first, second = np.zeros(SIZE), np.zeros(SIZE)
+    for epoch in range(1, SETTINGS.epochs + 1):
+        slope = np.zeros(SIZE)
+        for step in range(LENGTH):
+            action = np.tanh(obs[step] @ theta.reshape(3, 2))
+            missing = wanted[step] - action
+            ratio = np.exp(-missing @ missing / (2 * SETTINGS.deviation**2))
+            if preferred[step] < 0 and ratio < 1 - SETTINGS.clip:
+                continue  # far enough away
+            change = preferred[step] * ratio * missing / SETTINGS.deviation**2
+            jacobian = np.zeros((2, SIZE))
+            for output in range(2):
+                for entry in range(3):
+                    inner = (1 - action[output] ** 2) * obs[step, entry]
+                    jacobian[output, 2 * entry + output] = inner
+            slope += change @ jacobian / LENGTH
+        first = 0.9 * first + 0.1 * slope
+        second = 0.999 * second + 0.001 * slope**2
+        mean = first / (1 - 0.9**epoch)
+        theta += RATE * mean / (np.sqrt(second / (1 - 0.999**epoch)) + 1e-8)
+    return theta
+
+
+@functools.cache
+def vary() -> Any:
+    return compiled(
+        lambda weights, behavior, preferred: interpolated(
+            policy, weights, behavior, preferred, RATE, SETTINGS
+        )
+    )
+
+
+@pytest.mark.parametrize("scale", [0.0, 0.3, 2.0])
+def test_the_operator_is_that_of_its_definition(scale: float) -> None:
+    own, other = row(seen(), 0), row(seen(), 2)
+    preferred = defined_preference(own, other) - 1.0
+    assert (preferred > 0).any() and (preferred < 0).any()
+    weights = scale * np.random.default_rng(1).normal(size=SIZE)
+    found = vary()(jnp.float32(weights), other, jnp.float32(preferred))
+    expected = defined_offspring(weights, other, preferred)
+    assert np.abs(expected - weights).max() > RATE
+    np.testing.assert_allclose(found, expected, atol=2e-4)
+
+
+def test_no_preference_moves_no_weights() -> None:
+    weights = jnp.ones(SIZE)
+    found = vary()(weights, row(seen(), 2), jnp.zeros(LENGTH))
+    np.testing.assert_array_equal(found, weights)
+
+
+def told(seed: int = 0) -> tuple[Any, ...]:
+    """Genotypes, fitnesses, descriptors and extra scores of a generation."""
+    draw = np.random.default_rng(100 + seed).normal(size=(POLICIES, SIZE))
+    fitnesses = jnp.arange(4, dtype=jnp.float32) + 10 * seed
+    places = jnp.array([[0.1, 0.1], [0.9, 0.1], [0.1, 0.9], [0.9, 0.9]], jnp.float32)
+    return jnp.float32(draw), fitnesses, places, {"transitions": steps(seed)}
+
+
+def begun() -> tuple[AsciiEmitter, Any, Any]:
+    made = AsciiEmitter(
+        policy,
+        SETTINGS,
+        batch_size=5,
+        episode_length=LENGTH,
+        rate=RATE,
+        discount=DISCOUNT,
+    )
+    genotypes, fitnesses, places, _ = told()
+    cells = compute_euclidean_centroids((2, 2), [0.0, 0.0], [1.0, 1.0])
+    held = MapElitesRepertoire.init(genotypes, fitnesses, places, cells, {})
+    return made, held, made.init(jax.random.key(0), held, *told())
+
+
+@pytest.mark.slow
+def test_offspring_are_parents_varied_by_the_last_generation() -> None:
+    made, held, state = begun()
+    offspring, extra = compiled(made.emit)(held, state, jax.random.key(3))
+    assert offspring.shape == (made.batch_size, SIZE) and extra == {}
+    genotypes = told()[0]
+    found = seen()
+    pairs = [
+        vary()(
+            genotypes[own],
+            row(found, other),
+            preference(row(found, own), row(found, other), 0.25),
+        )
+        for own in range(3)
+        for other in range(4)
+    ]
+    away = np.abs(np.asarray(pairs)[:, None] - np.asarray(offspring)).max(axis=2)
+    assert (away.min(axis=0) < 1e-4).all()
+    assert len({int(best) for best in away.argmin(axis=0)}) > 1
+
+
+def test_elites_keep_their_behavior() -> None:
+    """The individual whose behavior is not finite is no parent."""
+    made, held, state = begun()
+    genotypes, fitnesses, places, extra = told(1)
+    fitnesses = fitnesses.at[0].set(-50.0)  # loses against the elite of its cell
+    held = held.add(genotypes, places, fitnesses, {})
+    after = made.state_update(state, held, genotypes, fitnesses, places, extra)
+    cells = [int(np.argmin(np.square(held.centroids - x).sum(1))) for x in places]
+    np.testing.assert_array_equal(after.elites.obs[cells[0]], seen().obs[0])
+    np.testing.assert_array_equal(after.elites.obs[cells[1]], seen(1).obs[1])
+    np.testing.assert_array_equal(after.others.obs, seen(1).obs)
+    known = np.asarray(after.fitnesses == held.fitnesses[:, 0])
+    assert known[cells[:3]].all() and not known[cells[3]]
+
+
+def test_better_actions_follow_the_derivative() -> None:
+    own = row(seen(), slice(0, 2))
+    slopes = np.random.default_rng(2).normal(size=(2, LENGTH, 2)).astype(np.float32)
+    slopes[0, 3] *= 1e20
+    slopes[1, 5:] = 0  # after the end
+    found = improved(own, jnp.asarray(slopes), 0.05) - own.actions
+    lengths = np.linalg.norm(found, axis=-1)
+    assert lengths.max() <= 0.05 * (1 + 1e-3) and lengths[0, 3] > 0.049
+    cosine = np.sum(found * slopes / np.abs(slopes).max((1, 2), keepdims=True), -1)
+    assert (cosine >= 0).all() and np.isfinite(found).all()
+    np.testing.assert_array_equal(found[1, 5:], 0)
+    nothing = jnp.zeros((2, LENGTH, 2))
+    np.testing.assert_array_equal(improved(own, nothing, 0.05), own.actions)
+
+
+def test_exact_offspring_raise_the_return() -> None:
+    """The return is the sum of first actions, so its derivative is known."""
+    genotypes, fitnesses, places, _ = told()
+    cells = compute_euclidean_centroids((2, 2), [0.0, 0.0], [1.0, 1.0])
+    held = MapElitesRepertoire.init(genotypes, fitnesses, places, cells, {})
+    obs = jnp.asarray(steps()["obs"][:1, :LENGTH])
+
+    def rollout(weights: jax.Array, key: jax.Array) -> dict[str, jax.Array]:
+        del key
+        actions = jax.vmap(jax.vmap(policy, (None, 0)), (0, None))(weights, obs[0])
+        zeros = jnp.zeros(actions.shape[:2])
+        shown = jnp.broadcast_to(obs, (len(weights), *obs.shape[1:]))
+        return {"obs": shown, "actions": actions, "rewards": zeros, "dones": zeros}
+
+    @dataclasses.dataclass
+    class Found:
+        gradients: jax.Array
+        overflowed: jax.Array
+
+    def gradient(actions: jax.Array, key: jax.Array) -> Any:
+        del key
+        slopes = jnp.zeros_like(actions).at[..., 0].set(1)
+        return Found(slopes[:, None], jnp.zeros((len(actions), 1), bool))
+
+    made = ExactAsciiEmitter(
+        policy, rollout, gradient, SETTINGS, parents=3, branches=2, rates=(0.01, 0.03)
+    )
+    offspring, extra = compiled(made.emit)(held, None, jax.random.key(0))
+    assert offspring.shape == (made.batch_size, SIZE) == (6, SIZE)
+    np.testing.assert_array_equal(extra["overflowed"], False)
+    parents = np.asarray(genotypes)
+    gaps = np.abs(np.asarray(offspring)[:, None] - parents).max(axis=2)
+    before = rollout(jnp.asarray(parents[gaps.argmin(axis=1)]), jax.random.key(0))
+    after = rollout(offspring, jax.random.key(0))
+    gain = np.asarray(after["actions"] - before["actions"]).sum(axis=1)
+    assert (gain[:, 0] > 1e-3).all()
+    # weights of the second action have no part in the return
+    assert (np.abs(gain[:, 1]) < 1e-5).all()
+
+
+@pytest.mark.parametrize(
+    ("made", "error"),
+    [
+        (lambda: Interpolation(epochs=0), "epochs: got 0; allowed: .* from 1"),
+        (lambda: Interpolation(deviation=0.0), "deviation: got 0.0; .* above 0"),
+        (lambda: Interpolation(clip=2.0), "clip: got 2.0; allowed: .* from 0 to 1"),
+        (lambda: Interpolation(similarity=-1.0), "similarity: got -1.0; allowed"),
+        (lambda: ascii_emitter(batch_size=0), "batch_size: got 0; allowed"),
+        (lambda: ascii_emitter(rate=0.0), "rate: got 0.0; allowed: .* above 0"),
+        (lambda: exact_emitter(branches=0), "branches: got 0; allowed: .* from 1"),
+        (lambda: exact_emitter(reach=0.0), "reach: got 0.0; allowed: .* above 0"),
+        (lambda: exact_emitter(rates=(2.0, 1.0)), r"rates: got \(2.0, 1.0\); allowed"),
+    ],
+)
+def test_bad_numbers_are_refused(made: Any, error: str) -> None:
+    with pytest.raises(ValueError, match=error):
+        made()
+
+
+def ascii_emitter(**changes: Any) -> AsciiEmitter:
+    given: Any = {"batch_size": 1, "episode_length": LENGTH, **changes}
+    return AsciiEmitter(policy, SETTINGS, **given)
+
+
+def exact_emitter(**changes: Any) -> ExactAsciiEmitter:
+    given: Any = {"parents": 1, "branches": 1, **changes}
+    nothing: Any = None
+    return ExactAsciiEmitter(policy, nothing, nothing, SETTINGS, **given)
+
+
+def test_transitions_are_needed() -> None:
+    made, held, state = begun()
+    genotypes, fitnesses, places, _ = told()
+    with pytest.raises(ValueError, match=r"extra scores: got .* returns transitions"):
+        made.state_update(state, held, genotypes, fitnesses, places, {})

@@ -1,0 +1,247 @@
+"""One actor that is told the target descriptor, on a point that is pushed about."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from point_runs import PointEnv, point_task
+from qdax.core.containers.mapelites_repertoire import (
+    MapElitesRepertoire,
+    compute_euclidean_centroids,
+)
+from test_actor_critic import SETTINGS, compiled
+
+from newton_qd.extractors import get_final_xy_position
+from newton_qd.qd.emitters import ActorCritic, ConditionedActorEmitter
+from newton_qd.qd.emitters.aims import AimedEnv, ConditionedPolicy, no_measure
+from newton_qd.qd.scoring.rollout import Policy, make_policy
+
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
+
+LENGTH = 10
+
+
+class Placed(PointEnv):
+    """The descriptor is where the point is, which has a gradient."""
+
+    dt = 1.0
+    fault_beyond = 9.0
+
+    def _state(self, position: jax.Array, reward: jax.Array) -> Any:
+        state = super()._state(position, reward)
+        info = {**state.info, "state_descriptor": position}
+        return dataclasses.replace(state, info=info)
+
+
+@functools.cache
+def task(final: bool = False) -> Any:
+    given = point_task(None, Placed())  # pyright: ignore[reportArgumentType]
+    limits = np.array([-1, -1], np.float32), np.array([3, 1], np.float32)
+    given = dataclasses.replace(given, limits=limits)
+    if final:
+        return dataclasses.replace(given, descriptor_extractor=get_final_xy_position)
+    return given
+
+
+@functools.cache
+def policy() -> Policy:
+    return make_policy(Placed(), (4,))
+
+
+def scaled(places: Any) -> np.ndarray:
+    return (np.asarray(places) - [1, 0]) / [2, 1]
+
+
+@pytest.mark.parametrize("final", [False, True])
+def test_rewards_add_up_to_the_distance_of_the_descriptor(final: bool) -> None:
+    env, target = AimedEnv(task(final), LENGTH), jnp.float32([0.4, -0.7])
+    first = Placed().reset(jax.random.key(1))
+    weights = jnp.float32([0.25, 0.5])
+    actions = jax.random.uniform(jax.random.key(2), (LENGTH, 2), minval=-0.4)
+
+    def advance(state: Any, action: jax.Array) -> tuple[Any, tuple]:
+        state = env.step(state, action)
+        place = state.info["state_descriptor"]
+        return state, (place, state.state.reward, state.reward)
+
+    def episode() -> Any:
+        start = env.aimed(first, target, weights)
+        return start, *jax.lax.scan(advance, start, actions)
+
+    start, last, (places, plain, rewards) = compiled(episode)()
+    reached = scaled(places)[-1] if final else scaled(places).mean(axis=0)
+    np.testing.assert_allclose(last.error, reached - target, atol=1e-5)
+    begun = np.linalg.norm(start.error)
+    assert begun > 0.1 if final else begun == 0
+    nearer = begun - np.linalg.norm(reached - target)
+    expected = 0.25 * np.sum(plain) + 0.5 * LENGTH * nearer
+    assert float(np.sum(rewards)) == pytest.approx(float(expected), abs=0.02)
+    parts = (last.state.obs, target, last.error, weights[1:])
+    np.testing.assert_array_equal(last.obs, np.concatenate(parts))
+    assert last.obs.shape == (env.observation_size,)
+
+
+def test_an_actor_is_a_policy_of_the_archive_for_each_target() -> None:
+    """The perceptron of observation and target, written out."""
+    own = ConditionedPolicy(policy(), 2)
+    actor = jax.random.normal(jax.random.key(0), (own.size,))
+    assert own.size == policy().size + 2 * 4
+    obs, target = jnp.float32([0.3, -0.2, 1.0]), jnp.float32([0.5, -0.8])
+    layers = policy().unravel(actor[: policy().size])["params"]
+    more = actor[policy().size :].reshape(2, 4)
+    kernel = np.concatenate([layers["Dense_0"]["kernel"], more])
+    inner = np.concatenate([obs, target]) @ kernel + layers["Dense_0"]["bias"]
+    outer = np.maximum(inner, 0) @ layers["Dense_1"]["kernel"]
+    expected = np.tanh(outer + layers["Dense_1"]["bias"])
+    told = jnp.concatenate([obs, target, jnp.zeros(3)])
+    np.testing.assert_allclose(own.act(actor, told), expected, atol=1e-5)
+    special = own.specialized(actor, target)
+    np.testing.assert_allclose(policy().of_weights(special, obs), expected, atol=1e-5)
+    start = own.unconditioned(special)
+    np.testing.assert_array_equal(own.specialized(start, target), special)
+
+
+def emitter(**changes: Any) -> ConditionedActorEmitter:
+    env, own = AimedEnv(task(), LENGTH), ConditionedPolicy(policy(), 2)
+    settings = dataclasses.replace(SETTINGS, worlds=6, rate=0.02)
+    given = {"copies": 4, "between": 3, "updates": 2, "empty": 0.5, **changes}
+    method = ActorCritic(env, own.act, no_measure, LENGTH, settings)
+    first = Placed().reset(jax.random.key(0))
+    options: Any = given
+    return ConditionedActorEmitter(method, env, own, first, **options)
+
+
+@functools.cache
+def parts() -> tuple[ConditionedActorEmitter, Any, Any, Any]:
+    """An emitter, and its compiled functions."""
+    made = emitter()
+    return made, compiled(made.init), compiled(made.emit), compiled(made.state_update)
+
+
+def begun() -> tuple[Any, Any]:
+    """An archive of 4 x 4 cells with three elites, and the emitter's first state."""
+    cells = compute_euclidean_centroids((4, 4), [-1.0, -1.0], [3.0, 1.0])
+    genotypes = jax.vmap(policy().init)(jax.random.split(jax.random.key(0), 3))
+    found = jnp.float32([[-0.5, -0.8], [0.4, 0.1], [2.9, 0.9]])
+    fitnesses = jnp.float32([1.0, 7.0, 3.0])
+    held = MapElitesRepertoire.init(genotypes, fitnesses, found, cells, {})
+    state = parts()[1](jax.random.key(1), held, genotypes, fitnesses, found, {})
+    return held, state
+
+
+@pytest.mark.slow
+def test_the_actor_starts_as_the_best_for_every_target() -> None:
+    held, state = begun()
+    best = held.genotypes[jnp.argmax(held.fitnesses[:, 0])]
+    offspring, told = parts()[2](held, state, jax.random.key(0))
+    assert offspring.shape == (parts()[0].batch_size, policy().size)
+    np.testing.assert_array_equal(offspring[:4], np.tile(best, (4, 1)))
+    np.testing.assert_array_equal(told["overflowed"], [0])
+
+
+@pytest.mark.slow
+def test_targets_are_elites_and_empty_cells_near_them() -> None:
+    held, state = begun()
+    filled = np.asarray(held.fitnesses[:, 0]) > -np.inf
+    wanted = np.asarray(state.cells)
+    assert filled[wanted[:2]].all() and not filled[wanted[2:]].any()
+    targets = np.asarray(state.learner.first.target)
+    known = scaled(held.centroids)
+    assert np.abs(targets[:, None] - known).max(axis=2).min(axis=1).max() < 1e-6
+    assert (np.abs(targets).max(axis=1) <= 1).all()
+
+
+@pytest.mark.slow
+def test_multipliers_rise_where_policies_miss() -> None:
+    held, state = begun()
+    places = np.array(held.centroids[state.cells])
+    places[0] += 1.5  # misses; the others hit, the last one is broken
+    places[3] = np.nan
+    after = parts()[3](state, held, None, None, jnp.asarray(places), {})
+    change = np.zeros(16)
+    np.add.at(change, np.asarray(state.cells), [0.3, -0.3, -0.3, 0.0])
+    np.testing.assert_allclose(after.logits, change, atol=1e-6)
+    share = np.asarray(after.learner.first.weights[:, 1])
+    assert ((0.42 < share) & (share < 0.58)).all()
+
+
+@pytest.mark.slow
+def test_an_update_tells_targets_apart() -> None:
+    held, state = begun()
+    places = held.centroids[state.cells]
+    for _ in range(3):
+        state = parts()[3](state, held, None, None, places, {})
+    assert int(state.failed[0]) == 0
+    offspring, _ = parts()[2](held, state, jax.random.key(0))
+    specialize = parts()[0]._policy.specialized
+    targets = jnp.float32(scaled(held.centroids[state.cells]))
+    expected = jax.vmap(specialize, (None, 0))(state.learner.weights, targets)
+    np.testing.assert_allclose(offspring[:4], expected, atol=1e-6)
+    assert len(np.unique(np.asarray(offspring[:4]), axis=0)) == len(
+        np.unique(state.cells)
+    )
+
+
+@pytest.mark.slow
+def test_an_actor_reaches_its_targets() -> None:
+    """Final positions, with the distance alone: three corners, one actor."""
+    wide = make_policy(Placed(), (16,))
+    env, own = AimedEnv(task(final=True), LENGTH), ConditionedPolicy(wide, 2)
+    settings = dataclasses.replace(SETTINGS, worlds=6, rate=0.02)
+    method = ActorCritic(env, own.act, no_measure, LENGTH, settings)
+    first = Placed().reset(jax.random.key(0))
+    targets = jnp.float32([[-0.8, -0.7], [0.1, 0.7], [-0.8, 0.7]] * 2)
+    weights = jnp.tile(jnp.float32([0, 1]), (6, 1))
+    worlds = jax.vmap(env.aimed, (None, 0, 0))(first, targets, weights)
+    actor = own.unconditioned(wide.init(jax.random.key(3)))
+    start = method.begin(jax.random.key(1), actor, jnp.ones(1), worlds)
+
+    def distances(actor: jax.Array) -> jax.Array:
+        def step(state: Any, _: None) -> tuple[Any, None]:
+            action = jax.vmap(own.act, (None, 0))(actor, state.obs)
+            return jax.vmap(env.step)(state, action), None
+
+        last = jax.lax.scan(step, worlds, length=LENGTH)[0]
+        return jnp.linalg.norm(last.error, axis=1)
+
+    def learn(carry: Any, key: jax.Array) -> tuple[Any, jax.Array]:
+        scale = jnp.zeros(8), jnp.ones(8)
+        return method.update(carry, scale, key)
+
+    keys = jax.random.split(jax.random.key(2), 200)
+    learned, lost = compiled(lambda: jax.lax.scan(learn, start, keys))()
+    assert not np.asarray(lost).any()
+    before, after = compiled(jax.vmap(distances))(jnp.stack([actor, learned.weights]))
+    assert before.min() > 1 and after.max() < 0.35
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"copies": -1}, "copies: got -1; allowed: .* from 0"),
+        ({"copies": 0, "between": 0}, r"copies, between: got \(0, 0\); .* least 1"),
+        ({"updates": 0}, "updates: got 0; allowed: .* from 1"),
+        ({"spread": (0.1, 0.01)}, r"spread: got \(0.1, .*; .*0 < smallest <= largest"),
+        ({"empty": 1.1}, "empty: got 1.1; allowed: .* from 0 to 1"),
+        ({"tolerance": 0.0}, "tolerance: got 0.0; allowed: .*above 0"),
+        ({"dual_rate": -1.0}, "dual_rate: got -1.0; allowed: .* from 0"),
+    ],
+)
+def test_bad_numbers_are_refused(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        emitter(**changes)
+
+
+@pytest.mark.slow
+def test_without_conditioning_copies_are_equal() -> None:
+    made = emitter(conditioned=False)
+    held, state = begun()
+    worlds = made._worlds(held, state.logits, state.unit, jax.random.key(0))
+    np.testing.assert_array_equal(worlds.target, 0)
+    np.testing.assert_array_equal(worlds.weights[:, 1], 0)
