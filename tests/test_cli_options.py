@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import runpy
 import sys
 from pathlib import Path
 from typing import Any
@@ -266,6 +267,15 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == f"newton_qd {newton_qd.__version__}"
     assert f"jax {jax.__version__}" in lines
+
+
+def test_the_command_is_a_module_too(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["newton-qd", "algorithms", "me"])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_module("newton_qd", run_name="__main__")
+    assert ended.value.code == cli.OK and "me: " in capsys.readouterr().out
 
 
 def test_devices_by_name(tmp_path: Path) -> None:
