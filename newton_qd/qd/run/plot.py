@@ -102,9 +102,9 @@ def plot_archive(
         MissingExtra: matplotlib is not installed.
     """
     require_extra("matplotlib", "viz")
-    from matplotlib.figure import Figure
+    from newton_qd.qd.run.figure import NotebookFigure
 
-    figure = Figure(figsize=(9.0, 8.0), layout="constrained")
+    figure = NotebookFigure(figsize=(9.0, 8.0), layout="constrained")
     figure.suptitle(title)
     axes, mappable = _draw(figure, archive, grid, limits, labels, fitness_label)
     figure.colorbar(mappable, ax=axes, label=fitness_label, shrink=0.85, pad=0.03)

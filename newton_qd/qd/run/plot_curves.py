@@ -36,10 +36,11 @@ def curves_figure(
         MissingExtra: matplotlib is not installed.
     """
     require_extra("matplotlib", "viz")
-    from matplotlib.figure import Figure
     from matplotlib.ticker import EngFormatter
 
-    figure = Figure(figsize=(12.0, 4.0), layout="constrained")
+    from newton_qd.qd.run.figure import NotebookFigure
+
+    figure = NotebookFigure(figsize=(12.0, 4.0), layout="constrained")
     figure.suptitle(f"{config.env_name}: {config.algorithm}, seed {config.seed}")
     evaluations = metrics["evaluations"]
     for axes, (name, label) in zip(figure.subplots(1, 3), _PANELS, strict=True):
