@@ -41,7 +41,24 @@ Every environment, moving as sines of time: of 64 random gaits, the one with the
 return. Nothing is learned. `docs/gallery.py` makes the pictures from the code;
 `newton-qd replay NAME` makes a page on which you can turn the view.
 [Environments](environments.md) describes them.
+
+<div class="gallery" markdown>
 """
+
+DESCRIPTORS = {
+    "get_feet_contact_proportion": "the share of the steps that each foot touches the "
+    "ground",
+    "get_final_xy_position": "the final position",
+}
+"""What the extractors of the suite compute."""
+
+CHANGES = {
+    "NoForwardRewardWrapper": "Here, velocity has no reward.",
+    "TrapWrapper": "Here, a trap of three walls is ahead.",
+    "MazeWrapper": "Here, it is in a maze, and the reward is minus the distance to a "
+    "target.",
+}
+"""What wrappers change of a task, beside its descriptor."""
 
 
 def actions(env: Any, steps: int) -> jax.Array:
@@ -95,8 +112,14 @@ def page() -> str:
     for name, spec in ENVIRONMENTS.items():
         about = inspect.getdoc(spec.base) or ""
         summary = " ".join(about.split("\n\n")[0].split())
-        text += f"\n## {name}\n\n![{name}, moving](gallery/{name}.gif)\n\n{summary}\n"
-    return text
+        wrappers = [getattr(one.wrapper, "__name__", "") for one in spec.wrappers]
+        summary += "".join(f" {CHANGES[one]}" for one in wrappers if one in CHANGES)
+        extractor = getattr(spec.descriptor_extractor, "__name__", None)
+        if extractor is not None:
+            summary += f" Descriptor: {DESCRIPTORS[extractor]}."
+        picture = f"![{name}, moving](gallery/{name}.gif)"
+        text += f"\n<div markdown>\n\n## {name}\n\n{picture}\n\n{summary}\n\n</div>\n"
+    return f"{text}\n</div>\n"
 
 
 def main() -> None:
