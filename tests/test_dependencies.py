@@ -29,6 +29,7 @@ REQUIREMENTS = sorted(
 # Distributions that are not named as what they install.
 DISTRIBUTIONS = {
     "PIL": "pillow",
+    "griffe": "griffelib",
     "imageio_ffmpeg": "imageio-ffmpeg",
     "warp": "warp-lang",
 }
