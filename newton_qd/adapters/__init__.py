@@ -2,9 +2,11 @@
 
 - ``make_gymnasium(name)``: an environment of Gymnasium;
   ``make_gymnasium_vector(name, num_envs)``: many worlds, reset as they end
+- ``newton_qd.adapters.torch.make_torch_step(env)``: reset and step for PyTorch, with
+  gradients
 
 Importing this package imports no other module of it. Each name is loaded when it is
-first used, and needs its extra: ``gym``.
+first used, and needs its extra: ``gym`` or ``torch``.
 """
 
 from __future__ import annotations

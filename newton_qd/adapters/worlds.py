@@ -7,38 +7,47 @@ from typing import Any
 from newton_qd import registry
 from newton_qd.checks import Fact, message
 from newton_qd.envs.base import Env
-from newton_qd.wrappers import AutoResetWrapper, VectorWrapper, Wrapper
+from newton_qd.wrappers import (
+    AutoResetWrapper,
+    EpisodeWrapper,
+    VectorWrapper,
+    Wrapper,
+)
 
 
-def one_world(env: str | Env, options: dict[str, Any]) -> Env:
+def one_world(env: str | Env, options: dict[str, Any], *, endless: bool = False) -> Env:
     """Returns an environment of one world that does not reset itself.
 
     Args:
         env: Name of an environment, or an environment.
         options: Arguments of ``newton_qd.create`` for a name.
+        endless: Whether an environment with an episode length is refused.
 
     Raises:
         TypeError: ``env`` is neither, or an option is unknown.
-        ValueError: An environment has options, a batch or auto-reset.
+        ValueError: An environment has options, a batch, auto-reset, or an episode
+            length that is refused.
         UnknownEnvironment: The name is not registered.
     """
     if isinstance(env, str):
-        return registry.create(env, auto_reset=False, **options)
-    if not isinstance(env, Env):
+        env = registry.create(env, auto_reset=False, **options)
+    elif not isinstance(env, Env):
         allowed = "a name of newton_qd.registered_envs(), or an environment"
         raise TypeError(message("env", env, allowed))
-    if options:
+    elif options:
         given = Fact(f"an environment with options {', '.join(sorted(options))}")
         raise ValueError(message("env", given, "a name with options"))
+    refused = {VectorWrapper: "a batch", AutoResetWrapper: "auto-reset"}
+    allowed = "one world: create(..., auto_reset=False), no batch_size"
+    if endless:
+        refused[EpisodeWrapper] = "an episode length"
+        allowed += ", episode_length=None"
     inside = env
     while isinstance(inside, Wrapper):
-        for kind, what in (
-            (VectorWrapper, "a batch"),
-            (AutoResetWrapper, "auto-reset"),
-        ):
+        for kind, what in refused.items():
             if isinstance(inside, kind):
-                given = Fact(f"an environment with {what}")
-                allowed = "one world: create(..., auto_reset=False), no batch_size"
-                raise ValueError(message("env", given, allowed))
+                raise ValueError(
+                    message("env", Fact(f"an environment with {what}"), allowed)
+                )
         inside = inside.env
     return env

@@ -1,0 +1,196 @@
+"""The door to PyTorch: the same numbers, the same gradients, the same memory."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import re
+import runpy
+import sys
+from pathlib import Path
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import newton_qd
+
+ROOT = Path(__file__).resolve().parent.parent
+STEPS, WORLDS = 3, 2
+
+
+def test_a_missing_torch_says_its_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "torch", None)
+    monkeypatch.delitem(sys.modules, "newton_qd.adapters.torch", raising=False)
+    with pytest.raises(newton_qd.MissingExtra, match=r"newton_qd\[torch\]"):
+        importlib.import_module("newton_qd.adapters.torch")
+
+
+@pytest.fixture(scope="module")
+def torch() -> Any:
+    return pytest.importorskip("torch")
+
+
+@pytest.fixture(scope="module")
+def door(torch: Any) -> Any:
+    return importlib.import_module("newton_qd.adapters.torch")
+
+
+@pytest.fixture(scope="module")
+def hopper() -> Any:
+    return newton_qd.create(
+        "hopper_uni",
+        batch_size=WORLDS,
+        auto_reset=False,
+        qdax_wrappers_kwargs=[{"smooth_width": 0.02}],
+    )
+
+
+@pytest.fixture(scope="module")
+def maze() -> Any:
+    return newton_qd.create("pointmaze", batch_size=WORLDS, episode_length=4)
+
+
+def same(tensors: Any, arrays: Any) -> bool:
+    pairs = zip(jax.tree.leaves(tensors), jax.tree.leaves(arrays), strict=True)
+    return all(np.array_equal(a.detach().numpy(), b) for a, b in pairs)
+
+
+def test_memory_is_shared(torch: Any, door: Any) -> None:
+    tensor = torch.arange(6.0).reshape(2, 3)
+    array = door.to_jax(tensor)
+    assert array.unsafe_buffer_pointer() == tensor.data_ptr()
+    back = door.to_torch(array)
+    assert back.data_ptr() == tensor.data_ptr() and door.to_jax(back) is array
+    assert np.array_equal(door.to_jax(tensor.T), tensor.T.numpy()), "gaps: copied"
+    key = jax.random.key(0)
+    assert door.to_torch(key) is key and door.to_jax(key) is key
+
+
+def test_the_numbers_are_those_of_env_step(torch: Any, door: Any, maze: Any) -> None:
+    """Also where worlds reset themselves, with and without a graph."""
+    reset, step = door.make_torch_step(maze)
+    wanted, env_step = jax.jit(maze.reset)(jax.random.key(7)), jax.jit(maze.step)
+    plain = graph = reset(7)
+    actions = torch.zeros(WORLDS, 2)
+    assert same(plain, wanted)
+    for number in range(6):
+        actions = torch.linspace(-1, 1, 2 * WORLDS).reshape(WORLDS, 2) / (1 + number)
+        wanted = env_step(wanted, np.asarray(actions))
+        plain = step(plain, actions)
+        graph = step(graph, actions.clone().requires_grad_())
+        assert same(plain, wanted) and same(graph, wanted)
+        assert not plain.obs.requires_grad and graph.obs.requires_grad
+    with torch.no_grad():
+        assert not step(graph, actions).obs.requires_grad
+
+
+@pytest.mark.slow
+@pytest.mark.optimized
+def test_gradients_are_those_of_jax(torch: Any, door: Any, hopper: Any) -> None:
+    """Through several steps, with respect to actions and to the first state."""
+    reset, step = door.make_torch_step(hopper)
+
+    def total(advance: Any, first: Any, q: Any, plan: Any) -> Any:
+        physics = dataclasses.replace(first.pipeline_state, q=q)
+        state, found = first.replace(pipeline_state=physics), 0.0
+        for number in range(STEPS):
+            state = advance(state, plan[number])
+            read = state.reward.sum() + state.info["state_descriptor"].sum()
+            found = found + read + 0.1 * (state.obs**2).sum()
+        return found
+
+    values = np.linspace(-0.5, 0.5, STEPS * WORLDS * 3, dtype=np.float32)
+    values = values.reshape(STEPS, WORLDS, 3)
+    first, start = reset(1), jax.jit(hopper.reset)(jax.random.key(1))
+    q = first.pipeline_state.q.clone().requires_grad_()
+    plan = torch.tensor(values, requires_grad=True)
+    found = total(step, first, q, plan)
+    found.backward()
+
+    def value(q: jax.Array, plan: jax.Array) -> jax.Array:
+        return total(jax.jit(hopper.step), start, q, plan)
+
+    given = start.pipeline_state.q, jnp.asarray(values)
+    wanted, slopes = jax.value_and_grad(value, (0, 1))(*given)
+    assert float(found.detach()) == pytest.approx(float(wanted), rel=1e-6)
+    for tensor, slope in zip((q, plan), slopes, strict=True):
+        scale = float(jnp.abs(slope).max())
+        assert scale > 0.1
+        error = np.abs(tensor.grad.numpy() - np.asarray(slope)).max()
+        assert error < 1e-6 * scale
+
+
+def test_a_gradient_of_every_part(torch: Any, door: Any, maze: Any) -> None:
+    """An action alone, a state alone, and nothing beyond a cut."""
+    reset, step = door.make_torch_step(maze)
+    actions = torch.full((WORLDS, 2), 0.3, requires_grad=True)
+    first = reset(0)
+    state = step(first, actions)
+    state.reward.sum().backward()
+    slope = jax.grad(lambda a: maze.step(start, a).reward.sum())
+    start = maze.reset(jax.random.key(0))
+    expected = slope(np.full((WORLDS, 2), 0.3, np.float32))
+    assert np.allclose(actions.grad.numpy(), expected, rtol=1e-6, atol=0)
+    cut = door.detached(step(first, actions))
+    assert not any(leaf.requires_grad for leaf in jax.tree.leaves(cut))
+    observed = first.replace(obs=first.obs.clone().requires_grad_())
+    step(observed, actions.detach()).reward.sum().backward()
+    assert torch.isfinite(observed.obs.grad).all() and observed.obs.grad.any()
+
+
+def test_one_world_and_physical_parameters(torch: Any, door: Any) -> None:
+    one = newton_qd.create("pointmaze", auto_reset=False)
+    reset, step = door.make_torch_step(one)
+    assert step(reset(0), torch.zeros(2)).obs.shape == (2,)
+    with pytest.raises(ValueError, match="params"):
+        step(reset(0), torch.zeros(2), torch.ones(2))
+
+
+def test_errors(torch: Any, door: Any, maze: Any) -> None:
+    reset, step = door.make_torch_step(maze)
+    state = reset(0)
+    with pytest.raises(TypeError, match="env: got 3; allowed: an environment"):
+        door.make_torch_step(cast("Any", 3))
+    with pytest.raises(ValueError, match="seed: got -1; allowed: integers from 0"):
+        reset(-1)
+    with pytest.raises(TypeError, match=r"action: got .*; allowed: a tensor"):
+        step(state, np.zeros((WORLDS, 2), np.float32))
+    with pytest.raises(ValueError, match="action: got a tensor on meta; allowed: one"):
+        step(state, torch.zeros(WORLDS, 2, device="meta"))
+    with pytest.raises(ValueError, match="action: got an array of shape"):
+        step(state, torch.zeros(WORLDS, 3))
+    with pytest.raises(TypeError, match=r"action: got an array of shape .* float16"):
+        step(state, torch.zeros(WORLDS, 2, dtype=torch.float16))
+
+
+def test_what_pytorch_cannot_do_here_is_an_error(
+    torch: Any, door: Any, maze: Any
+) -> None:
+    reset, step = door.make_torch_step(maze)
+    actions = torch.full((WORLDS, 2), 0.3, requires_grad=True)
+    loss = step(reset(0), actions).reward.sum()
+    (slope,) = torch.autograd.grad(loss, actions, create_graph=True)
+    with pytest.raises(RuntimeError, match=r"once_differentiable|not require grad"):
+        slope.sum().backward()
+    state = step(reset(0), actions)
+    with torch.no_grad():
+        actions.mul_(2.0)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        state.reward.sum().backward()
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("torch")
+def test_the_example_runs(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = ROOT / "examples" / "shac_torch.py"
+    assert len(path.read_text(encoding="utf-8").splitlines()) < 80
+    tiny = ["--worlds", "2", "--window", "4", "--iterations", "2"]
+    monkeypatch.setattr(sys, "argv", [str(path), *tiny])
+    runpy.run_path(str(path), run_name="__main__")
+    printed = capsys.readouterr().out
+    assert re.search(r"iteration   2: mean reward of a step +-?\d", printed)
