@@ -62,7 +62,7 @@ def faults(folder: Path) -> list[str]:
         path.resolve(): Page(path.read_text(encoding="utf-8"))
         for path in sorted(folder.rglob("*.html"))
     }
-    found = []
+    found = [] if pages else [f"{folder} has no pages"]
     for path, page in pages.items():
         name = path.relative_to(folder.resolve())
         for address in sorted(page.loaded):

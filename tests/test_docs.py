@@ -192,6 +192,7 @@ def test_the_reference_has_every_public_name() -> None:
 
 
 def test_dead_links_and_other_hosts_are_found(tmp_path: Path) -> None:
+    assert load("check_site").faults(tmp_path) == [f"{tmp_path} has no pages"]
     (tmp_path / "a").mkdir()
     (tmp_path / "index.html").write_text(
         '<p id="top"><a href="a/#one">good</a> <a href="a/#two">bad</a>'
