@@ -17,6 +17,19 @@ variant is best on a task is found first, with another seed:
 
 With ``--workers N`` N runs go on at once, on a CPU each with its share of the cores, on
 GPUs in turn on each of them.
+
+All this is the protocol ``core``, for one core of a CPU. ``study_protocols.py`` has two
+more. ``field`` is that of published comparisons, for one GPU: a million evaluations in
+batches of 1,024, and scores after 60, 250 and 1,000 s. ``small`` has the same policies,
+episodes and cells, for minutes on a CPU. Their runs can be stopped at any time and
+continued, see ``study_runs.py``; variants are in ``study/field.toml``:
+
+    python benchmarks/study.py --protocol field --device cuda --until 60 --out field
+    python benchmarks/study.py --protocol small --out small
+    python benchmarks/study_scores.py small
+
+``--until S`` leaves later stops for another command, which continues the runs.
+``--stop-after S`` ends the command in time for a machine that is lent for so long.
 """
 
 from __future__ import annotations
@@ -27,13 +40,15 @@ import dataclasses
 import itertools
 import math
 import os
-import subprocess
-import sys
 import time
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+
+import study_runs
+from study_pool import Pool
+from study_protocols import PROTOCOLS
 
 FOLDER = Path(__file__).resolve().parent / "study"
 TASKS = (
@@ -198,68 +213,25 @@ def write(path: Path, rows: list[dict]) -> None:
     unfinished.replace(path)
 
 
-@dataclasses.dataclass
-class Pool:
-    """Processes, one in each slot.
-
-    Attributes:
-        args: Arguments of the command.
-        slots: The process of each slot, or ``None``.
-        gpus: Number of GPUs.
-    """
-
-    args: argparse.Namespace
-    slots: list[subprocess.Popen | None]
-    gpus: int
-
-    def free(self) -> int | None:
-        """A slot without a process that still runs."""
-        for slot, process in enumerate(self.slots):
-            if process is None or process.poll() is not None:
-                self._end(slot)
-                return slot
-        return None
-
-    def _end(self, slot: int) -> None:
-        """Waits for the process of a slot, and says so if it has failed."""
-        process, self.slots[slot] = self.slots[slot], None
-        if process is not None and process.wait():
-            print(f"failed: {process.args}", file=sys.stderr, flush=True)
-
-    def start(self, slot: int, *what: str) -> None:
-        """Starts this file again with other arguments."""
-        args = self.args
-        common = ["--seconds", str(args.seconds), "--device", args.device]
-        command = [sys.executable, __file__, *common, *what]
-        variables = {**os.environ, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
-        if args.device == "cuda":
-            variables["CUDA_VISIBLE_DEVICES"] = str(slot % self.gpus)
-        else:
-            variables.update(JAX_PLATFORMS="cpu", CUDA_VISIBLE_DEVICES="")
-            cores = sorted(os.sched_getaffinity(0))
-            share = cores[slot % len(cores) :: len(self.slots)]
-            command += ["--cores", *map(str, share)]
-        self.slots[slot] = subprocess.Popen(command, env=variables)
-
-    def wait(self) -> int:
-        """Waits for a free slot."""
-        while (slot := self.free()) is None:
-            time.sleep(0.2)
-        return slot
-
-    def drain(self) -> None:
-        """Waits for all processes."""
-        for slot in range(len(self.slots)):
-            self._end(slot)
-
-
 def arguments() -> argparse.Namespace:
     """Reads the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--protocol", choices=("core", *PROTOCOLS), default="core")
     parser.add_argument("--out", type=Path, default=Path("runs"))
-    parser.add_argument("--tasks", nargs="*", choices=TASKS, default=list(TASKS))
-    parser.add_argument("--algorithms", nargs="*", default=list(ALGORITHMS))
-    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--tasks", nargs="*", help="default: all of the protocol")
+    parser.add_argument("--algorithms", nargs="*", help="default: all of the protocol")
+    parser.add_argument(
+        "--seeds", type=int, help="at most so many; default: 5, or as the protocol says"
+    )
+    parser.add_argument(
+        "--until", type=float, help="field, small: longest time of a run [s]"
+    )
+    parser.add_argument(
+        "--stop-after",
+        type=float,
+        default=math.inf,
+        help="field, small: stop all runs so many seconds after the command",
+    )
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     parser.add_argument("--gpus", type=int, default=1)
@@ -276,7 +248,24 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--tuned", type=Path, help="folder of what --tune has found")
     parser.add_argument("--cores", type=int, nargs="*", help=argparse.SUPPRESS)
     parser.add_argument("--run", nargs=4, help=argparse.SUPPRESS)
-    return parser.parse_args()
+    args = parser.parse_args()
+    protocol = PROTOCOLS.get(args.protocol)
+    args.tasks = args.tasks or list(protocol.tasks if protocol else TASKS)
+    args.algorithms = args.algorithms or list(
+        protocol.algorithms if protocol else ALGORITHMS
+    )
+    for name, known in (
+        ("tasks", protocol.tasks if protocol else TASKS),
+        ("algorithms", protocol.algorithms if protocol else args.algorithms),
+    ):
+        unknown = sorted(set(getattr(args, name)) - set(known))
+        if unknown:
+            parser.error(f"--{name}: got {', '.join(unknown)}; allowed: {known}")
+    if args.seeds is None:
+        args.seeds = protocol.seeds if protocol else 5
+    if protocol and args.until is None:
+        args.until = max(x.amount for x in protocol.stops if x.unit == "s")
+    return args
 
 
 def planned(args: argparse.Namespace) -> list[tuple[Run, Path]]:
@@ -306,26 +295,68 @@ def planned(args: argparse.Namespace) -> list[tuple[Run, Path]]:
     return [(run, run.file(args.out, run.algorithm)) for run in runs]
 
 
+def left(args: argparse.Namespace) -> list[tuple[str, ...]]:
+    """Task, variant, seed and output of the runs that are not finished."""
+    if args.protocol == "core":
+        return [
+            (run.task, run.variant, str(run.seed), str(file))
+            for run, file in planned(args)
+            if not file.exists()
+        ]
+    found = study_runs.missing(
+        PROTOCOLS[args.protocol],
+        args.out,
+        tasks=args.tasks,
+        algorithms=args.algorithms,
+        seeds=args.seeds,
+        until=args.until,
+        tune=args.tune,
+        tuned=args.tuned,
+    )
+    return [(run.task, run.variant, str(run.seed), str(args.out)) for run in found]
+
+
+def one(args: argparse.Namespace, begin: float) -> None:
+    """Carries out one run."""
+    task, variant, seed, out = args.run
+    if args.protocol == "core":
+        run = Run(task, variant, int(seed))
+        execute(run, args.seconds, args.device, Path(out))
+        return
+    study_runs.execute(
+        PROTOCOLS[args.protocol],
+        study_runs.Run(task, variant, int(seed)),
+        Path(out),
+        until=args.until,
+        device=args.device,
+        deadline=begin + args.stop_after,
+    )
+
+
 def main() -> None:
     """Runs what is missing."""
     begin, args = time.monotonic(), arguments()
     if args.cores:
         os.sched_setaffinity(0, args.cores)
     if args.run:
-        task, variant, seed, file = args.run
-        run = Run(task, variant, int(seed))
-        execute(run, args.seconds, args.device, Path(file))
+        one(args, begin)
         return
-    missing = [(run, file) for run, file in planned(args) if not file.exists()]
+    args.out.mkdir(parents=True, exist_ok=True)
+    missing = left(args)
+    latest = min(args.start_until, args.stop_after)
     pool = Pool(args, [None] * args.workers, args.gpus)
-    for number, (run, file) in enumerate(missing):
+    for number, what in enumerate(missing):
         slot = pool.wait()
         spent = time.monotonic() - begin
-        if spent > args.start_until:
+        if spent > latest:
             print(f"{len(missing) - number} runs are left", flush=True)
             break
-        print(f"{spent:5.0f} s: {run}, {number + 1} of {len(missing)}", flush=True)
-        pool.start(slot, "--run", run.task, run.variant, str(run.seed), str(file))
+        print(f"{spent:5.0f} s: {what}, {number + 1} of {len(missing)}", flush=True)
+        more = []
+        if args.protocol != "core":
+            more = ["--until", str(args.until)]
+            more += ["--stop-after", str(args.stop_after - spent)]
+        pool.start(slot, *more, "--run", *what)
     pool.drain()
 
 

@@ -221,7 +221,7 @@ def test_shares_of_a_batch_that_do_not_fit_are_refused() -> None:
             {"branches": 9},
             "share: got .* holds a parent with branches = 9",
         ),
-        ("ascii-me-exact", {"slowest": 1.0}, r"rates: got \(1.0, 0.01\); allowed"),
+        ("ascii-me-exact", {"slowest": 1.0}, r"rates: got \(1.0, 0.003\); allowed"),
         ("me-actor-critic", {"fitness": float("nan")}, "fitness: got nan; allowed"),
         ("omg-mega", {"sigma_g": 0.0}, "sigma_g: got 0.0; allowed: .*above 0"),
         ("omg-mega", {"window": -1}, "window: got -1; allowed: integers from 0"),

@@ -257,7 +257,14 @@ def test_exact_offspring_raise_the_return() -> None:
         return Found(slopes[:, None], jnp.zeros((len(actions), 1), bool))
 
     made = ExactAsciiEmitter(
-        policy, rollout, gradient, SETTINGS, parents=3, branches=2, rates=(0.01, 0.03)
+        policy,
+        rollout,
+        gradient,
+        SETTINGS,
+        parents=3,
+        branches=2,
+        rates=(0.01, 0.03),
+        samples=20,
     )
     offspring, extra = compiled(made.emit)(held, None, jax.random.key(0))
     assert offspring.shape == (made.batch_size, SIZE) == (6, SIZE)
@@ -282,6 +289,7 @@ def test_exact_offspring_raise_the_return() -> None:
         (lambda: ascii_emitter(batch_size=0), "batch_size: got 0; allowed"),
         (lambda: ascii_emitter(rate=0.0), "rate: got 0.0; allowed: .* above 0"),
         (lambda: exact_emitter(branches=0), "branches: got 0; allowed: .* from 1"),
+        (lambda: exact_emitter(samples=0), "samples: got 0; allowed: .* from 1"),
         (lambda: exact_emitter(reach=0.0), "reach: got 0.0; allowed: .* above 0"),
         (lambda: exact_emitter(rates=(2.0, 1.0)), r"rates: got \(2.0, 1.0\); allowed"),
     ],

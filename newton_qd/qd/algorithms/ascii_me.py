@@ -108,14 +108,17 @@ class ExactAsciiMEOptions(InterpolationOptions):
         reach: Largest change of an action that the operator aims at [-].
         slowest: Smallest learning rate of Adam [-].
         fastest: Largest learning rate of Adam [-].
+        samples: Steps of the episode that an offspring learns from; 0: all.
     """
 
+    epochs: int = 8
     branches: int = 8
     window: int = WINDOW
     clip: float = 100.0
     reach: float = 0.3
-    slowest: float = 3e-4
-    fastest: float = 1e-2
+    slowest: float = 3e-5
+    fastest: float = 3e-3
+    samples: int = 64
 
     def parents(self, config: EvolveConfig) -> int:
         """Returns the number of parents with a gradient in each generation.
@@ -161,6 +164,7 @@ def _make_exact(context: EmitterContext, options: ExactAsciiMEOptions) -> Any:
         branches=options.branches,
         reach=options.reach,
         rates=(options.slowest, options.fastest),
+        samples=options.samples or None,
     )
     return with_isoline(emitter, config)
 

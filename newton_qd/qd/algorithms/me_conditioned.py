@@ -40,8 +40,8 @@ class ConditionedOptions(DifferentiableOptions, ActorCriticSettings):
     worlds: int = 32
     window: int = WINDOW
     rate: float = 2e-3
-    copies: float = 0.125
-    between: float = 0.25
+    copies: float = 0.0625
+    between: float = 0.1875
     updates: int = 1
     empty: float = 0.5
     tolerance: float = 0.1

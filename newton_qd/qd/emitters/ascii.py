@@ -210,7 +210,8 @@ class ExactAsciiEmitter(Emitter):
     where G is the median of :math:`|g_t|` over the episode. The derivative goes through
     the physics, not through the policy, so feedback does not make it larger. Several
     offspring of a parent share one derivative and differ in the learning rate, which is
-    drawn log-uniformly. The state of this emitter is empty.
+    drawn log-uniformly, and in the steps that they learn from. The state of this
+    emitter is empty.
     """
 
     def __init__(
@@ -223,7 +224,8 @@ class ExactAsciiEmitter(Emitter):
         parents: int,
         branches: int,
         reach: float = 0.3,
-        rates: tuple[float, float] = (3e-4, 1e-2),
+        rates: tuple[float, float] = (3e-5, 3e-3),
+        samples: int | None = None,
     ) -> None:
         """Sets the operator.
 
@@ -238,12 +240,15 @@ class ExactAsciiEmitter(Emitter):
             branches: Offspring of each parent.
             reach: Largest change s of an action that the operator aims at [-].
             rates: Range of the learning rate [-].
+            samples: Steps of the episode that an offspring learns from, drawn with
+                replacement; ``None``: all.
 
         Raises:
             ValueError: A number is out of its range.
         """
         for name, value in (("parents", parents), ("branches", branches)):
             checks.integer(name, value, most=None)
+        checks.integer("samples", samples, most=None, optional=True)
         checks.number("reach", reach, above=0)
         if not 0 < rates[0] <= rates[1]:
             raise ValueError(message("rates", rates, "0 < smallest <= largest"))
@@ -255,6 +260,7 @@ class ExactAsciiEmitter(Emitter):
         self._branches = branches
         self._reach = reach
         self._rates = rates
+        self._samples = samples
 
     @property
     def batch_size(self) -> int:
@@ -271,7 +277,7 @@ class ExactAsciiEmitter(Emitter):
             ``overflowed``, (parents,). Such a parent does not move.
         """
         del emitter_state
-        cell_key, rate_key, score_key = jax.random.split(key, 3)
+        cell_key, rate_key, step_key, score_key = jax.random.split(key, 4)
         filled = repertoire.fitnesses[:, 0] > -jnp.inf
         weights = repertoire.genotypes[draw_cells(cell_key, filled, self._parents)]
         steps = self._rollout(weights, score_key)
@@ -285,13 +291,18 @@ class ExactAsciiEmitter(Emitter):
         part = jax.random.uniform(rate_key, shape, weights.dtype)
         rates = low * (high / low) ** part
 
-        def vary(start: jax.Array, aim: Behavior, rate: jax.Array) -> jax.Array:
+        def vary(start: Any, aim: Behavior, rate: Any, key: Any) -> jax.Array:
+            if self._samples is not None:
+                length = len(aim.counts)
+                drawn = jax.random.randint(key, (self._samples,), 0, length)
+                aim = jax.tree.map(lambda leaf: leaf[drawn], aim)
             return interpolated(
                 self._policy, start, aim, aim.counts, rate, self._settings
             )
 
-        branch = jax.vmap(vary, (None, None, 0))
-        offspring = jax.vmap(branch)(weights, better, rates)
+        keys = jax.random.split(step_key, shape)
+        branch = jax.vmap(vary, (None, None, 0, 0))
+        offspring = jax.vmap(branch)(weights, better, rates, keys)
         overflowed = jnp.any(found.overflowed, axis=1)
         return offspring.reshape(-1, weights.shape[1]), {"overflowed": overflowed}
 

@@ -1,0 +1,269 @@
+"""Tables and figures of the protocols ``field`` and ``small`` of ``study.py``.
+
+    python benchmarks/study_scores.py field --out docs/field.md --figures docs/figures
+
+The headline is the corrected QD score without offset: elites are evaluated again from
+other start states, and their fitness is normalized per task to 0 for an untrained
+policy and 1 for the best known one. The best known one is the best corrected elite of
+all runs, or a better one in ``study/best_known.csv``. Scores are interquartile means
+over seeds with bootstrap intervals of 95 %.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import dataclasses
+import itertools
+from pathlib import Path
+
+import numpy as np
+from study_protocols import OURS, PROTOCOLS
+from study_report import interval
+from study_runs import lines
+
+from newton_qd.qd.run import quality
+
+BEST_KNOWN = Path(__file__).resolve().parent / "study" / "best_known.csv"
+PUBLISHED = {
+    "hopper_uni": {"me": 401, "pga-me": 474, "dcrl-me": 527, "ascii-me": 680},
+    "walker2d_uni": {"me": 434, "pga-me": 542, "dcrl-me": 645, "ascii-me": 767},
+}
+"""Medians of QD scores [thousands] at a million evaluations (Mitsides et al. 2025)."""
+LEVELS = np.linspace(0, 1, 101)
+
+Key = tuple[str, str, str]
+"""Task, algorithm and stop."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Scored:
+    """A run at a stop.
+
+    Attributes:
+        seed: Its seed.
+        line: Its line of ``runs.csv``.
+        raw: (cells,) fitness of each cell.
+        corrected: (cells,) the same after another evaluation of the elites.
+    """
+
+    seed: int
+    line: dict[str, str]
+    raw: np.ndarray
+    corrected: np.ndarray
+
+
+Results = dict[Key, list[Scored]]
+
+
+def load(folder: Path) -> Results:
+    """Reads the runs of a folder; the seed of the tuning is left out."""
+    found: Results = {}
+    for line in lines(folder):
+        name = f"{line['task']}.{line['variant']}.{line['seed']}.npz"
+        cells = np.load(folder / "cells" / name)[line["stop"]].astype(np.float64)
+        key = line["task"], line["algorithm"], line["stop"]
+        seed = int(line["seed"])
+        found.setdefault(key, []).append(Scored(seed, line, *cells))
+    return found
+
+
+def references(results: Results) -> dict[str, tuple[float, float]]:
+    """Returns the fitness of an untrained policy and the best known one, by task."""
+    known: dict[str, float] = {}
+    if BEST_KNOWN.is_file():
+        with BEST_KNOWN.open(newline="", encoding="utf-8") as file:
+            known = {row["task"]: float(row["fitness"]) for row in csv.DictReader(file)}
+    found = {}
+    for task in sorted({key[0] for key in results}):
+        runs = [
+            run for key, group in results.items() if key[0] == task for run in group
+        ]
+        untrained = np.median([float(run.line["initial_fitness"]) for run in runs])
+        best = max(quality.best(run.corrected) for run in runs)
+        best = max(best, known.get(task, -np.inf))
+        found[task] = float(untrained), float(best)
+    return found
+
+
+def common(results: Results, task: str, stop: str) -> dict[str, list[float]]:
+    """Mean corrected fitness over the cells that all algorithms fill, by algorithm.
+
+    Runs with the same seed have the same cells, so seeds are compared one by one.
+    """
+    groups = {key[1]: runs for key, runs in results.items() if key[::2] == (task, stop)}
+    seeds = set.intersection(*({run.seed for run in runs} for runs in groups.values()))
+    found: dict[str, list[float]] = {name: [] for name in groups}
+    for seed in sorted(seeds):
+        archives = [
+            next(run.corrected for run in runs if run.seed == seed)
+            for runs in groups.values()
+        ]
+        means = quality.common_mean_fitness(archives)
+        for name, mean in zip(groups, means, strict=True):
+            if np.isfinite(mean):
+                found[name].append(float(mean))
+    return found
+
+
+def normalized(run: Scored, limits: tuple[float, float]) -> float:
+    """The headline score of a run."""
+    return quality.normalized_qd_score(run.corrected, *limits)
+
+
+def text(values: list[float], spec: str) -> str:
+    """Interquartile mean and its interval."""
+    if not values:
+        return "-"
+    middle, low, high = interval([np.asarray(values)])
+    return f"{middle:{spec}} ({low:{spec}} to {high:{spec}})"
+
+
+def table(results: Results, stop: str) -> str:
+    """Markdown table of all tasks and algorithms at a stop."""
+    limits = references(results)
+    head = (
+        *("task", "algorithm", "seeds", "**corrected QD score without offset**"),
+        *("corrected mean fitness over common cells", "corrected coverage [%]"),
+        *("corrected best", "corrected QD score", "QD score", "coverage [%]", "best"),
+        *("evaluations [k]", "time [s]"),
+    )
+    rows = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
+    keys = sorted(key for key in results if key[2] == stop)
+    for task, group in itertools.groupby(keys, key=lambda key: key[0]):
+        shared = common(results, task, stop)
+        for key in group:
+            runs = results[key]
+
+            def column(name: str, runs: list[Scored] = runs) -> list[float]:
+                return [float(run.line[name]) for run in runs]
+
+            clock = "wall_s" if runs[0].line["device"] == "cuda" else "processor_s"
+            cells = (
+                *(task, key[1], str(len(runs))),
+                text([normalized(run, limits[task]) for run in runs], ".4f"),
+                text(shared[key[1]], ".4g"),
+                text(column("corrected_coverage"), ".1f"),
+                text(column("corrected_max_fitness"), ".4g"),
+                text(column("corrected_qd_score"), ",.0f"),
+                text(column("qd_score"), ",.0f"),
+                text(column("coverage"), ".1f"),
+                text(column("max_fitness"), ".4g"),
+                f"{np.mean(column('evaluations')) / 1e3:.0f}",
+                f"{np.mean(column(clock)):.0f}",
+            )
+            rows.append(f"| {' | '.join(cells)} |")
+    return "\n".join(rows)
+
+
+def verdict(results: Results, stop: str) -> str:
+    """Markdown table: our best algorithm and the best other one of each task."""
+    limits = references(results)
+    rows = ["| task | ours | others | ratio | intervals |", "|---|---|---|---|---|"]
+    for task in limits:
+        sides: list[list[tuple[float, float, float, str]]] = [[], []]
+        for (own, algorithm, at), runs in results.items():
+            if (own, at) == (task, stop):
+                scores = np.asarray([normalized(run, limits[task]) for run in runs])
+                sides[algorithm not in OURS].append((*interval([scores]), algorithm))
+        if not all(sides):
+            continue
+        ours, other = (max(side) for side in sides)
+        apart = ours[1] > other[2] or ours[2] < other[1]
+        ratio = ours[0] / other[0] if other[0] > 0 else np.inf
+        cells = [f"{x[3]} {x[0]:.4f} ({x[1]:.4f} to {x[2]:.4f})" for x in (ours, other)]
+        rows.append(
+            f"| {task} | {' | '.join(cells)} | {ratio:.2f} | "
+            f"{'apart' if apart else 'overlap'} |"
+        )
+    return "\n".join(rows)
+
+
+def published(results: Results) -> str:
+    """Markdown table: ratios to MAP-Elites with a million evaluations, and published.
+
+    The published scores have no offset, and neither have these.
+    """
+    rows = ["| task | algorithm | ratio here | published |", "|---|---|---|---|"]
+    for task, scores in PUBLISHED.items():
+        sums = {
+            name: [np.sum(run.raw[np.isfinite(run.raw)]) for run in runs]
+            for name in scores
+            if (runs := results.get((task, name, "1000000 evaluations")))
+        }
+        if "me" not in sums:
+            continue
+        base = np.median(sums["me"])
+        for name, found in sums.items():
+            ratio, other = np.median(found) / base, scores[name] / scores["me"]
+            rows.append(f"| {task} | {name} | {ratio:.2f} | {other:.2f} |")
+    return "\n".join(rows) if len(rows) > 2 else ""
+
+
+def figure(results: Results, stop: str, path: Path) -> None:
+    """Plots the distribution of the corrected normalized fitness over cells."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    limits = references(results)
+    names = sorted({key[1] for key in results})
+    columns = min(4, len(limits))
+    size = (3.2 * columns, 2.6 * -(-len(limits) // columns))
+    drawing, panels = plt.subplots(
+        -(-len(limits) // columns), columns, figsize=size, squeeze=False
+    )
+    for panel, (task, (low, high)) in zip(panels.flat, limits.items(), strict=False):
+        for color, name in enumerate(names):
+            if runs := results.get((task, name, stop)):
+                thresholds = low + LEVELS * (high - low)
+                shares = [quality.ccdf(run.corrected, thresholds) for run in runs]
+                mean = np.mean(shares, axis=0)
+                panel.plot(LEVELS, mean, color=f"C{color}", label=name, linewidth=1.2)
+        panel.set_title(task, fontsize=9)
+        panel.tick_params(labelsize=7)
+        panel.set_xlabel("normalized fitness", fontsize=8)
+    for panel in list(panels.flat)[len(limits) :]:
+        panel.axis("off")
+    panels[0, 0].set_ylabel("cells at least as fit [%]", fontsize=8)
+    panels.flat[0].legend(fontsize=7)
+    drawing.tight_layout()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    drawing.savefig(path, dpi=120)
+    plt.close(drawing)
+
+
+def report(results: Results) -> str:
+    """Returns all tables."""
+    parts = []
+    for stop in dict.fromkeys(key[2] for key in sorted(results, key=lambda k: k[2])):
+        parts += [f"## At {stop}", verdict(results, stop), table(results, stop)]
+    ratios = published(results)
+    if ratios:
+        parts += ["## Ratios to MAP-Elites", ratios]
+    return "\n\n".join(parts) + "\n"
+
+
+def main() -> None:
+    """Prints the tables, and writes them and the figures."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("runs", type=Path)
+    parser.add_argument("--out", type=Path, help="Markdown file of the tables")
+    parser.add_argument("--figures", type=Path)
+    args = parser.parse_args()
+    results = load(args.runs)
+    known = {str(x) for protocol in PROTOCOLS.values() for x in protocol.stops}
+    stops = sorted({key[2] for key in results} & known)
+    if args.figures:
+        for stop in stops:
+            name = f"study_ccdf_{stop.replace(' ', '_')}.png"
+            figure(results, stop, args.figures / name)
+    content = report(results)
+    if args.out:
+        args.out.write_text(content, encoding="utf-8")
+    print(content)
+
+
+if __name__ == "__main__":
+    main()
