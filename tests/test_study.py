@@ -1,0 +1,136 @@
+"""The protocols of the study: which runs are left, and what the report says of runs."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from newton_qd.qd.algorithms import ALGORITHMS, algorithm_named
+from newton_qd.qd.config import EvolveConfig
+
+FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
+sys.path.insert(0, str(FOLDER))
+
+import study_runs  # noqa: E402
+import study_scores  # noqa: E402
+from study_protocols import FIELD, HUMANOIDS, PROTOCOLS, SMALL, Stop  # noqa: E402
+from study_report import interval  # noqa: E402
+
+TASK, CELLS = "hopper_uni", 8
+STOPS = tuple(map(str, SMALL.stops))
+
+
+def line(algorithm: str, seed: int, stop: str, **values: Any) -> dict[str, str]:
+    given = {
+        **dict.fromkeys(study_runs.HEAD, 1.0),
+        **{"protocol": "small", "task": TASK, "algorithm": algorithm, "seed": seed},
+        **{"variant": f"{algorithm}@1", "stop": stop, "device": "cpu"},
+        **{"initial_fitness": 2.0, **values},
+    }
+    return {name: str(given[name]) for name in study_runs.HEAD}
+
+
+def add(out: Path, algorithm: str, seed: int, stop: str, fitnesses: Any) -> None:
+    """Adds a run whose re-evaluated elites lose 1."""
+    raw = np.asarray(fitnesses, np.float32)
+    (out / "cells").mkdir(exist_ok=True)
+    path = out / "cells" / f"{TASK}.{algorithm}@1.{seed}.npz"
+    np.savez(path, **{stop: np.stack([raw, raw - 1])})
+    study_runs.add_line(out / "runs.csv", line(algorithm, seed, stop))
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS.values(), ids=lambda x: x.name)
+def test_every_variant_is_a_setting(protocol: Any) -> None:
+    known = {spec.name for spec in ALGORITHMS}
+    assert set(protocol.algorithms) <= known
+    variants = study_runs.variants()
+    for algorithm in protocol.algorithms:
+        own = [name for name in variants if name.split("@")[0] == algorithm]
+        assert own and own[0] == f"{algorithm}@1"
+        for name in own:
+            given = {**protocol.settings_of(TASK), **variants[name]}
+            config = EvolveConfig(env_name=TASK, algorithm=algorithm, **given)
+            algorithm_named(algorithm).read_options(config)
+    assert protocol.settings_of(TASK)["hidden"] == [64, 64]
+
+
+def test_baselines_get_as_many_variants() -> None:
+    names = [name.split("@")[0] for name in study_runs.variants()]
+    ours = max(names.count(name) for name in study_scores.OURS)
+    assert ours <= min(names.count(name) for name in ("me", "ascii-me", "pga-me"))
+
+
+def test_humanoids_have_larger_policies() -> None:
+    for name in HUMANOIDS:
+        assert FIELD.settings_of(name)["hidden"] == [256, 256]
+        assert FIELD.has(name, "me") and not FIELD.has(name, "cma-me")
+    assert FIELD.has("ant_uni", "cma-me") and len(FIELD.tasks) == 10
+    assert FIELD.seeds_of("me") == 20 and FIELD.seeds_of("pga-me") == 5
+
+
+def test_stops_come_by_evaluations_and_time() -> None:
+    assert Stop("evaluations", 10).reached(10, 0.0)
+    assert not Stop("evaluations", 10).reached(9, 99.0)
+    assert Stop("s", 60).reached(0, 60.0) and not Stop("s", 60).reached(99, 59.9)
+    assert [str(x) for x in FIELD.stops_until(250)] == [
+        "1000000 evaluations",
+        "60 s",
+        "250 s",
+    ]
+
+
+def left(out: Path, until: float = 40, **given: Any) -> list[str]:
+    options: dict[str, Any] = {"tasks": [TASK], "algorithms": ["me"], "seeds": 2}
+    found = study_runs.missing(SMALL, out, until=until, **{**options, **given})
+    return [str(run) for run in found]
+
+
+def test_finished_runs_are_left_out(tmp_path: Path) -> None:
+    assert left(tmp_path) == [f"{TASK}.me@1.0", f"{TASK}.me@1.1"]
+    study_runs.add_line(tmp_path / "runs.csv", line("me", 0, "20 s"))
+    assert left(tmp_path) == [f"{TASK}.me@1.0", f"{TASK}.me@1.1"]
+    assert left(tmp_path, until=20) == [f"{TASK}.me@1.1"]
+    study_runs.add_line(tmp_path / "runs.csv", line("me", 0, "40 s"))
+    assert left(tmp_path) == [f"{TASK}.me@1.1"]
+    assert len(study_runs.lines(tmp_path)) == 2
+
+
+def test_tuning_chooses_the_corrected_score(tmp_path: Path) -> None:
+    assert len(left(tmp_path, tune=True)) == 4
+    for variant, gain in (("me@1", 3.0), ("me@2", 5.0), ("me@3", 4.0)):
+        row = line("me", 1000, "20 s", corrected_qd_gain=gain) | {"variant": variant}
+        study_runs.add_line(tmp_path / "runs.csv", row)
+    assert study_runs.best_variant(tmp_path, TASK, "me") == "me@2"
+    assert left(tmp_path / "other", tuned=tmp_path, seeds=1) == [f"{TASK}.me@2.0"]
+    with pytest.raises(FileNotFoundError, match="no run of pga-me"):
+        study_runs.best_variant(tmp_path, TASK, "pga-me")
+
+
+def test_the_report_compares_corrected_archives(tmp_path: Path) -> None:
+    empty, stop = -np.inf, "20 s"
+    me = [4.0, empty, 6.0, empty, 3.0, 2.0, empty, empty]
+    ours = [9.0, 5.0, 11.0, empty, empty, empty, empty, empty]
+    for seed in (0, 1):
+        add(tmp_path, "me", seed, stop, me)
+        add(tmp_path, "me-conditioned", seed, stop, ours)
+    results = study_scores.load(tmp_path)
+    # untrained: 2; best known: 11 - 1 after another evaluation
+    assert study_scores.references(results) == {TASK: (2.0, 10.0)}
+    shared = study_scores.common(results, TASK, stop)
+    assert shared == {"me": [4.0, 4.0], "me-conditioned": [9.0, 9.0]}
+    scores = {
+        key[1]: study_scores.normalized(runs[0], (2.0, 10.0))
+        for key, runs in results.items()
+    }
+    assert scores["me"] == pytest.approx((1 + 3) / 8 / CELLS)
+    assert scores["me-conditioned"] == pytest.approx((6 + 2 + 8) / 8 / CELLS)
+    content = study_scores.report(results)
+    assert (
+        "| hopper_uni | me-conditioned 0.2500 (0.2500 to 0.2500) | me 0.06" in content
+    )
+    assert "| 4.00 | apart |" in content
+    assert interval([np.array([1.0, 1.0])]) == (1.0, 1.0, 1.0)
