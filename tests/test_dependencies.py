@@ -88,7 +88,9 @@ def test_every_import_is_declared(folder: str) -> None:
 
 
 def test_the_package_needs_no_extra_of_developers() -> None:
-    names = declared("qd", "ribs", "tensorboard", "viz", "video", "gym", "torch")
+    names = declared(
+        "qd", "ribs", "tensorboard", "viz", "video", "gym", "brax", "torch"
+    )
     missing = {
         f"{path}: {root}"
         for path, root in imported(ROOT / "newton_qd")

@@ -70,6 +70,7 @@ HOMES = {
 }
 LEAF_HOMES = ("adapters/", "qd/", "viewing/", "compat/", "cli/")
 # each adapter is one door: no other module knows what is behind it
+HOMES["brax"] = ("adapters/brax",)
 HOMES["gymnasium"] = ("adapters/gymnasium",)
 HOMES["torch"] = ("adapters/torch",)
 # the gradient doctor's report draws itself
