@@ -30,7 +30,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 MOMENTS = 20
 GROWTH = 1.02
@@ -115,21 +115,41 @@ def kills(count: int) -> bool:
     moments = random.Random(0)
     with tempfile.TemporaryDirectory() as folder:
         expected, out = Path(folder) / "expected", Path(folder) / "run"
-        arguments = [sys.executable, *EVOLVE, "--iterations", str(20 * count)]
+        arguments = [
+            sys.executable,
+            *EVOLVE,
+            "--iterations",
+            str(60 * count),
+            "--quiet",
+        ]
         begin = time.monotonic()
-        run_to_end([*arguments, "--out", str(expected)])
-        whole = time.monotonic() - begin
+        process = subprocess.Popen([*arguments, "--out", str(expected)])
+        wait_for_more(expected, process)
+        begun = time.monotonic() - begin
+        process.wait()
+        again = [*arguments, "--out", str(out), "--resume"]
         for attempt in range(count):
-            again = [*arguments, "--out", str(out), "--resume"]
             process = subprocess.Popen(
                 again, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
             )
-            time.sleep(moments.uniform(0.0, min(whole, 15.0)))
+            if attempt % 2:  # between or in generations, else while it begins
+                wait_for_more(out, process)
+                time.sleep(moments.uniform(0.0, 0.5))
+            else:
+                time.sleep(moments.uniform(0.0, begun))
             process.kill()
             process.wait()
-            print(f"kill {attempt + 1} of {count}", flush=True)
-        run_to_end([*arguments, "--out", str(out), "--resume"])
+            there = generations_in(out)
+            print(f"kill {attempt + 1} of {count} after generation {there}", flush=True)
+        run_to_end(again)
         return same_archives(expected, out)
+
+
+def wait_for_more(out: Path, process: subprocess.Popen[Any]) -> None:
+    """Waits until a run has written a generation more than there was."""
+    before = generations_in(out)
+    while generations_in(out) <= before and process.poll() is None:
+        time.sleep(0.01)
 
 
 def full_disk(count: int) -> bool:
@@ -209,18 +229,16 @@ def survives(
             arguments, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
         )
 
-    table, written = out / "metrics.csv", -1
+    written = -1
     if wait is None:
         with trouble(out.parent, None):
             process = start()
             error = process.communicate()[1]
     else:
-        before = generations_in(table)
         process = start()
-        while generations_in(table) <= before and process.poll() is None:
-            time.sleep(0.01)
+        wait_for_more(out, process)
         time.sleep(wait)
-        written = generations_in(table)
+        written = generations_in(out)
         with trouble(out.parent, process):
             error = process.communicate()[1]
     kept = load_run(out).iteration if written >= 0 else -1
@@ -229,8 +247,9 @@ def survives(
     return complained and kept >= written
 
 
-def generations_in(table: Path) -> int:
+def generations_in(out: Path) -> int:
     """Number of the last generation in ``metrics.csv``; -1: none."""
+    table = out / "metrics.csv"
     return table.read_bytes().count(b"\n") - 2 if table.exists() else -1
 
 

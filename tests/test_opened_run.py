@@ -230,6 +230,10 @@ def test_eval_refuses(
 
 
 def test_eval_of_no_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert call("eval", tmp_path / "no") == cli.BAD_ARGUMENTS
+    assert "no', which does not exist; allowed: a results folder, as" in (
+        capsys.readouterr().err
+    )
     assert call("eval", tmp_path) == cli.BAD_ARGUMENTS
     assert "cannot read" in capsys.readouterr().err
 

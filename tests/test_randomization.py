@@ -102,7 +102,7 @@ def test_ranges_of_arrays_and_of_one_value() -> None:
     ("options", "message"),
     [
         ({"friction": (0.5,)}, r"friction: got .*\(low, high\)"),
-        ({"friction": 0.5}, r"friction: got 0.5.*\(low, high\)"),
+        ({"friction": 0.5}, r"friction: got 0.5.*\(low, high\), numbers$"),
         ({"gear_scale": (np.ones(3), 2.0)}, r"gear_scale: got .*\(8,\)"),
         ({"gravity": (2.0, 1.0)}, r"gravity: got .*low is above high"),
         ({"mass_scale": (0.0, 1.0)}, r"mass_scale: got 0.0; .*above 0"),

@@ -102,6 +102,12 @@ def test_wrong_arguments_are_named(ant: Any) -> None:
         record(ant, "walk", key)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="worlds: got 0"):
         record(ant, jnp.zeros((3, 8)), key, worlds=0)
+    with pytest.raises(ValueError, match=r"steps: got 4; allowed: None, .* 1 to 3"):
+        record(ant, jnp.zeros((3, 8)), key, steps=4)
+    with pytest.raises(ValueError, match=r"steps, worlds: got .*, which needs at leas"):
+        record(ant, lambda obs: obs[:8], key, steps=2**31 - 1)
+    with pytest.raises(TypeError, match="key: got 3; allowed: one key"):
+        record(ant, jnp.zeros((3, 8)), 3)  # type: ignore[arg-type]
     with pytest.raises(TypeError, match="env: got str; allowed: environments"):
         record("ant", jnp.zeros((3, 8)), key)  # type: ignore[arg-type]
     batch = newton_qd.create("pointmaze", batch_size=2)

@@ -74,12 +74,20 @@ def add_parsers(commands: Commands) -> None:
 
 
 def opened(folder: Path, task_factory: TaskFactory) -> Run:
-    """Opens a run; says what differs from the machine that made it."""
+    """Opens a run; says what differs from the machine that made it.
+
+    Raises:
+        ConfigError: The folder does not exist, or holds no run.
+    """
     from newton_qd.physics.precision import quiet
     from newton_qd.qd.run.opened import load_run
     from newton_qd.qd.scoring.task import make_task
 
     quiet()
+    if not folder.is_dir():
+        why = "which is a file" if folder.exists() else "which does not exist"
+        allowed = "a results folder, as newton-qd evolve writes it"
+        raise ConfigError(message("DIR", str(folder), allowed, why=why))
     run = load_run(
         folder, task_factory=make_task if task_factory is None else task_factory
     )

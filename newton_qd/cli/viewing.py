@@ -375,10 +375,12 @@ def _random_trajectory(arguments: argparse.Namespace) -> Trajectory:
 
     from newton_qd.physics.precision import quiet
     from newton_qd.viewing import record
+    from newton_qd.viewing.recording import check_memory
 
     quiet()
     steps, worlds = arguments.steps or _RANDOM_STEPS, arguments.best or 1
     env = newton_qd.create(arguments.what, episode_length=steps, auto_reset=False)
+    check_memory(env, steps, worlds)
     start, noise = jax.random.split(jax.random.key(arguments.seed or 0))
     shape = (worlds, steps, env.action_size)
     actions = jax.random.uniform(noise, shape, env.dtype, -1, 1)

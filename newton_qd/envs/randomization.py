@@ -108,7 +108,9 @@ def _bounds(name: str, limits: Range, default: jax.Array) -> tuple[np.ndarray, .
     Raises:
         ValueError: The range has the wrong shape, type or order.
     """
-    allowed = f"(low, high), numbers or arrays of shape {default.shape}"
+    allowed = "(low, high), numbers"
+    if default.shape:
+        allowed += f" or arrays of shape {default.shape}"
     try:
         low, high = (
             np.broadcast_to(np.asarray(end, default.dtype), default.shape)

@@ -12,9 +12,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from newton_qd import checks, physics
+from newton_qd import checks, memory, physics
 from newton_qd.checks import Fact, message
 from newton_qd.envs.base import Env, PhysicsEnv
+from newton_qd.envs.inputs import require_key
 from newton_qd.types import Action, Observation, Params, PyTree, RNGKey
 from newton_qd.viewing.drawing import Drawing, drawing_of
 from newton_qd.viewing.trajectory import Contacts, Trajectory
@@ -55,21 +56,29 @@ def record(
 
     Raises:
         TypeError: The environment cannot be drawn, or an argument has the wrong type.
-        ValueError: The environment has a batch, the actions have the wrong shape, or
-            ``steps`` or ``worlds`` is not an integer above 0.
+        ValueError: The environment has a batch, the actions have the wrong shape,
+            ``steps`` or ``worlds`` is not an integer above 0, there are fewer actions
+            than ``steps``, or the trajectory does not fit in memory.
         RobotDescriptionError: A URDF file is malformed.
         OSError: A URDF file cannot be read.
     """
     drawing = drawing_of(env)
+    require_key("key", key)
     checks.integer("steps", steps, optional=True)
     checks.integer("worlds", worlds, optional=True)
     plan = None
     if not callable(policy):
         plan, worlds = _checked_plan(env, policy, worlds)
-        steps = plan.shape[1] if steps is None else min(steps, plan.shape[1])
+        if steps is not None and steps > plan.shape[1]:
+            allowed = (
+                f"None, or integers from 1 to {plan.shape[1]}, as there are actions"
+            )
+            raise ValueError(message("steps", steps, allowed))
+        steps = plan.shape[1] if steps is None else steps
     if steps is None:
         steps = _episode_steps(env)
     worlds = 1 if worlds is None else worlds
+    check_memory(env, steps, worlds)
     keys = key[None] if worlds == 1 else jax.random.split(key, worlds)
     acts = (lambda _, observation: policy(observation)) if callable(policy) else None
     run = functools.partial(_run, env, acts, params, contacts, steps)
@@ -78,6 +87,22 @@ def record(
     seen = jax.jit(jax.vmap(run))(keys, None, plan)
     seen = jax.tree.map(np.asarray, seen)
     return _trajectory(env, drawing, seen, labels)
+
+
+def check_memory(env: Env, steps: int, worlds: int) -> None:
+    """Checks that a trajectory can fit in memory.
+
+    Args:
+        env: Environment of one world.
+        steps: Control steps.
+        worlds: Number of worlds.
+
+    Raises:
+        ValueError: It cannot.
+    """
+    # actions, and about as many numbers as an observation has
+    needed = 4 * (env.action_size + env.observation_size) * steps * worlds
+    memory.check("steps, worlds", (steps, worlds), needed, memory.limit())
 
 
 class Recorder:
