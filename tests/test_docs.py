@@ -212,6 +212,13 @@ def test_dead_links_and_other_hosts_are_found(tmp_path: Path) -> None:
     ]
 
 
+@pytest.mark.parametrize("name", ["README", "CONTRIBUTING", "CHANGELOG"])
+def test_links_of_the_first_pages_lead_to_files(name: str) -> None:
+    text = (ROOT / f"{name}.md").read_text(encoding="utf-8")
+    links = re.findall(r"\]\((?!https?:)([^)#]+)", text)
+    assert links and not [link for link in links if not (ROOT / link).exists()]
+
+
 NOTEBOOKS = sorted((DOCS / "notebooks").glob("*.ipynb"))
 
 
