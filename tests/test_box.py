@@ -215,7 +215,11 @@ def round_a_corner(s: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize(
     "line",
-    [pytest.param(tipping, marks=pytest.mark.slow), over_an_edge, round_a_corner],
+    [
+        pytest.param(tipping, marks=pytest.mark.slow),
+        pytest.param(over_an_edge, marks=pytest.mark.slow),
+        round_a_corner,
+    ],
 )
 def test_step_is_smooth(
     x64: None, tmp_path: Path, line: Callable[[np.ndarray], np.ndarray]

@@ -70,7 +70,11 @@ def test_step_and_kinematics_read_the_same(x64: None, robot: RobotSpec) -> None:
         np.testing.assert_allclose(found[:2], expected[:2], rtol=1e-14)
 
 
-@pytest.mark.parametrize("robot", [ANT, HALFCHEETAH, HUMANOID], ids=lambda r: r.name)
+@pytest.mark.parametrize(
+    "robot",
+    [ANT, pytest.param(HALFCHEETAH, marks=pytest.mark.slow), HUMANOID],
+    ids=lambda r: r.name,
+)
 def test_gradients_of_readings(x64: None, robot: RobotSpec) -> None:
     system = system_of(robot)
     inputs = random_states(system, np.random.default_rng(3), 20)

@@ -199,6 +199,7 @@ def test_in_place_and_default_control(device: jax.Device) -> None:
     np.testing.assert_array_equal(numpy(alone.joint_qd, 2), loop.qd)
 
 
+@pytest.mark.slow  # compiles kernels of Newton
 def test_wrench_changes_the_momentum(tmp_path: Path, device: jax.Device) -> None:
     """Only the free joint's wrench does, and it acts at the centre of mass."""
     loop = Loop(off_centre(tmp_path, ARM, gravity=0.0), 1, device)
