@@ -367,7 +367,8 @@ def _wrapper_options(
     """
     if given is None:
         return [wrapper_spec.options for wrapper_spec in spec.wrappers]
-    if isinstance(given, Mapping) or not all(isinstance(x, Mapping) for x in given):
+    rows = isinstance(given, Sequence) and all(isinstance(x, Mapping) for x in given)
+    if not rows:
         allowed = "None, or a sequence of dictionaries, one for each wrapper"
         raise TypeError(message("qdax_wrappers_kwargs", given, allowed))
     if len(given) != len(spec.wrappers):

@@ -7,7 +7,8 @@ import json
 import pytest
 
 import newton_qd
-from newton_qd import cli
+from newton_qd import cli, tasks
+from newton_qd.envs.pointmaze import PointMaze
 
 
 def test_an_environment_is_described(capsys: pytest.CaptureFixture[str]) -> None:
@@ -29,6 +30,20 @@ def test_an_environment_is_described(capsys: pytest.CaptureFixture[str]) -> None
     assert sum(block["size"] for block in found["observation"]) == 2
     assert cli.main(["envs", "antt"]) == cli.BAD_ARGUMENTS
     assert "does not exist" in capsys.readouterr().err
+
+
+def test_a_class_without_a_text(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Plain(PointMaze):
+        action_size = 1
+
+    specs = {**tasks.ENVIRONMENTS, "plain": tasks.EnvironmentSpec(Plain, "plain")}
+    monkeypatch.setattr(tasks, "ENVIRONMENTS", specs)
+    assert cli.main(["envs", "plain"]) == cli.OK
+    text = capsys.readouterr().out
+    assert text.startswith("plain: its class has no description\n\nstep: 1 s\n")
+    assert "action: 1 number\n" in text and "metrics" not in text
 
 
 @pytest.mark.slow

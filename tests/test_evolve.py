@@ -235,6 +235,17 @@ def test_descriptors_out_of_bounds_go_to_the_nearest_cell() -> None:
     np.testing.assert_array_equal(distance.argmin(1), np.flatnonzero(filled))
 
 
+def test_wrong_arguments_of_a_policy_are_named() -> None:
+    env = point_task(SMALL).env
+    for hidden, words in (("ab", "hidden: got 'ab'"), ((4, 0), r"hidden\[1\]: got 0")):
+        with pytest.raises((TypeError, ValueError), match=words):
+            make_policy(env, hidden)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="env: got 'ant'; allowed: an environment"):
+        make_policy("ant", (4,))  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="key: got 3; allowed: one key"):
+        make_policy(env, (4,)).init(3)  # type: ignore[arg-type]
+
+
 def test_genotypes_of_another_policy_are_refused() -> None:
     task = point_task(SMALL)
     policy = make_policy(task.env, SMALL.hidden)

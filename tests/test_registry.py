@@ -381,6 +381,11 @@ def test_a_base_makes_an_environment(rows: None) -> None:
 
 
 def test_arguments_of_wrappers_are_named() -> None:
+    for wrong in (3, "a", iter([{}])):
+        with pytest.raises(
+            TypeError, match=r"^qdax_wrappers_kwargs: got .*sequence of"
+        ):
+            newton_qd.create("ant_uni", qdax_wrappers_kwargs=wrong)  # pyright: ignore
     words = r"^qdax_wrappers_kwargs\[0\], smooth: got 1, which is not an argument of "
     words += "FeetContactWrapper; allowed: smooth_width, straight_through, smooth_tail$"
     with pytest.raises(TypeError, match=words):

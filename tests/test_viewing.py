@@ -31,6 +31,7 @@ from newton_qd.viewing import (
     record_elites,
     render,
     replay_html,
+    write_explorer,
 )
 from newton_qd.viewing.drawing import body_frames, drawing_of_system
 from newton_qd.viewing.trajectory import Trajectory
@@ -93,7 +94,7 @@ def test_a_policy_and_auto_reset() -> None:
     assert np.array_equal(whole.q[3, 2], whole.q[3, 4])
 
 
-def test_wrong_arguments_are_named(ant: Any) -> None:
+def test_wrong_arguments_are_named(ant: Any, walk: Trajectory) -> None:
     key = jax.random.key(0)
     for wrong in (jnp.zeros((3, 7)), jnp.zeros(8), jnp.zeros((2, 0, 8))):
         with pytest.raises(ValueError, match=r"policy: got .*; allowed: a function"):
@@ -106,6 +107,11 @@ def test_wrong_arguments_are_named(ant: Any) -> None:
         record(ant, jnp.zeros((3, 8)), key, steps=4)
     with pytest.raises(ValueError, match=r"steps, worlds: got .*, which needs at leas"):
         record(ant, lambda obs: obs[:8], key, steps=2**31 - 1)
+    with pytest.raises(TypeError, match="trajectory: got 3; allowed: a Trajectory"):
+        render(3, "a.png")  # type: ignore[arg-type]
+    for runs in ("a", ["a"], walk):
+        with pytest.raises(TypeError, match=r"runs.*: got .*; allowed: a list of one"):
+            write_explorer(runs, "a.html")  # type: ignore[arg-type]
     with pytest.raises(TypeError, match="key: got 3; allowed: one key"):
         record(ant, jnp.zeros((3, 8)), 3)  # type: ignore[arg-type]
     with pytest.raises(TypeError, match="env: got str; allowed: environments"):
@@ -262,6 +268,9 @@ def test_an_episode_has_its_length(
     drawn = load_run(reference, task_factory=point_task)
     with pytest.raises(ValueError, match=r"steps: got 10; allowed: None, or .* 1 to 9"):
         record_elites(drawn, drawn.cells[:1], steps=10)
+    for cells in ("a", [1.5]):
+        with pytest.raises(IndexError, match=r"cell: got .*; allowed: integers from 0"):
+            record_elites(drawn, cells)  # type: ignore[arg-type]
     arguments = ["replay", str(reference), "--seed", "1"]
     assert cli.main(arguments, task_factory=point_task) == 2
     assert "--seed: got 1, and elites begin where their run" in capsys.readouterr().err

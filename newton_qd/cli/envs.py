@@ -101,7 +101,9 @@ def _facts(name: str, *, whole: bool) -> dict[str, Any]:
     if not whole:
         return found
     base = env.unwrapped
-    text, _, section = (inspect.getdoc(type(base)) or "").partition("\n\nMetrics:\n")
+    # not the text of a base class, which says nothing about this environment
+    text = inspect.cleandoc(vars(type(base)).get("__doc__") or "")
+    text, _, section = text.partition("\n\nMetrics:\n")
     terms = re.findall(r"^ {4}(\w+): (.*(?:\n {8,}.*)*)", section, flags=re.MULTILINE)
     found["description"] = " ".join(text.split("\n\n")[0].split())
     found["about"] = [" ".join(part.split()) for part in text.split("\n\n")[1:]]
@@ -117,6 +119,10 @@ def _facts(name: str, *, whole: bool) -> dict[str, Any]:
     found["wrappers"] = _wrappers(env)
     found["picture"] = _picture(name)
     return found
+
+
+def _numbers(count: int) -> str:
+    return "1 number" if count == 1 else f"{count} numbers"
 
 
 def _number(value: float | None) -> str:
@@ -144,14 +150,14 @@ def _picture(name: str) -> str | None:
 def _description(found: dict[str, Any]) -> str:
     """Returns the text that describes an environment."""
     name, descriptor = found["name"], found["descriptor"]
-    lines = [f"{name}: {found['description']}"]
+    lines = [f"{name}: {found['description'] or 'its class has no description'}"]
     lines += ["", *(line for part in found["about"] for line in (part, ""))]
     lines += [
         f"step: {found['step_seconds']:g} s",
-        f"observation: {found['observation_size']} numbers",
+        f"observation: {_numbers(found['observation_size'])}",
     ]
     lines += [f"  {block['size']:4}  {block['name']}" for block in found["observation"]]
-    lines.append(f"action: {found['action_size']} numbers")
+    lines.append(f"action: {_numbers(found['action_size'])}")
     lines += [
         f"  {motor['joint']}, gear {motor['gear']:g}" for motor in found["actuators"]
     ]
@@ -162,7 +168,8 @@ def _description(found: dict[str, Any]) -> str:
         limits = ", ".join(f"{low:g} to {high:g}" for low, high in ends)
         lines.append(f"descriptor: {descriptor['name']}, limits {limits}")
         lines.append(f"reward offset: {_number(found['reward_offset'])}")
-    lines.append("metrics, the terms of the reward and more:")
+    if found["metrics"]:
+        lines.append("metrics, the terms of the reward and more:")
     lines += [f"  {term}: {meaning}" for term, meaning in found["metrics"].items()]
     lines.append(f"wrappers: {', '.join(found['wrappers']) or 'none'}")
     picture = found["picture"] or f"newton-qd render {name} --png makes one"

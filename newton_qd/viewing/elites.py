@@ -33,7 +33,7 @@ def record_elites(
 
     Args:
         run: The run, from ``newton_qd.qd.load_run(DIR)``.
-        cells: (N,) rows of the archive, with at least one.
+        cells: (N,) rows of the archive, with at least one; or a row.
         steps: Control steps, up to the episode length of the run; ``None``: all.
         contacts: Whether to record the impulse of every contact.
         progress: Called after each batch with the number of recorded elites and N.
@@ -44,7 +44,7 @@ def record_elites(
         IndexError: A cell does not exist.
         LookupError: A cell is empty.
     """
-    elites = [run.elite(int(cell)) for cell in cells]
+    elites = [run.elite(cell) for cell in np.atleast_1d(np.asarray(cells)).tolist()]
     length = run.config.episode_length
     checks.integer("steps", steps, optional=True)
     if steps is not None and steps > length:

@@ -55,12 +55,17 @@ def explorer_html(
         progress: Called with the number of recorded elites and their total.
 
     Raises:
-        TypeError: The environment cannot be drawn.
+        TypeError: The environment cannot be drawn, or ``runs`` is no list of runs.
         ValueError: There are not one or two runs, an archive is empty, the robots
             differ, or a number is not allowed.
     """
     checks.integer("starts", starts, least=0)
     checks.integer("seed", seed, least=0)
+    allowed = "a list of one run or two runs, as newton_qd.qd.load_run returns them"
+    checks.instance("runs", runs, (list, tuple), allowed)
+    for index, run in enumerate(runs):
+        if not hasattr(run, "cells"):
+            raise TypeError(message(f"runs[{index}]", run, allowed))
     if not 1 <= len(runs) <= _MOST_RUNS:
         raise ValueError(message("runs", Fact(f"{len(runs)} runs"), "one run or two"))
     for run in runs:
@@ -116,7 +121,7 @@ def write_explorer(
         The path of the file.
 
     Raises:
-        TypeError: The environment cannot be drawn.
+        TypeError: The environment cannot be drawn, or ``runs`` is no list of runs.
         ValueError: There are not one or two runs, an archive is empty, the robots
             differ, or a number is not allowed.
         OSError: The file cannot be written.

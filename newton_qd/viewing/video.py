@@ -65,12 +65,13 @@ def render(
         The path of the file.
 
     Raises:
-        TypeError: A number has the wrong type.
+        TypeError: An argument has the wrong type.
         ValueError: The path has another ending, or a number is not allowed.
         MissingExtra: Pillow (for ``.png`` and ``.gif``) or imageio-ffmpeg (for
             ``.mp4``) is not installed.
         OSError: The file cannot be written.
     """
+    checks.instance("trajectory", trajectory, Trajectory, "a Trajectory")
     target = Path(path)
     ending = target.suffix.lower()
     if ending not in FORMATS:

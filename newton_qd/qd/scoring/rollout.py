@@ -11,7 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from newton_qd import checks
 from newton_qd.checks import Fact, message
+from newton_qd.envs.inputs import require_key
 from newton_qd.gradients.episode import Episode
 from newton_qd.gradients.flow import EXACT, GradientOptions
 from newton_qd.qd.extras import require_extra
@@ -76,7 +78,13 @@ def make_policy(env: Environment, hidden: tuple[int, ...]) -> Policy:
 
     Raises:
         MissingExtra: QDax is not installed.
+        TypeError: ``env`` is not an environment, or ``hidden`` is no sequence.
+        ValueError: A width is not an integer above 0.
     """
+    checks.environment(env, needs="observation_size")
+    checks.instance("hidden", hidden, (tuple, list), "a tuple of integers")
+    for index, width in enumerate(hidden):
+        checks.integer(f"hidden[{index}]", width)
     require_extra("qdax", "qd")
     from qdax.core.neuroevolution.networks.networks import MLP
 
@@ -91,6 +99,7 @@ def make_policy(env: Environment, hidden: tuple[int, ...]) -> Policy:
     flat, unravel = ravel_pytree(zeros)
 
     def init(key: RNGKey) -> jax.Array:
+        require_key("key", key)
         return ravel_pytree(network.init(key, dummy))[0]
 
     def apply(parameters: PyTree, observation: Observation) -> jax.Array:
