@@ -230,11 +230,15 @@ def test_gpus_share_the_worlds() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.skipif(
+    jax.__version_info__ < (0, 10), reason="before, JAX cannot split random numbers so"
+)
 def test_a_mesh_with_explicit_axes_splits_steps_and_gradients() -> None:
     """Axes are explicit by default; each device steps its share of the worlds."""
     code = """
 import contextlib
 import newton_qd
+from newton_qd.gradients import Episode
 from jax.sharding import NamedSharding, PartitionSpec
 from newton_qd.physics.native import all_plans
 
@@ -251,9 +255,27 @@ reset, step = (jax.jit(jax.vmap(f)) for f in (env.reset, env.step))
 def slope(state, action):
     return jax.grad(lambda a: jax.vmap(env.step)(state, a).reward.sum())(action)
 
+# rollouts, and episodes of plans and of policies, with their gradients
+plans = jax.random.uniform(keys[1], (8, 3, env.action_size), minval=-1.0)
+weights = jax.random.normal(keys[2], (8, env.observation_size, env.action_size)) / 9
+extractor = newton_qd.tables.descriptor_extractor["ant_uni"]
+
+@jax.jit
+def whole(state, plans, weights, key):
+    planned, closed = (
+        Episode(env, policy, extractor, episode_length=3)
+        for policy in (None, lambda w, seen: jnp.tanh(seen @ w))
+    )
+    return (
+        jax.vmap(env.rollout)(state, plans),
+        planned.gradient(plans, key),
+        closed.gradient(weights, key),
+    )
+
 start, one = reset(keys), jax.jit(env.reset)(keys[0])
 found = (start, step(start, actions), slope(start, actions))
 expected = jax.tree.leaves(jax.block_until_ready(found))
+long = jax.tree.leaves(whole(start, plans, weights, keys[3]))
 for count in (2, 4):
     mesh = jax.make_mesh((count,), ("b",), devices=jax.devices()[:count])
     assert mesh.axis_types == (jax.sharding.AxisType.Explicit,)
@@ -274,6 +296,12 @@ for count in (2, 4):
             ):
                 shared = jax.jit(jax.vmap(env.step, axes))(state, action)
                 jax.block_until_ready((shared, found))
+            if (context is mesh) == (count == 4):
+                given = *jax.device_put((plans, weights), axis), keys[3]
+                given = jax.tree.leaves(whole(start, *given))
+                for a, b in zip(long, given, strict=True):
+                    assert b.sharding.spec[0] == "b", b.sharding
+                    np.testing.assert_array_equal(a, b)
     for a, b in zip(expected, found, strict=True):
         assert b.sharding.spec[0] == "b", b.sharding
         np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6)

@@ -6,6 +6,7 @@ import jax
 import numpy as np
 
 from newton_qd.checks import message
+from newton_qd.physics.explicit_mesh import rows_of
 from newton_qd.physics.system import PhysicsState, System
 
 
@@ -23,7 +24,7 @@ def linear_changes(
         (n, 3) world axes [m/s].
     """
     mass = np.asarray(system.mass[bodies], system.dtype)[:, None]
-    return state.impulse[bodies, :3] / mass
+    return rows_of(state.impulse, bodies, slice(0, 3)) / mass
 
 
 def angular_changes(
@@ -44,7 +45,8 @@ def angular_changes(
         ValueError: An inertia is not the same about every axis.
     """
     inertia = isotropic_inertia(system, bodies, reader)
-    return state.impulse[bodies, 3:] / np.asarray(inertia, system.dtype)[:, None]
+    turned = rows_of(state.impulse, bodies, slice(3, 6))
+    return turned / np.asarray(inertia, system.dtype)[:, None]
 
 
 def isotropic_inertia(system: System, bodies: np.ndarray, reader: str) -> np.ndarray:

@@ -148,7 +148,8 @@ class PointMaze(QDEnv):
             jnp.where(sound, old, frozen), jnp.where(sound, action, jnp.zeros_like(old))
         )
         position = jnp.where(sound, moved, frozen)
-        one, zero = jnp.ones((), self._dtype), jnp.zeros((), self._dtype)
+        ends = jnp.ones((), self._dtype), jnp.zeros((), self._dtype)
+        one, zero = split_as([position], ends)
         reward = -length(position - self._array(self._goal))
         return state.replace(
             obs=position,

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from newton_qd.checks import message
 from newton_qd.envs import inputs
 from newton_qd.envs.state import State
+from newton_qd.physics.explicit_mesh import split_as
 from newton_qd.physics.step import Foreseen
 from newton_qd.physics.step import rollout as physics_rollout
 from newton_qd.types import Action, Params
@@ -47,7 +48,14 @@ def rollout(env: Any, state: State, actions: Action, params: Params) -> State:
     order = _order(env)
     if order == RolloutOrder.ONE_BY_ONE:
         return _in_order(env, state, actions, params, known=False)
-    known = _foresee(env.unwrapped, state, actions, params)
+    base = env.unwrapped
+    inputs.require_robot_state(state, base.system, ())
+    actions = jax.vmap(
+        lambda action: inputs.checked_action(action, base.action_size, base.dtype)
+    )(actions)
+    given = (state, actions, params)
+    state, actions, params = split_as([state.obs, actions], given)
+    known = _foresee(base, state, actions, params)
     if order == RolloutOrder.IN_ORDER:
         return _in_order(env, state, actions, known, known=True)
     return _at_once(env, state, actions, known)
@@ -80,20 +88,18 @@ def _in_order(
 ) -> State:
     def advance(state: State, row: tuple[Action, Params]) -> tuple[State, State]:
         action, foreseen = row
-        state = env.step(state, action, foreseen if known else params)
-        return state, state
+        after = env.step(state, action, foreseen if known else params)
+        after = split_as([state.reward, action], after)
+        return after, after
 
     rows = (actions, params if known else None)
+    state = split_as([state.reward, jnp.asarray(actions)], state)
     return jax.lax.scan(advance, state, rows)[1]
 
 
 def _foresee(base: Any, state: State, actions: Action, params: Params) -> Foreseen:
     """Runs the physics of a :class:`~newton_qd.envs.base.PhysicsEnv` for a plan."""
-    inputs.require_robot_state(state, base.system, ())
     start = state.pipeline_state
-    actions = jax.vmap(
-        lambda action: inputs.checked_action(action, base.action_size, base.dtype)
-    )(actions)
     controls = jax.vmap(base.control, (None, 0))(start, actions)
     # as in ``PhysicsEnv.step``: such a control tells the physics to freeze a world
     sound = jnp.all(jnp.isfinite(actions), axis=1) & (state.info["fault"] == 0)

@@ -12,6 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from newton_qd.physics.explicit_mesh import mesh_of
+
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
 _NUMBERS = (jax.Array, np.ndarray, np.generic, bool, int, float)
@@ -35,7 +37,10 @@ def compiled_once(
     def run(*given: Any, **named: Any) -> Any:
         bound = signature.bind(*given, **named)
         (this, *arguments), options = bound.args, bound.kwargs
-        if _compiling() or not _arrays_only(arguments):
+        if _compiling():
+            with mesh_of(arguments):
+                return method(*given, **named)
+        if not _arrays_only(arguments):
             return method(*given, **named)
         kept = this.__dict__.setdefault(_KEPT, {})
         key = (method.__name__, repr(sorted(options.items())))

@@ -29,6 +29,7 @@ from newton_qd.gradients.outcome import Outcome, at_fault, finished, transition
 from newton_qd.gradients.plans import run_plan
 from newton_qd.gradients.scores import gradient_scores, scores
 from newton_qd.moved import moved_name
+from newton_qd.physics.explicit_mesh import split_as
 from newton_qd.types import (
     DescriptorExtractor,
     Environment,
@@ -170,9 +171,11 @@ class Episode:
         if self.policy is None:
             rows["action"] = self._plan(parameters)
         no = jnp.zeros((), bool)
+        likes = [x for x in jax.tree.leaves((parameters, first, params)) if x.size]
+        carry = split_as(likes, (first, jnp.zeros((), dtype), no, no))
         (_, fitness, _, bad), (readings, over, taken) = scan_keeping(
-            functools.partial(self._advance, parameters, first, params),
-            (first, jnp.zeros((), dtype), no, no),
+            functools.partial(self._advance, parameters, carry[0], params),
+            carry,
             rows,
             steps,
             self.options.checkpoint_every,
@@ -376,6 +379,7 @@ class Episode:
         # the step of a user's environment may have no parameters
         step: Callable[..., StateLike] = self.env.step
         state = step(state, action) if params is None else step(state, action, params)
+        state = split_as([begin.reward], state)
         steps = transition(begin, action, state) if self.transitions else {}
         # This sum is in time order. A reduction over time would depend on the batch
         # size.

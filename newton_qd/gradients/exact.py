@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from newton_qd.envs.state import select
 from newton_qd.gradients.outcome import Outcome
 from newton_qd.moved import moved_name
+from newton_qd.physics.explicit_mesh import split_as
 from newton_qd.types import Genotype, PyTree, RNGKey
 
 _MOVED = {
@@ -72,12 +73,15 @@ def differentiate(
 
     def values(genotype: Genotype) -> tuple[jax.Array, Outcome]:
         outcome = run(genotype)
-        return jnp.append(outcome.fitness, outcome.descriptor), outcome
+        parts = [outcome.fitness, outcome.descriptor]
+        fitness, descriptor = split_as(parts, parts)
+        return jnp.append(fitness, descriptor), outcome
 
     rows, pull, outcome = jax.vjp(values, genotype, has_aux=True)
     if weights is None:
         weights = jnp.eye(rows.size, dtype=rows.dtype)
-    (gradients,) = jax.vmap(pull)(weights.astype(rows.dtype))
+    weights = split_as([rows], weights.astype(rows.dtype))
+    (gradients,) = jax.vmap(pull)(weights)
     sound = finite_rows(gradients)
     zeros = jax.tree.map(jnp.zeros_like, gradients)
     return EpisodeGradients(

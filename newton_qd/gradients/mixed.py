@@ -16,6 +16,7 @@ from newton_qd.envs.state import select
 from newton_qd.gradients.exact import EpisodeGradients, finite_rows
 from newton_qd.gradients.outcome import Outcome
 from newton_qd.moved import moved_name
+from newton_qd.physics.explicit_mesh import rows_split_as
 from newton_qd.types import Genotype, PyTree, RNGKey
 
 _MOVED = {
@@ -87,6 +88,7 @@ def mixed_gradients(
         tolerance: Allowed error if the two orders disagree.
     """
     noise = _noise(noise_key, genotypes, samples, sigma)
+    noise = rows_split_as(jax.tree.leaves(genotypes)[0], noise)
     found = _pairs(gradient, genotypes, noise)
     combine = functools.partial(_combined, sigma=sigma, tolerance=tolerance)
     return jax.vmap(combine)(centre, found, noise)
@@ -97,11 +99,12 @@ def _pairs(
 ) -> EpisodeGradients:
     """Returns values and gradients at x + w and x - w, leaves (N, samples, 2, ...)."""
     signs = jnp.array([1, -1], jnp.int32)
-    around = jax.tree.map(
-        lambda x, w: x[:, None, None] + w[:, :, None] * _like(signs, w[0]),
-        genotypes,
-        noise,
-    )
+
+    def moved(x: jax.Array, w: jax.Array) -> jax.Array:
+        sign = signs.astype(w.dtype).reshape(2, *[1] * (w.ndim - 2))
+        return x[:, None, None] + w[:, :, None] * sign
+
+    around = jax.tree.map(moved, genotypes, noise)
     shape = jax.tree.leaves(around)[0].shape[:3]
     found = gradient(jax.tree.map(lambda x: x.reshape(-1, *x.shape[3:]), around))
     return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), found)

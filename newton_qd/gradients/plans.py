@@ -9,6 +9,7 @@ import jax.numpy as jnp
 
 from newton_qd.envs.env import Env
 from newton_qd.gradients.outcome import at_fault
+from newton_qd.physics.explicit_mesh import split_as
 from newton_qd.types import Params
 
 
@@ -31,7 +32,8 @@ def run_plan(
     """
     states = env.rollout(first, plan, params)
     ended = jax.lax.cummax((states.done > 0).astype(jnp.int32)) > 0
-    over = jnp.concatenate([jnp.zeros_like(ended[:1]), ended[:-1]])
+    none = split_as([states.done], jnp.zeros_like(ended[:1]))
+    over = jnp.concatenate([none, ended[:-1]])
     bad = jnp.any(~over & jax.vmap(at_fault)(states))
 
     # This sum is in time order. A reduction over time would depend on the batch size.
@@ -39,9 +41,10 @@ def run_plan(
         over, reward = row
         return jnp.where(over, total, total + reward), None
 
-    zero = jnp.zeros_like(states.reward[0])
+    zero = split_as([states.reward], jnp.zeros_like(states.reward[0]))
     fitness, _ = jax.lax.scan(add, zero, (over, states.reward))
     if not described:
         return fitness, None, over, bad
     begin, after = (x.info["state_descriptor"] for x in (first, states))
+    begin = split_as([after], begin)
     return fitness, jnp.concatenate([begin[None], after[:-1]]), over, bad

@@ -10,12 +10,15 @@ how it is split, and JAX needs a rule for each operation:
 
 from __future__ import annotations
 
+import contextlib
 import functools
-from collections.abc import Callable, Sequence
+import itertools
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.custom_batching import custom_vmap
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
@@ -34,10 +37,8 @@ def row_like(rows: Sequence[jax.Array], size: int) -> jax.ShapeDtypeStruct:
         size: Its length.
     """
     kind = jax.ShapeDtypeStruct((size,), rows[0].dtype)
-    types: list[Any] = [jax.typeof(row) for row in rows]
-    named = hasattr(types[0], "manual_axis_type")  # since JAX 0.10
-    own = [one.manual_axis_type.varying if named else one.vma for one in types]
-    varying = frozenset().union(*own)
+    named = _names_axes(rows[0])
+    varying = frozenset().union(*map(_varying, rows))
     if not varying:
         return kind
     whole = NamedSharding(jax.sharding.get_abstract_mesh(), PartitionSpec())
@@ -46,6 +47,49 @@ def row_like(rows: Sequence[jax.Array], size: int) -> jax.ShapeDtypeStruct:
         axes = sharding.ManualAxisType(varying=varying)
         return kind.update(manual_axis_type=axes, sharding=whole)
     return kind.update(vma=varying, sharding=whole)
+
+
+def _names_axes(row: jax.Array) -> bool:
+    """Returns whether a type has an object for its axes, as since JAX 0.10."""
+    return hasattr(jax.typeof(row), "manual_axis_type")
+
+
+def _varying(row: jax.Array) -> frozenset[Any]:
+    """Returns the axes of the mesh over which a row varies inside ``jax.shard_map``."""
+    kind: Any = jax.typeof(row)
+    return kind.manual_axis_type.varying if _names_axes(row) else kind.vma
+
+
+def split_row(row: jax.Array, offsets: list[int]) -> list[jax.Array]:
+    """Splits a row (size,) as ``jnp.split`` does.
+
+    Before JAX 0.9, the gradient of ``jnp.split`` inside ``jax.shard_map`` is an error
+    if a part has no gradient.
+
+    Args:
+        row: The row.
+        offsets: Where each part but the first begins.
+    """
+    if jax.__version_info__ >= (0, 9) or not _varying(row):
+        return jnp.split(row, offsets)
+    ends = [0, *offsets, row.size]
+    return [row[begin:end] for begin, end in itertools.pairwise(ends)]
+
+
+def rows_of(array: jax.Array, rows: np.ndarray, columns: slice) -> jax.Array:
+    """Returns ``array[rows, columns]``.
+
+    Since JAX 0.11, the gradient of this index needs a rule on a mesh with explicit
+    axes. Parts that are joined need none.
+
+    Args:
+        array: (n, m) array of one world.
+        rows: (k,) numbers of the rows, each at most once.
+        columns: The columns.
+    """
+    if not _on_explicit_mesh(array):
+        return array[rows, columns]
+    return jnp.concatenate([array[row : row + 1, columns] for row in rows.tolist()])
 
 
 def over_devices(
@@ -60,7 +104,8 @@ def over_devices(
 
     @functools.partial(jax.jit, static_argnames="output_dims", inline=True)
     def run(*rows: jax.Array, output_dims: int) -> tuple[jax.Array, ...]:
-        return (batched(output_dims)(*rows),)
+        # a loop over steps is traced with the types of one world
+        return (split_as(rows, batched(output_dims)(*rows)),)
 
     @functools.cache
     def batched(output_dims: int) -> Callable[..., jax.Array]:
@@ -108,6 +153,24 @@ def _explicit(row: jax.Array) -> NamedSharding | None:
     return NamedSharding(sharding.mesh, worlds)
 
 
+@contextlib.contextmanager
+def mesh_of(values: Any) -> Iterator[None]:
+    """Lets JAX split constants under ``vmap``, while a function is compiled.
+
+    Nothing changes without a mesh with explicit axes, and inside ``jax.set_mesh``.
+
+    Args:
+        values: Pytree; some of its arrays may be split.
+    """
+    arrays = [x for x in jax.tree.leaves(values) if isinstance(x, jax.Array)]
+    split = [array for array in arrays if _on_explicit_mesh(array)]
+    if not split or not jax.sharding.get_abstract_mesh().empty:
+        yield
+        return
+    with jax.sharding.use_abstract_mesh(jax.typeof(split[0]).sharding.mesh):
+        yield
+
+
 def split_as(likes: Sequence[jax.Array], values: Tree) -> Tree:
     """Returns values of one world, split over devices as other arrays of this world.
 
@@ -123,17 +186,32 @@ def split_as(likes: Sequence[jax.Array], values: Tree) -> Tree:
         return values
 
     def split(value: jax.Array) -> jax.Array:
-        # The sum with -0 keeps the sign of a zero. The condition makes -0 depend on the
-        # world, so that JAX does not see a constant.
+        # The sum with -0 keeps the sign of a zero. The factor, 0 or 1, makes -0 depend
+        # on the world, so that JAX does not see a constant.
         if jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
             return value
         zero = jnp.asarray(-0.0, value.dtype)
         for like in likes:
             same = _first(like) == _first(like)
-            value = value + jnp.where(same, zero, zero)
+            value = value + same.astype(value.dtype) * zero
         return value
 
     return jax.tree.map(split, values)
+
+
+def rows_split_as(like: jax.Array, values: Tree) -> Tree:
+    """Returns values of a batch, split over devices as another array of this batch.
+
+    Args:
+        like: (N, ...) the array.
+        values: Pytree, leaves (N, ...). Without a mesh with explicit axes, it is
+            returned as it is.
+    """
+    if not _on_explicit_mesh(like):
+        return values
+    sharding = jax.typeof(like).sharding
+    rows = NamedSharding(sharding.mesh, PartitionSpec(sharding.spec[0]))
+    return jax.tree.map(lambda value: jax.sharding.reshard(value, rows), values)
 
 
 def _on_explicit_mesh(array: jax.Array) -> bool:
