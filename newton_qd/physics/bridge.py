@@ -16,7 +16,7 @@ from jax.core import Tracer
 
 from newton_qd.checks import Fact, message
 from newton_qd.physics import layout, row_calls
-from newton_qd.physics.explicit_mesh import split_as
+from newton_qd.physics.explicit_mesh import split_as, split_row
 from newton_qd.physics.launch import Launcher, thread_count
 from newton_qd.physics.layout import Layout
 from newton_qd.physics.row_calls import (
@@ -91,7 +91,7 @@ def _row(
 
 def _split(row: jax.Array, fields: Layout) -> dict[str, jax.Array]:
     """Splits one world's row (size,) into its fields, each in its shape."""
-    parts = jnp.split(row, [field.offset for field in fields][1:])
+    parts = split_row(row, [field.offset for field in fields][1:])
     pairs = zip(fields, parts, strict=True)
     return {field.name: part.reshape(field.shape) for field, part in pairs}
 
