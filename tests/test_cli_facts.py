@@ -36,7 +36,9 @@ def test_a_class_without_a_text(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Plain(PointMaze):
-        action_size = 1
+        @property
+        def action_size(self) -> int:
+            return 1
 
     specs = {**tasks.ENVIRONMENTS, "plain": tasks.EnvironmentSpec(Plain, "plain")}
     monkeypatch.setattr(tasks, "ENVIRONMENTS", specs)
