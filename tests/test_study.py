@@ -39,7 +39,8 @@ def add(out: Path, algorithm: str, seed: int, stop: str, fitnesses: Any) -> None
     raw = np.asarray(fitnesses, np.float32)
     (out / "cells").mkdir(exist_ok=True)
     path = out / "cells" / f"{TASK}.{algorithm}@1.{seed}.npz"
-    np.savez(path, **{stop: np.stack([raw, raw - 1])})
+    cells: dict[str, Any] = {stop: np.stack([raw, raw - 1])}
+    np.savez(path, **cells)
     study_runs.add_line(out / "runs.csv", line(algorithm, seed, stop))
 
 

@@ -152,7 +152,7 @@ class AsciiEmitter(Emitter):
         fitnesses: Any = None,
         descriptors: Any = None,
         extra_scores: Any = None,
-    ) -> AsciiState:
+    ) -> PyTree:
         """Stores the behaviors of the generation and of the new elites."""
         del fitnesses
         seen = self._seen(extra_scores)
