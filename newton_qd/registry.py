@@ -68,7 +68,8 @@ def register(
     """Adds an environment to the names that ``create`` knows.
 
     Args:
-        env_name: A new name: letters, digits and ``_``, not beginning with a digit.
+        env_name: A new name: up to 100 ASCII letters, digits and ``_``, not beginning
+            with a digit.
         base: Class of environments, or function that makes one, without wrappers. A
             function is called once, if it needs no other arguments than ``options``.
         base_name: Name that the wrappers receive; ``None``: ``env_name``.

@@ -257,7 +257,9 @@ def test_help_has_the_options_of_an_algorithm(
     assert "greedy_learning_rate=0.0003" in printed
     assert printed.rstrip().endswith("Give them as --option NAME=VALUE.")
     assert cli.main(["evolve", "--help", "--algorithm", "no"]) == cli.BAD_ARGUMENTS
-    assert "'no', which does not exist" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert "'no', which does not exist" in error
+    assert "those that register_algorithm adds (--module NAME)" in error
 
 
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:

@@ -93,4 +93,5 @@ def algorithm_named(name: str) -> AlgorithmSpec[Any]:
         if spec.name == name:
             return spec
     names = listed([spec.name for spec in algorithms()])
+    names += "; and those that register_algorithm adds (--module NAME)"
     raise ConfigError(message("algorithm", name, names, why="which does not exist"))
