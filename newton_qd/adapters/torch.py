@@ -15,8 +15,10 @@ steps, which wait for that stream.
 # pyright: reportAttributeAccessIssue=false, reportMissingImports=false
 from __future__ import annotations
 
+import dataclasses
+import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -35,15 +37,64 @@ except ModuleNotFoundError as error:
     raise MissingExtra("torch", "torch") from error
 
 
-_ARRAY = "_newton_qd_array"
-"""Attribute of a tensor that a step returned: its array, which shares its memory.
-
-An exchange takes about 70 microseconds of Python, and a state has twenty leaves.
-"""
+_FIELDS = tuple(field.name for field in dataclasses.fields(State))
 
 
-TorchState: TypeAlias = Any
-"""A ``newton_qd.State`` whose leaves are tensors."""
+class TorchState:
+    """A :class:`newton_qd.State` whose leaves are tensors.
+
+    It has the same attributes. Each becomes tensors when it is first read, so a step
+    costs little. It is a pytree of tensors.
+
+    Attributes:
+        arrays: The same state with the arrays of JAX; ``None`` after ``replace``.
+        tracked: Whether one of its tensors requires a gradient.
+    """
+
+    pipeline_state: Any
+    obs: Any
+    reward: Any
+    done: Any
+    metrics: Any
+    info: Any
+
+    def __init__(self, arrays: State | None, parts: dict[str, Any]) -> None:
+        """Makes a state.
+
+        Args:
+            arrays: State of JAX, if there is one.
+            parts: Attributes that are tensors already; all of them without ``arrays``.
+        """
+        self.arrays = arrays
+        self.tracked = bool(parts) and _tracked(parts)
+        vars(self).update(parts)
+
+    def __getattr__(self, name: str) -> Any:
+        if name not in _FIELDS or self.arrays is None:
+            kind = type(self).__name__
+            raise AttributeError(f"{kind!r} object has no attribute {name!r}")
+        value = jax.tree.map(to_torch, getattr(self.arrays, name))
+        setattr(self, name, value)
+        return value
+
+    def __repr__(self) -> str:
+        return f"<TorchState: observation {tuple(self.obs.shape)}>"
+
+    @property
+    def parts(self) -> dict[str, Any]:
+        """All attributes by name, as tensors."""
+        return {name: getattr(self, name) for name in _FIELDS}
+
+    def replace(self, **changes: Any) -> TorchState:
+        """Returns a copy with some attributes replaced."""
+        return TorchState(None, {**self.parts, **changes})
+
+
+jax.tree_util.register_pytree_node(
+    TorchState,
+    lambda state: ((state.parts,), None),
+    lambda _, children: TorchState(None, *children),
+)
 
 
 class TorchEnv(NamedTuple):
@@ -62,9 +113,8 @@ class TorchEnv(NamedTuple):
 def make_torch_step(env: Env) -> TorchEnv:
     """Makes reset and step of an environment for PyTorch.
 
-    The leaves of a state are tensors: ``state.obs``, ``state.reward``, and the others
-    too. Values are bitwise those of ``jax.jit(env.step)``. Tensors of a state share
-    their memory with JAX, so never change one in place.
+    Values are bitwise those of ``jax.jit(env.step)``. Tensors of a state share their
+    memory with JAX, so never change one in place.
 
     Args:
         env: An environment of one world or of a batch, such as
@@ -72,8 +122,8 @@ def make_torch_step(env: Env) -> TorchEnv:
 
     Returns:
         ``(reset, step)``. Both compile at their first call. ``step`` raises
-        ``ValueError`` if tensors are on different devices, and all errors of
-        ``env.step``.
+        ``ValueError`` if the actions are on another device than the state, and all
+        errors of ``env.step``.
 
     Raises:
         TypeError: ``env`` is not an environment.
@@ -83,14 +133,16 @@ def make_torch_step(env: Env) -> TorchEnv:
     return TorchEnv(door.reset, door.step)
 
 
-def detached(tree: PyTree) -> PyTree:
+def detached(state: TorchState) -> TorchState:
     """Returns a state whose gradient goes back no further.
 
     Args:
-        tree: A state, or another pytree of tensors.
+        state: A state.
     """
+    if state.arrays is not None:
+        return TorchState(state.arrays, {})
     return jax.tree.map(
-        lambda leaf: leaf.detach() if isinstance(leaf, torch.Tensor) else leaf, tree
+        lambda leaf: leaf.detach() if isinstance(leaf, torch.Tensor) else leaf, state
     )
 
 
@@ -102,9 +154,7 @@ def to_torch(leaf: Any) -> Any:
     """
     if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
         return leaf
-    tensor = torch.from_dlpack(leaf)
-    setattr(tensor, _ARRAY, leaf)
-    return tensor
+    return torch.from_dlpack(leaf)
 
 
 def to_jax(leaf: Any) -> Any:
@@ -116,9 +166,6 @@ def to_jax(leaf: Any) -> Any:
     """
     if not isinstance(leaf, torch.Tensor):
         return leaf
-    known = getattr(leaf, _ARRAY, None)
-    if known is not None:
-        return known
     return jax.dlpack.from_dlpack(leaf.detach().contiguous())
 
 
@@ -126,10 +173,13 @@ class _Door:
     """The compiled functions of an environment."""
 
     def __init__(self, env: Env) -> None:
+        def run(parts: dict[str, Any], action: jax.Array, params: Params) -> State:
+            return env.step(State(**parts), action, params)
+
         self._reset = jax.jit(env.reset)
-        self.run = jax.jit(env.step)
-        self.linearize = jax.jit(lambda inputs: _linearized(env, inputs))
-        self.pull = jax.jit(lambda pull, slopes: pull(slopes)[0])
+        self._run = jax.jit(run)
+        self.linearize = jax.jit(functools.partial(_linearized, run))
+        self.pull = jax.jit(_pulled, static_argnums=(2, 3))
 
     def reset(self, seed: int) -> TorchState:
         """Begins an episode in every world.
@@ -141,7 +191,7 @@ class _Door:
             ValueError: ``seed`` is not an integer from 0.
         """
         checks.integer("seed", seed, least=0, most=2**32 - 1)
-        return jax.tree.map(to_torch, self._reset(jax.random.key(seed)))
+        return TorchState(self._reset(jax.random.key(seed)), {})
 
     def step(
         self, state: TorchState, action: torch.Tensor, params: Params = None
@@ -154,22 +204,48 @@ class _Door:
             params: Physical parameters; ``None``: the default ones.
 
         Raises:
-            TypeError: The action is not a tensor.
-            ValueError: Tensors are on different devices.
+            TypeError: The state is not one of PyTorch, or the action is not a tensor.
+            ValueError: The action is on another device than the state.
         """
+        checks.instance("state", state, TorchState, "a state of reset or step")
         checks.instance("action", action, torch.Tensor, "a tensor of PyTorch")
-        leaves, structure = jax.tree.flatten((state, action, params))
-        tensors = [leaf for leaf in leaves if isinstance(leaf, torch.Tensor)]
-        for tensor in tensors:
-            if tensor.device != action.device:
-                given = Fact(f"a tensor on {action.device}")
-                raise ValueError(message("action", given, f"one on {tensor.device}"))
-        if torch.is_grad_enabled() and any(x.requires_grad for x in tensors):
-            found: list[Any] = []
-            results = _Step.apply(self, structure, found, *leaves)
-            return jax.tree.unflatten(found[0], results)
-        inputs = jax.tree.unflatten(structure, [to_jax(leaf) for leaf in leaves])
-        return jax.tree.map(to_torch, self.run(*inputs))
+        if action.device != state.obs.device:
+            wrong = Fact(f"a tensor on {action.device}")
+            raise ValueError(message("action", wrong, f"one on {state.obs.device}"))
+        if state.arrays is None:
+            parts = jax.tree.map(to_jax, state.parts)
+        else:
+            parts = {name: getattr(state.arrays, name) for name in _FIELDS}
+        given = jax.tree.map(to_jax, params)
+        tracked = action.requires_grad or state.tracked
+        tracked = tracked or (params is not None and _tracked(params))
+        if not tracked or not torch.is_grad_enabled():
+            # the exchange of a NumPy array takes less time; it shares its memory too
+            on_cpu = action.device.type == "cpu"
+            array = action.detach().numpy() if on_cpu else to_jax(action)
+            after = TorchState(self._run(parts, array, given), {})
+            after.obs  # noqa: B018 - waits for the step: the inputs may change now
+            return after
+        found: list[State] = []
+        inputs = parts, to_jax(action), given
+        leaves = jax.tree.leaves((state.parts, action, params))
+        results = _Step.apply(self, inputs, found, *leaves)
+        structure = jax.tree.structure(_parts(found[0]))
+        return TorchState(found[0], jax.tree.unflatten(structure, results))
+
+
+def _parts(state: State) -> dict[str, Any]:
+    """Returns the attributes of a state by name."""
+    return {name: getattr(state, name) for name in _FIELDS}
+
+
+def _tracked(tree: PyTree) -> bool:
+    """Returns whether a tensor in a pytree requires a gradient."""
+    return any(
+        leaf.requires_grad
+        for leaf in jax.tree.leaves(tree)
+        if isinstance(leaf, torch.Tensor)
+    )
 
 
 def _moves(leaf: Any) -> bool:
@@ -179,19 +255,42 @@ def _moves(leaf: Any) -> bool:
     return jnp.issubdtype(leaf.dtype, jnp.floating)
 
 
-def _linearized(env: Env, inputs: PyTree) -> tuple[State, Callable[..., Any]]:
+def _linearized(
+    run: Callable[..., State], inputs: PyTree
+) -> tuple[State, Callable[..., Any]]:
     """Returns the next state, and its gradient as a function that is a pytree."""
     leaves, structure = jax.tree.flatten(inputs)
 
     def step(moving: list[jax.Array]) -> tuple[list[jax.Array], State]:
         rest = iter(moving)
         merged = [next(rest) if _moves(leaf) else leaf for leaf in leaves]
-        state = env.step(*jax.tree.unflatten(structure, merged))
-        return [leaf for leaf in jax.tree.leaves(state) if _moves(leaf)], state
+        state = run(*jax.tree.unflatten(structure, merged))
+        moved = [leaf for leaf in jax.tree.leaves(_parts(state)) if _moves(leaf)]
+        return moved, state
 
     moving = [leaf for leaf in leaves if _moves(leaf)]
     _, pull, state = jax.vjp(step, moving, has_aux=True)
     return state, pull
+
+
+def _pulled(
+    pull: Callable[..., Any],
+    slopes: list[jax.Array | None],
+    shapes: tuple[jax.ShapeDtypeStruct, ...],
+    wanted: tuple[bool, ...],
+) -> list[jax.Array]:
+    """Returns the gradients of the inputs that are wanted.
+
+    Args:
+        pull: What ``_linearized`` returned.
+        slopes: Gradient of the loss with respect to each result; ``None``: zero.
+        shapes: Shapes and types of the results.
+        wanted: Which inputs are wanted.
+    """
+    pairs = zip(slopes, shapes, strict=True)
+    given = [jnp.zeros(x.shape, x.dtype) if s is None else s for s, x in pairs]
+    (found,) = pull(given)
+    return [slope for slope, want in zip(found, wanted, strict=True) if want]
 
 
 class _Step(torch.autograd.Function):
@@ -199,16 +298,19 @@ class _Step(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, door: _Door, structure: Any, found: list[Any], *leaves: Any
+        ctx: Any, door: _Door, inputs: PyTree, found: list[State], *leaves: Any
     ) -> tuple[Any, ...]:
-        """Runs the step; appends the structure of its result to ``found``."""
-        inputs = jax.tree.unflatten(structure, [to_jax(leaf) for leaf in leaves])
+        """Runs the step; appends its result to ``found``."""
         state, ctx.pull = door.linearize(inputs)
-        arrays, made = jax.tree.flatten(state)
-        found.append(made)
+        found.append(state)
+        arrays = jax.tree.leaves(_parts(state))
         results = tuple(to_torch(array) for array in arrays)
-        ctx.door = door
-        ctx.moving = [_moves(leaf) for leaf in leaves], [_moves(x) for x in arrays]
+        ctx.door, ctx.moving = door, tuple(map(_moves, leaves))
+        ctx.shapes = tuple(
+            jax.ShapeDtypeStruct(x.shape, x.dtype) if _moves(x) else None
+            for x in arrays
+        )
+        ctx.set_materialize_grads(False)
         tensors = [x for x in results if isinstance(x, torch.Tensor)]
         ctx.mark_non_differentiable(*(x for x in tensors if not _moves(x)))
         # PyTorch then finds tensors that somebody changed before the way back
@@ -219,15 +321,17 @@ class _Step(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *slopes: Any) -> tuple[Any, ...]:
-        """Returns the gradient of every leaf of the inputs.
+        """Returns the gradient of every leaf of the inputs that needs one.
 
         Raises:
             RuntimeError: A tensor was changed in place after the step.
         """
         _ = ctx.saved_tensors  # raises the error
-        inputs, outputs = ctx.moving
-        chosen = zip(slopes, outputs, strict=True)
-        given = [to_jax(slope) for slope, moves in chosen if moves]
-        gradients = iter(ctx.door.pull(ctx.pull, given))
-        found = [to_torch(next(gradients)) if moves else None for moves in inputs]
-        return None, None, None, *found
+        pairs = zip(slopes, ctx.shapes, strict=True)
+        given = [to_jax(slope) for slope, shape in pairs if shape is not None]
+        shapes = tuple(shape for shape in ctx.shapes if shape is not None)
+        needed = ctx.needs_input_grad[3:]
+        moving = zip(needed, ctx.moving, strict=True)
+        wanted = tuple(need for need, moves in moving if moves)
+        found = iter(ctx.door.pull(ctx.pull, given, shapes, wanted))
+        return None, None, None, *(to_torch(next(found)) if x else None for x in needed)
