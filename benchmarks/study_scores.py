@@ -2,11 +2,11 @@
 
     python benchmarks/study_scores.py field --out docs/field.md --figures docs/figures
 
-The headline is the corrected QD score without offset: elites are evaluated again from
-other start states, and their fitness is normalized per task to 0 for an untrained
-policy and 1 for the best known one. The best known one is the best corrected elite of
-all runs, or a better one in ``study/best_known.csv``. Scores are interquartile means
-over seeds with bootstrap intervals of 95 %.
+The headline is the corrected QD score: elites are evaluated again from other start
+states. Beside it is the same score without offset: the fitness is normalized per task
+to 0 for an untrained policy and 1 for the best known one. The best known one is the
+best corrected elite of all runs, or a better one in ``study/best_known.csv``. Scores
+are interquartile means over seeds with bootstrap intervals of 95 %.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ def common(results: Results, task: str, stop: str) -> dict[str, list[float]]:
 
 
 def normalized(run: Scored, limits: tuple[float, float]) -> float:
-    """The headline score of a run."""
+    """The corrected QD score without offset of a run."""
     return quality.normalized_qd_score(run.corrected, *limits)
 
 
@@ -123,9 +123,9 @@ def table(results: Results, stop: str) -> str:
     """Markdown table of all tasks and algorithms at a stop."""
     limits = references(results)
     head = (
-        *("task", "algorithm", "seeds", "**corrected QD score without offset**"),
+        *("task", "algorithm", "seeds", "**corrected QD score**", "**without offset**"),
         *("corrected mean fitness over common cells", "corrected coverage [%]"),
-        *("corrected best", "corrected QD score", "QD score", "coverage [%]", "best"),
+        *("corrected best", "QD score", "coverage [%]", "best"),
         *("evaluations [k]", "time [s]"),
     )
     rows = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
@@ -141,11 +141,11 @@ def table(results: Results, stop: str) -> str:
             clock = "wall_s" if runs[0].line["device"] == "cuda" else "processor_s"
             cells = (
                 *(task, key[1], str(len(runs))),
+                text(column("corrected_qd_score"), ",.0f"),
                 text([normalized(run, limits[task]) for run in runs], ".4f"),
                 text(shared[key[1]], ".4g"),
                 text(column("corrected_coverage"), ".1f"),
                 text(column("corrected_max_fitness"), ".4g"),
-                text(column("corrected_qd_score"), ",.0f"),
                 text(column("qd_score"), ",.0f"),
                 text(column("coverage"), ".1f"),
                 text(column("max_fitness"), ".4g"),
@@ -158,20 +158,25 @@ def table(results: Results, stop: str) -> str:
 
 def verdict(results: Results, stop: str) -> str:
     """Markdown table: our best algorithm and the best other one of each task."""
-    limits = references(results)
-    rows = ["| task | ours | others | ratio | intervals |", "|---|---|---|---|---|"]
-    for task in limits:
+    rows = [
+        "| task | ours: corrected QD score | others | ratio | intervals |",
+        "|---|---|---|---|---|",
+    ]
+    for task in sorted({key[0] for key in results}):
         sides: list[list[tuple[float, float, float, str]]] = [[], []]
         for (own, algorithm, at), runs in results.items():
             if (own, at) == (task, stop):
-                scores = np.asarray([normalized(run, limits[task]) for run in runs])
-                sides[algorithm not in OURS].append((*interval([scores]), algorithm))
+                found = [float(run.line["corrected_qd_score"]) for run in runs]
+                scores = interval([np.asarray(found)])
+                sides[algorithm not in OURS].append((*scores, algorithm))
         if not all(sides):
             continue
         ours, other = (max(side) for side in sides)
         apart = ours[1] > other[2] or ours[2] < other[1]
         ratio = ours[0] / other[0] if other[0] > 0 else np.inf
-        cells = [f"{x[3]} {x[0]:.4f} ({x[1]:.4f} to {x[2]:.4f})" for x in (ours, other)]
+        cells = [
+            f"{x[3]} {x[0]:,.0f} ({x[1]:,.0f} to {x[2]:,.0f})" for x in (ours, other)
+        ]
         rows.append(
             f"| {task} | {' | '.join(cells)} | {ratio:.2f} | "
             f"{'apart' if apart else 'overlap'} |"

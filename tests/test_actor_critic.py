@@ -110,6 +110,43 @@ def test_the_gradient_is_that_of_the_window() -> None:
 
 
 @pytest.mark.slow
+def test_values_inside_of_a_window_count() -> None:
+    """The TD(lambda) return as the weighted mean of the returns of all lengths."""
+    part, way = 0.7, method(noise=0.0, actor_trace=0.7)
+    start = learner(way)
+    key = jax.random.key(4)
+    start = dataclasses.replace(
+        start,
+        target=jax.tree.map(
+            lambda x: x + jax.random.normal(key, x.shape), start.target
+        ),
+    )
+    scale = compiled(way.scale)(jax.random.key(2), start.first)
+    weights = 0.3 * jax.random.normal(key, (SIZE,))
+    world = jax.tree.map(lambda x: x[0], start.first)
+    discount, env = SETTINGS.discount, PointEnv()
+
+    def by_hand(weights: jax.Array) -> jax.Array:
+        state, total, returns = world, jnp.zeros(()), []
+        for step in range(SETTINGS.window):
+            state = env.step(state, policy(weights, state.obs))
+            total += discount**step * state.reward
+            value = way._value(start.target, scale, state.obs)
+            returns.append(total + discount ** (step + 1) * value)
+        last = len(returns) - 1
+        mean = sum((1 - part) * part**i * x for i, x in enumerate(returns[:last]))
+        return mean + part**last * returns[last]
+
+    def by_window(weights: jax.Array) -> jax.Array:
+        noise = jnp.zeros((SETTINGS.window, 2))
+        return way._window(weights, start, scale, world, world, noise)[0]
+
+    pairs = (compiled(jax.value_and_grad(x))(weights) for x in (by_window, by_hand))
+    for found, expected in zip(*pairs, strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.slow
 def test_actors_reach_what_they_aim_at() -> None:
     best, lost = learned(method(), (1.0, 0.0, 0.0))
     assert not np.asarray(lost).any()
@@ -251,6 +288,7 @@ def test_bad_numbers_are_refused(changes: dict[str, Any], message: str) -> None:
         ({"clip": 0.0}, "clip: got 0.0; allowed: finite .*above 0"),
         ({"noise": -1.0}, "noise: got -1.0; allowed: .* from 0"),
         ({"trace": 2.0}, "trace: got 2.0; allowed: .* from 0 to 1"),
+        ({"actor_trace": 2.0}, "actor_trace: got 2.0; allowed: .* from 0 to 1"),
     ],
 )
 def test_bad_settings_are_refused(changes: dict[str, Any], message: str) -> None:

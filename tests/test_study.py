@@ -41,7 +41,9 @@ def add(out: Path, algorithm: str, seed: int, stop: str, fitnesses: Any) -> None
     path = out / "cells" / f"{TASK}.{algorithm}@1.{seed}.npz"
     cells: dict[str, Any] = {stop: np.stack([raw, raw - 1])}
     np.savez(path, **cells)
-    study_runs.add_line(out / "runs.csv", line(algorithm, seed, stop))
+    score = float(np.sum(raw[np.isfinite(raw)] + 9))
+    row = line(algorithm, seed, stop, corrected_qd_score=score)
+    study_runs.add_line(out / "runs.csv", row)
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS.values(), ids=lambda x: x.name)
@@ -130,8 +132,7 @@ def test_the_report_compares_corrected_archives(tmp_path: Path) -> None:
     assert scores["me"] == pytest.approx((1 + 3) / 8 / CELLS)
     assert scores["me-conditioned"] == pytest.approx((6 + 2 + 8) / 8 / CELLS)
     content = study_scores.report(results)
-    assert (
-        "| hopper_uni | me-conditioned 0.2500 (0.2500 to 0.2500) | me 0.06" in content
-    )
-    assert "| 4.00 | apart |" in content
+    assert "| hopper_uni | me-conditioned 52 (52 to 52) | me 51 (51 to 51)" in content
+    assert "| 1.02 | apart |" in content
+    assert "| hopper_uni | me | 2 | 51 (51 to 51) | 0.0625 (0.0625 to" in content
     assert interval([np.array([1.0, 1.0])]) == (1.0, 1.0, 1.0)

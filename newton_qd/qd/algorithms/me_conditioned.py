@@ -13,6 +13,7 @@ from newton_qd.qd.algorithms.gradient_options import (
     DifferentiableOptions,
     differentiable,
     initial_scale,
+    on_robots_that_fall,
 )
 from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext
 from newton_qd.qd.algorithms.variation import with_isoline
@@ -39,7 +40,8 @@ class ConditionedOptions(DifferentiableOptions, ActorCriticSettings):
 
     worlds: int = 32
     window: int = WINDOW
-    rate: float = 2e-3
+    rate: float = 1e-3
+    actor_trace: float = 0.7
     copies: float = 0.0625
     between: float = 0.1875
     updates: int = 1
@@ -111,7 +113,7 @@ ME_CONDITIONED = AlgorithmSpec(
     "part of the offspring are its policies for cells of the archive",
     make=_make,
     options=ConditionedOptions,
-    tuned={"halfcheetah_uni": SHORT},
+    tuned={"halfcheetah_uni": SHORT, **on_robots_that_fall(rate=3e-4)},
     evaluations=_evaluations,
     gradients=_gradients,
     initial_scale=initial_scale,

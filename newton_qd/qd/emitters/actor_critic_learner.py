@@ -64,6 +64,11 @@ class ActorCritic:
     over a window of h control steps, where V is the value of the last state. The next
     window continues from this state. V is fitted to TD(lambda) targets.
 
+    A fall ends an episode, and the gradient of the physics does not see it. With
+    ``actor_trace`` below 1, the policy maximizes the TD(lambda) return of the window,
+    in which the value of every state counts, also that of a state shortly before a fall
+    (Hafner et al. 2020, "Dream to control").
+
     Attributes:
         env: Environment of one world without auto-reset.
         policy: Maps weights (size,) and an observation to an action.
@@ -225,6 +230,9 @@ class ActorCritic:
             total, target = sums
             gain, over, value = row
             mixed = (1 - settings.trace) * value + settings.trace * target
+            if settings.actor_trace < 1:  # else without the value, also if it is NaN
+                part = settings.actor_trace
+                total = (1 - part) * value + part * total
             total, target = (
                 gain + settings.discount * jnp.where(over, 0, x) for x in (total, mixed)
             )

@@ -22,6 +22,8 @@ class ActorCriticSettings:
         critic: Widths of the critic's hidden layers.
         discount: Discount of a control step [-].
         trace: Lambda of the critic's TD(lambda) targets [-].
+        actor_trace: Lambda of the return that the actor maximizes [-]; 1: only the last
+            state of a window has a value.
         epochs: Number of times that the critic learns from a window.
         batches: Optimizer steps of the critic in each epoch.
 
@@ -38,6 +40,7 @@ class ActorCriticSettings:
     critic: tuple[int, ...] = (64, 64)
     discount: float = 0.97
     trace: float = 0.95
+    actor_trace: float = 1.0
     epochs: int = 2
     batches: int = 4
 
@@ -59,3 +62,4 @@ class ActorCriticSettings:
         checks.number("noise", self.noise, least=0)
         checks.number("discount", self.discount, least=0, below=1)
         checks.number("trace", self.trace, least=0, most=1)
+        checks.number("actor_trace", self.actor_trace, least=0, most=1)

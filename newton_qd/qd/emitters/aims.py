@@ -20,6 +20,7 @@ from newton_qd.qd.scoring.rollout import Policy
 from newton_qd.qd.scoring.task import Task
 from newton_qd.types import Action, PyTree, RNGKey, StateLike
 
+_FALL = 30.0  # steps away from the target that a fall costs
 _SMALL = 1e-3  # the distance to a target is smooth below this
 
 
@@ -71,7 +72,9 @@ class AimedEnv:
     for a target d, if the descriptor is the mean of the state descriptors m, or the
     final position p. A step is rewarded with :math:`w_1 r + w_2 T (|e_t| -
     |e_{t+1}|)`. Summed over the episode, the second term is the distance between the
-    episode's descriptor and the target. It has a gradient through the physics.
+    episode's descriptor and the target. It has a gradient through the physics. The end
+    of an episode by a fall costs as much as 30 steps away from the target; without
+    that, a fall would be the way to come no further away.
 
     Attributes:
         task: Task with a descriptor that has a gradient.
@@ -134,7 +137,9 @@ class AimedEnv:
         reached = self.scaled(after.info["state_descriptor"]) - state.target
         error = reached if self._final else state.error + reached / self.episode_length
         nearer = self.episode_length * (_length(state.error) - _length(error))
-        reward = state.weights[0] * after.reward + state.weights[1] * nearer
+        fall = _FALL * self.task.descriptor_length**0.5
+        paid = nearer - jnp.where(after.done > 0, fall, 0).astype(nearer.dtype)
+        reward = state.weights[0] * after.reward + state.weights[1] * paid
         return AimedState(after, state.target, error, state.weights, reward)
 
 
