@@ -31,6 +31,7 @@ PUBLISHED = {
 }
 """Medians of QD scores [thousands] at a million evaluations (Mitsides et al. 2025)."""
 LEVELS = np.linspace(0, 1, 101)
+LEAST_SEEDS = 3  # below, an interval says nothing
 
 Key = tuple[str, str, str]
 """Task, algorithm and stop."""
@@ -163,12 +164,14 @@ def verdict(results: Results, stop: str) -> str:
         "|---|---|---|---|---|",
     ]
     for task in sorted({key[0] for key in results}):
+        few = False
         sides: list[list[tuple[float, float, float, str]]] = [[], []]
         for (own, algorithm, at), runs in results.items():
             if (own, at) == (task, stop):
                 found = [float(run.line["corrected_qd_score"]) for run in runs]
                 scores = interval([np.asarray(found)])
                 sides[algorithm not in OURS].append((*scores, algorithm))
+                few = few or len(runs) < LEAST_SEEDS
         if not all(sides):
             continue
         ours, other = (max(side) for side in sides)
@@ -179,7 +182,7 @@ def verdict(results: Results, stop: str) -> str:
         ]
         rows.append(
             f"| {task} | {' | '.join(cells)} | {ratio:.2f} | "
-            f"{'apart' if apart else 'overlap'} |"
+            f"{'too few seeds' if few else 'apart' if apart else 'overlap'} |"
         )
     return "\n".join(rows)
 
