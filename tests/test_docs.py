@@ -70,7 +70,7 @@ def test_python_on_a_page_runs_as_pasted(
     monkeypatch.setattr(tasks, "ENVIRONMENTS", dict(tasks.ENVIRONMENTS))
     monkeypatch.chdir(tmp_path)
     text = (DOCS / page).read_text(encoding="utf-8")
-    for package in re.findall(r"^import (torch|equinox)$", text, re.M):
+    for package in re.findall(r"^import (torch)$", text, re.M):
         pytest.importorskip(package)  # not in the extra `all`
     for name, xml in zip(
         re.findall(r"[Ss]ave it as `(.*?\.urdf)`", text),

@@ -6,6 +6,7 @@
   ``AnnealedRepertoire`` for one of them
 - ``load_run(folder)``: a run with its settings, task, policy, elites and pictures;
   ``load_archive(folder)``, ``plot_archive(...)``: its archive alone
+- ``policy_of(env, network)``: a policy from a network of Flax or Equinox
 - ``make_task``, ``make_policy``, ``make_scoring_function``: parts for other algorithms
   of QDax
 - ``episode_of(task, policy, length)``: the same as a ``newton_qd.Episode``;
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from newton_qd.qd.run.plot import plot_archive
     from newton_qd.qd.run.search import SearchError
     from newton_qd.qd.scoring.gradient_scoring import make_gradient_scoring_function
+    from newton_qd.qd.scoring.networks import policy_of
     from newton_qd.qd.scoring.ribs import from_ribs, make_ribs_evaluation, to_ribs
     from newton_qd.qd.scoring.robust import robust_scoring
     from newton_qd.qd.scoring.rollout import (
@@ -80,6 +82,7 @@ __all__ = [
     "make_scoring_function",
     "make_task",
     "plot_archive",
+    "policy_of",
     "register_algorithm",
     "robust_scoring",
     "shard_scoring",
@@ -115,6 +118,7 @@ _HOME = {
     "make_scoring_function": "scoring.rollout",
     "make_task": "scoring.task",
     "plot_archive": "run.plot",
+    "policy_of": "scoring.networks",
     "register_algorithm": "algorithms",
     "robust_scoring": "scoring.robust",
     "shard_scoring": "scoring.sharding",

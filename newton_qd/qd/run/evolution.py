@@ -32,7 +32,7 @@ from newton_qd.qd.run.search import Search, SearchState
 from newton_qd.qd.run.sizes import check_memory
 from newton_qd.qd.run.tensorboard import EventLog
 from newton_qd.qd.run.warm_start import StartFrom, digest_of, start_genotypes
-from newton_qd.qd.scoring.rollout import make_policy
+from newton_qd.qd.scoring.networks import policy_for
 from newton_qd.qd.scoring.sharding import device_mesh, device_named
 from newton_qd.qd.scoring.task import Task, make_task, randomized
 
@@ -199,7 +199,7 @@ def _started(
     """
     start = None
     if start_from is not None:
-        start = start_genotypes(start_from, make_policy(task.env, config.hidden))
+        start = start_genotypes(start_from, policy_for(task, config.hidden))
     elif config.warm_start is not None and folder is not None:
         start = folder.start_genotypes()
     if start is None:

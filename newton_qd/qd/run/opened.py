@@ -28,11 +28,11 @@ from newton_qd.qd.run.plot import grid_indices
 from newton_qd.qd.run.reevaluation import Reevaluated
 from newton_qd.qd.run.results import read_reevaluated, read_results
 from newton_qd.qd.run.search import start_key
+from newton_qd.qd.scoring.networks import policy_for
 from newton_qd.qd.scoring.robust import robust_scoring, run_scoring
 from newton_qd.qd.scoring.rollout import (
     Policy,
     episode_of,
-    make_policy,
 )
 from newton_qd.qd.scoring.task import Task, make_task, randomized
 from newton_qd.types import Repertoire, RNGKey, ScoringFunction
@@ -364,7 +364,7 @@ def load_run(
     archive, metrics = read_results(path)
     task = randomized(config, task_factory(config))
     config = config.resolve(task.descriptor_length)
-    policy = make_policy(task.env, config.hidden)
+    policy = policy_for(task, config.hidden)
     if archive.genotypes.shape[1] != policy.size:
         given = Fact(f"genotypes of {archive.genotypes.shape[1]} numbers")
         allowed = f"{policy.size}, the weights of a policy of {config.env_name!r} with "

@@ -28,10 +28,10 @@ from newton_qd.qd.run.reevaluation import (
     corrected_fitnesses,
     reevaluate,
 )
+from newton_qd.qd.scoring.networks import policy_for
 from newton_qd.qd.scoring.robust import robust_scoring, run_scoring
 from newton_qd.qd.scoring.rollout import (
     episode_of,
-    make_policy,
     make_scoring_function,
 )
 from newton_qd.qd.scoring.sharding import on_mesh, shard_scoring
@@ -103,7 +103,7 @@ class Search:
         key_centroids, self._key_reset = keys[0], keys[1]
         self._key_initial, self._key_generations = keys[2], keys[3]
         self._key_reevaluations = jax.random.fold_in(self._key_reset, 1)
-        self._policy = make_policy(task.env, config.hidden)
+        self._policy = policy_for(task, config.hidden)
         self._centroids = cell_centroids(config, task.limits, key_centroids)
         with refused_options():
             score = self._scoring()

@@ -34,6 +34,8 @@ class Task:
         labels: D names for the axes of plots.
         reward_offset: Number per control step that makes returns positive, for the QD
             score only.
+        network: Network of the policies, as for ``policy_of``; ``None``: a perceptron
+            with the hidden layers of the settings.
     """
 
     env: Any
@@ -41,6 +43,7 @@ class Task:
     limits: tuple[np.ndarray, np.ndarray]
     labels: tuple[str, ...]
     reward_offset: float
+    network: Any = None
 
     @property
     def descriptor_length(self) -> int:

@@ -1,0 +1,105 @@
+"""Networks of Flax and Equinox as policies of episodes, scoring functions and runs."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import newton_qd
+from newton_qd.gradients import Episode
+from newton_qd.qd import (
+    EvolveConfig,
+    evolve,
+    load_run,
+    make_scoring_function,
+    make_task,
+    policy_of,
+)
+
+CONFIG = EvolveConfig(
+    env_name="pointmaze", iterations=1, batch_size=4, episode_length=5, reevaluations=0
+)
+HIDDEN = 3
+OBSERVATION = jnp.array([0.3, -0.5], jnp.float32)
+
+
+def linen() -> Any:
+    nn = pytest.importorskip("flax.linen")
+    return nn.Sequential([nn.Dense(HIDDEN), jnp.tanh, nn.Dense(2), jnp.tanh])
+
+
+def nnx() -> Any:
+    nnx = pytest.importorskip("flax.nnx")
+
+    class Network(nnx.Module):
+        def __init__(self, rngs: Any) -> None:
+            self.first = nnx.Linear(2, HIDDEN, rngs=rngs)
+            self.last = nnx.Linear(HIDDEN, 2, rngs=rngs)
+            self.rngs = rngs  # random keys and counters are no weights
+
+        def __call__(self, obs: jax.Array) -> jax.Array:
+            return jnp.tanh(self.last(jnp.tanh(self.first(obs))))
+
+    return lambda key: Network(nnx.Rngs(params=key))
+
+
+def equinox() -> Any:
+    eqx = pytest.importorskip("equinox")
+    return lambda key: eqx.nn.MLP(2, 2, HIDDEN, 1, final_activation=jnp.tanh, key=key)
+
+
+NETWORKS = {"linen": linen, "nnx": nnx, "equinox": equinox}
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_weights_are_a_vector(name: str) -> None:
+    network, key = NETWORKS[name](), jax.random.key(3)
+    policy = policy_of(newton_qd.create("pointmaze"), network)
+    assert policy.size == 2 * HIDDEN + HIDDEN + HIDDEN * 2 + 2
+    weights = policy.init(key)
+    if name == "linen":
+        wanted = network.apply(network.init(key, OBSERVATION), OBSERVATION)
+    else:
+        wanted = network(key)(OBSERVATION)
+    assert np.allclose(policy.of_weights(weights, OBSERVATION), wanted, atol=1e-6)
+    assert np.array_equal(policy.ravel(policy.unravel(weights)), weights)
+    both = jax.vmap(policy.init)(jax.random.split(key, 2))
+    assert both.shape == (2, policy.size) and not np.array_equal(*both)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NETWORKS)
+def test_episodes_scores_and_runs(name: str, tmp_path: Path) -> None:
+    network = NETWORKS[name]()
+
+    def task_of(config: EvolveConfig) -> Any:
+        return dataclasses.replace(make_task(config), network=network)
+
+    task, key = task_of(CONFIG), jax.random.key(0)
+    policy = policy_of(task.env, network)
+    weights = jax.vmap(policy.init)(jax.random.split(key, 4))
+    fitness, descriptors, _ = make_scoring_function(task, policy, 5)(weights, key)
+    assert np.isfinite(fitness).all() and descriptors.shape == (4, 2)
+    episode = Episode(task.env, policy.of_weights, episode_length=5)
+    slope = jax.grad(lambda x: episode(x, key).fitness)(weights[0])
+    assert np.isfinite(slope).all() and jnp.abs(slope).max() > 0
+    result = evolve(CONFIG, out=tmp_path / "run", progress=False, task_factory=task_of)
+    assert result.archive.genotypes.shape[1] == policy.size
+    run = load_run(tmp_path / "run", task_factory=task_of)
+    assert np.array_equal(
+        np.ravel(run.evaluate(run.cells).fitnesses), run.archive.fitnesses[run.cells]
+    )
+
+
+def test_errors() -> None:
+    env: Any = newton_qd.create("pointmaze")
+    with pytest.raises(TypeError, match="network: got 3; allowed: a module of Flax"):
+        policy_of(env, 3)
+    with pytest.raises(ValueError, match=r"network: got actions of shape \(3,\)"):
+        policy_of(env, lambda key: jax.tree_util.Partial(jnp.dot, jnp.ones((3, 2))))
