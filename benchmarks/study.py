@@ -224,6 +224,9 @@ def arguments() -> argparse.Namespace:
         "--seeds", type=int, help="at most so many; default: 5, or as the protocol says"
     )
     parser.add_argument(
+        "--variants", nargs="*", help="field, small: run these, as for ablations"
+    )
+    parser.add_argument(
         "--until", type=float, help="field, small: longest time of a run [s]"
     )
     parser.add_argument(
@@ -312,6 +315,7 @@ def left(args: argparse.Namespace) -> list[tuple[str, ...]]:
         until=args.until,
         tune=args.tune,
         tuned=args.tuned,
+        chosen_variants=args.variants,
     )
     return [(run.task, run.variant, str(run.seed), str(args.out)) for run in found]
 

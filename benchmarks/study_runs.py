@@ -112,6 +112,12 @@ def best_variant(tuning: Path, task: str, algorithm: str) -> str:
     return max(scores, key=lambda name: scores[name])
 
 
+def numbered(algorithm: str) -> list[str]:
+    """Returns the variants of an algorithm that tuning tries; others are ablations."""
+    names = [name.split("@") for name in variants()]
+    return [f"{algorithm}@{x}" for own, x in names if own == algorithm and x.isdigit()]
+
+
 def missing(
     protocol: Protocol,
     out: Path,
@@ -122,6 +128,7 @@ def missing(
     until: float,
     tune: bool = False,
     tuned: Path | None = None,
+    chosen_variants: list[str] | None = None,
 ) -> list[Run]:
     """Returns the runs without a line for one of their stops.
 
@@ -136,12 +143,20 @@ def missing(
         until: Longest time of a run [s].
         tune: Whether to run every variant with the seed of the tuning.
         tuned: Folder of the tuning; ``None``: the first variant of each algorithm.
+        chosen_variants: Variants to run instead of the algorithms; ``None``: none.
     """
     kinds = [(t, a) for t in tasks for a in algorithms if protocol.has(t, a)]
     planned: list[Run] = []
-    if tune:
+    if chosen_variants:
+        planned = [
+            Run(task, variant, seed)
+            for seed in range(seeds)
+            for task in tasks
+            for variant in chosen_variants
+        ]
+    elif tune:
         for task, algorithm in kinds:
-            own = [name for name in variants() if name.split("@")[0] == algorithm]
+            own = numbered(algorithm)
             planned += [Run(task, variant, TUNING_SEED) for variant in own]
     else:
         for seed in range(seeds):

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from study_protocols import OURS, PROTOCOLS
 from study_report import interval
-from study_runs import lines
+from study_runs import TUNING_SEED, lines
 
 from newton_qd.qd.run import quality
 
@@ -58,13 +58,19 @@ Results = dict[Key, list[Scored]]
 
 
 def load(folder: Path) -> Results:
-    """Reads the runs of a folder; the seed of the tuning is left out."""
+    """Reads the runs of a folder; the seed of the tuning is left out.
+
+    An ablation is named by its variant, as if it were an algorithm.
+    """
     found: Results = {}
     for line in lines(folder):
         name = f"{line['task']}.{line['variant']}.{line['seed']}.npz"
         cells = np.load(folder / "cells" / name)[line["stop"]].astype(np.float64)
-        key = line["task"], line["algorithm"], line["stop"]
+        own = line["variant"].split("@")[1].isdigit()
+        key = line["task"], line["algorithm" if own else "variant"], line["stop"]
         seed = int(line["seed"])
+        if seed == TUNING_SEED:
+            continue
         found.setdefault(key, []).append(Scored(seed, line, *cells))
     return found
 
@@ -167,7 +173,7 @@ def verdict(results: Results, stop: str) -> str:
         few = False
         sides: list[list[tuple[float, float, float, str]]] = [[], []]
         for (own, algorithm, at), runs in results.items():
-            if (own, at) == (task, stop):
+            if (own, at) == (task, stop) and "@" not in algorithm:
                 found = [float(run.line["corrected_qd_score"]) for run in runs]
                 scores = interval([np.asarray(found)])
                 sides[algorithm not in OURS].append((*scores, algorithm))

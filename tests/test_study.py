@@ -17,7 +17,7 @@ sys.path.insert(0, str(FOLDER))
 
 import study_runs  # noqa: E402
 import study_scores  # noqa: E402
-from study_protocols import FIELD, HUMANOIDS, PROTOCOLS, SMALL, Stop  # noqa: E402
+from study_protocols import BASELINES, FIELD, HUMANOIDS, PROTOCOLS, SMALL, Stop  # noqa: E402
 from study_report import interval  # noqa: E402
 
 TASK, CELLS = "hopper_uni", 8
@@ -62,9 +62,16 @@ def test_every_variant_is_a_setting(protocol: Any) -> None:
 
 
 def test_baselines_get_as_many_variants() -> None:
-    names = [name.split("@")[0] for name in study_runs.variants()]
-    ours = max(names.count(name) for name in study_scores.OURS)
-    assert ours <= min(names.count(name) for name in ("me", "ascii-me", "pga-me"))
+    ours = max(len(study_runs.numbered(name)) for name in study_scores.OURS)
+    others = [len(study_runs.numbered(name)) for name in BASELINES]
+    assert ours <= min(others) == 4
+
+
+def test_ablations_are_run_by_name(tmp_path: Path) -> None:
+    name = "me-conditioned@no-copies"
+    assert name in study_runs.variants()
+    assert name not in study_runs.numbered("me-conditioned")
+    assert left(tmp_path, chosen_variants=[name], seeds=1) == [f"{TASK}.{name}.0"]
 
 
 def test_humanoids_have_larger_policies() -> None:
@@ -120,6 +127,7 @@ def test_the_report_compares_corrected_archives(tmp_path: Path) -> None:
     for seed in (0, 1, 2):
         add(tmp_path, "me", seed, stop, me)
         add(tmp_path, "me-conditioned", seed, stop, ours)
+    add(tmp_path, "me", study_runs.TUNING_SEED, stop, ours)
     results = study_scores.load(tmp_path)
     # untrained: 2; best known: 11 - 1 after another evaluation
     assert study_scores.references(results) == {TASK: (2.0, 10.0)}
