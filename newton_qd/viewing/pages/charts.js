@@ -13,7 +13,7 @@
     const every = data.feet_most || 1; // a frame has the sum of several steps
     const reward = [];
     for (let k = 0; k < length; k++) reward.push(data.rewards.data[w * steps + k] / every);
-    this.chart("reward", [reward], 1, total, ["reward"]);
+    this.chart("reward of a step", [reward], 1, total, ["reward"]);
     const nf = data.feet.shape[2];
     if (nf) this.feetChart(w, nf, length, total);
     const nd = data.descriptors.shape[2];

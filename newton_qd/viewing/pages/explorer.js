@@ -36,9 +36,12 @@
   const bar = NQD.element("div", section, { name: "bar" });
   const label = NQD.element("label", bar, { text: "colour " });
   const choice = NQD.element("select", label);
-  runs[0].metrics.forEach((metric, index) => {
-    NQD.element("option", choice, { text: metric.name }).value = index;
-  });
+  // archives of other descriptors have other metrics: a colour needs one of both
+  const metric = (run, name) => run.metrics.find((each) => each.name === name);
+  for (const { name } of runs[0].metrics) {
+    if (!runs.every((run) => metric(run, name))) continue;
+    NQD.element("option", choice, { text: name }).value = name;
+  }
   const limit = NQD.element("label", bar, { text: "fitness from " });
   const filter = NQD.element("input", limit, { type: "range" });
   const shown = NQD.element("span", bar, { name: "clock" });
@@ -53,8 +56,17 @@
 
   const maps = runs.map((run, index) => {
     const part = NQD.element("div", section, { name: "run" });
-    NQD.element("h2", part, { text: run.name, name: "isolate" });
+    const heading = NQD.element("h2", part, { text: run.name, name: "isolate" });
+    if (runs.length > 1) { // the colour of its robot
+      heading.style.borderLeft = "12px solid " + NQD.palette[index];
+      heading.style.paddingLeft = "6px";
+    }
     NQD.element("div", part, { text: run.facts, name: "soft isolate" });
+    NQD.element("div", part, {
+      text: "Click a " + (run.map.grid || run.low.length <= 2 ? "cell" : "line")
+        + ", or press an arrow key: this elite then moves.",
+      name: "soft",
+    });
     const map = new NQD.Map(part, run, (elite) => choose(index, elite));
     if (run.notice) NQD.element("div", part, { text: run.notice, name: "notice" });
     const tools = NQD.element("div", part, { name: "tools" });
@@ -89,10 +101,10 @@
 
   // Colours every map with one scale, so that two archives can be compared.
   function colour() {
-    const index = Number(choice.value);
+    const name = choice.value;
     let low = Infinity, high = -Infinity;
     for (const run of runs) {
-      for (const value of run.metrics[index].values.data) {
+      for (const value of metric(run, name).values.data) {
         if (!Number.isFinite(value)) continue;
         low = Math.min(low, value);
         high = Math.max(high, value);
@@ -101,7 +113,7 @@
     const least = filter.value === start ? lowest : Math.min(Number(filter.value), highest);
     maps.forEach((map, r) => {
       fitness[r].forEach((value, e) => { map.shown[e] = value >= least ? 1 : 0; });
-      map.colour(runs[r].metrics[index].values.data, low, high);
+      map.colour(metric(runs[r], name).values.data, low, high);
     });
     shown.textContent = NQD.short(least);
     scale.replaceChildren();
@@ -111,7 +123,7 @@
     for (let k = 0; k <= 10; k++) steps.push(NQD.viridis(k / 10));
     strip.style.background = "linear-gradient(to right, " + steps.join(",") + ")";
     NQD.element("span", scale, { text: NQD.short(high) });
-    NQD.element("span", scale, { text: choice.selectedOptions[0].textContent, name: "soft isolate" });
+    NQD.element("span", scale, { text: name, name: "soft isolate" });
   }
   choice.addEventListener("change", colour);
   filter.addEventListener("input", colour);
@@ -195,9 +207,14 @@
         pen.stroke();
       });
       NQD.element("div", part, {
-        text: NQD.short(low) + " \u2026 " + NQD.short(high), name: "soft",
+        text: NQD.short(low) + " \u2026 " + NQD.short(high)
+          + (name === "coverage" ? " %" : ""), name: "soft",
       });
     }
+    const all = runs.map((run) => Math.max(...run.curves.evaluations.data));
+    NQD.element("div", curves, {
+      text: "curves over 0 \u2026 " + Math.max(...all) + " evaluations", name: "wide soft",
+    });
     for (const run of runs) {
       for (const line of run.reevaluated || []) {
         NQD.element("div", curves, {
