@@ -31,8 +31,10 @@ def write_atomically(path: Path, content: bytes) -> None:
             # Without this, a power failure after the rename can leave an empty file.
             os.fsync(file.fileno())
         os.replace(temporary, path)
-    except OSError as error:
+    except BaseException as error:  # also an interrupt leaves no part behind
         with contextlib.suppress(OSError):
             temporary.unlink()
+        if not isinstance(error, OSError):
+            raise
         # The message of the system does not always name the file.
         raise OSError(error.errno, error.strerror, str(path)) from error
