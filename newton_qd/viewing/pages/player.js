@@ -56,6 +56,11 @@
       text: "\u2302", title: "First view (h)", type: "button",
     });
     home.addEventListener("click", () => this.act("h"));
+    const metres = this.options.unit === " steps" ? "" : " m"; // a maze has no unit
+    const grid = NQD.element("span", bar, {
+      text: "grid " + NQD.short(drawing.grid) + metres, name: "soft",
+    });
+    grid.title = "Distance of two thin lines on the ground; thick lines: five times that";
   };
 
   Player.box = function (bar, name, text, title, value) {
