@@ -64,7 +64,7 @@ def test_replay_page(walk: Trajectory, pages: Pages, tmp_path: Path) -> None:
     page.keyboard.press("s")
     apart = page.evaluate("NQD.player.view.shift[1]")
     assert apart < -2
-    for box in ("impulses", "colliders", "trail", "frames"):
+    for box in ("impulses", "colliders", "trail", "link frames"):
         page.get_by_label(box, exact=True).click()
     assert page.evaluate("NQD.player.view.arrows.visible")
     before = page.evaluate("document.documentElement.dataset.theme")

@@ -178,8 +178,8 @@ def _run_data(
     again = run.reevaluated
     return {
         "name": str(run.path),
-        "facts": f"{config.env_name}, {config.algorithm}, seed {config.seed}, "
-        f"generation {run.iteration}",
+        "facts": f"{config.env_name}, algorithm {config.algorithm}, "
+        f"seed {config.seed}, generation {run.iteration}",
         "labels": list(run.task.labels),
         "low": low.tolist(),
         "high": high.tolist(),

@@ -31,10 +31,10 @@
     }
   };
 
-  function surface(charts, title, height) {
+  function surface(charts, title, height, hint) {
     const row = NQD.element("div", charts, { name: "chart" });
     const names = NQD.element("div", row, { name: "names" });
-    NQD.element("span", names, { text: title, name: "title" });
+    NQD.element("span", names, { text: title, name: "title", title: hint });
     const canvas = NQD.element("canvas", row);
     const ratio = Math.min(window.devicePixelRatio || 1, 2);
     const width = Math.max(50, charts.clientWidth);
@@ -58,7 +58,8 @@
   NQD.short = short;
 
   NQD.Player.prototype.chart = function (title, lines, first, total, names) {
-    const made = surface(this.charts, title, HEIGHT.line);
+    const made = surface(this.charts, title, HEIGHT.line,
+      "Lowest and highest value are beside the title");
     let low = Infinity, high = -Infinity;
     for (const line of lines) {
       for (const value of line) {
@@ -88,7 +89,9 @@
   };
 
   NQD.Player.prototype.feetChart = function (w, nf, length, total) {
-    const made = surface(this.charts, "feet on the ground", HEIGHT.feet * nf);
+    const made = surface(this.charts, "feet on the ground", HEIGHT.feet * nf,
+      "A bar: the foot touches the ground. A pale bar: for a part of the frame. "
+      + "Beside the name: share of the steps");
     const names = this.view.drawing.feet;
     const frames = this.data.feet.shape[1], most = this.data.feet_most || 1;
     for (let f = 0; f < nf; f++) {

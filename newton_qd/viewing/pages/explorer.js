@@ -44,7 +44,7 @@
   }
   const limit = NQD.element("label", bar, { text: "fitness from " });
   const filter = NQD.element("input", limit, { type: "range" });
-  const shown = NQD.element("span", bar, { name: "clock" });
+  const shown = NQD.element("span", limit, { name: "clock" });
   const fitness = runs.map((run) => run.metrics[0].values.data);
   const lowest = Math.min(...fitness.map((f) => Math.min(...f)));
   const highest = Math.max(...fitness.map((f) => Math.max(...f)));

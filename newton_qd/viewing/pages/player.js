@@ -43,15 +43,16 @@
     this.rate.value = 1;
     this.boxes = {};
     this.box(bar, "follow", "follow", "Camera follows the robot (f)", this.follow);
-    this.box(bar, "trail", "trail", "Way of the torso (t)", true);
+    this.box(bar, "trail", "trail", "Line: the way of the torso (t)", true);
     if (worlds > 1) {
       this.box(bar, "apart", "side by side", "Worlds beside each other (s)", false);
     }
-    this.box(bar, "contacts", "impulses", "Contact impulses (c)", false);
+    this.box(bar, "contacts", "impulses",
+      "Arrows: contact impulses on the robot (c)", false);
     this.boxes.contacts.parentElement.hidden = true;
     const hidden = drawing.shapes.some((shape) => !shape.visual);
     if (hidden) this.box(bar, "colliders", "colliders", "Colliders (k)", false);
-    this.box(bar, "origins", "frames", "Origins of the links (o)", false);
+    this.box(bar, "origins", "link frames", "Axes at the origins of the links (o)", false);
     const home = NQD.element("button", bar, {
       text: "\u2302", title: "First view (h)", type: "button",
     });
