@@ -24,9 +24,9 @@ NAMES = [
     for name in newton_qd.registered_envs()
     if name in newton_qd.tables.descriptor_extractor and name not in _REPEATED
 ]
-# One with four feet, one with one, one with walls and one without physics; the others
-# share their code with these and run with the slow tests.
-_QUICK = {"ant_uni", "antmaze", "hopper_uni", "pointmaze"}
+# One with four feet, one with walls and one without physics; the others share their
+# code with these and run with the slow tests.
+_QUICK = {"ant_uni", "antmaze", "pointmaze"}
 
 
 def named(name: str, *others: Any) -> Any:

@@ -218,7 +218,7 @@ def round_a_corner(s: np.ndarray) -> np.ndarray:
     [
         pytest.param(tipping, marks=pytest.mark.slow),
         pytest.param(over_an_edge, marks=pytest.mark.slow),
-        round_a_corner,
+        pytest.param(round_a_corner, marks=pytest.mark.slow),
     ],
 )
 def test_step_is_smooth(

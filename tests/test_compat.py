@@ -420,18 +420,9 @@ TASKS = ("ant_uni", "walker2d_uni", "pointmaze", "ant_omni", "anttrap")
 ALGORITHMS = (me, pga_me, dcrl_me, qdpg, me_es, cma_me)
 
 
-@pytest.mark.parametrize(
-    ("algorithm", "name"),
-    [
-        pytest.param(
-            algorithm,
-            name,
-            marks=[] if (algorithm, name) == (me, "pointmaze") else [pytest.mark.slow],
-        )
-        for algorithm in ALGORITHMS
-        for name in TASKS
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_the_archive_grows_and_its_best_improves(algorithm: Any, name: str) -> None:
     from qdax.core.map_elites import MAPElites
     from qdax.utils.metrics import default_qd_metrics

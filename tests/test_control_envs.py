@@ -41,10 +41,9 @@ NAMES = (
     "swimmer",
 )
 REACHERS = ("reacher", "reacherangle")
-# One with and one without a drawn target; the others run with the slow tests.
+# One with a drawn target; the others run with the slow tests.
 EVERY_NAME = [
-    pytest.param(n, marks=() if n in ("reacher", "swimmer") else pytest.mark.slow)
-    for n in NAMES
+    pytest.param(n, marks=() if n == "reacher" else pytest.mark.slow) for n in NAMES
 ]
 
 
@@ -252,7 +251,9 @@ def test_a_world_does_not_depend_on_its_batch(name: str) -> None:
 
 
 # those with a control or roots of their own; the rest is the base's
-@pytest.mark.parametrize("name", ["swimmer", "reacher"])
+@pytest.mark.parametrize(
+    "name", [pytest.param("swimmer", marks=pytest.mark.slow), "reacher"]
+)
 def test_a_fault_stays_in_its_world_and_has_no_gradient(name: str) -> None:
     env = make(name)
     state, actions = thrown(env, 3)

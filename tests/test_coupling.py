@@ -88,6 +88,7 @@ def test_order_of_pairs_does_not_matter(x64: None, tmp_path: Path, free: bool) -
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-12 * scale)
 
 
+@pytest.mark.slow  # compiles the adjoint
 @TREES
 @pytest.mark.parametrize(("steps", "bound"), [(1, 1e-6), (4, 1e-6)])
 def test_directional_derivatives(

@@ -34,7 +34,13 @@ from newton_qd.qd.emitters.annealed_repertoire import AnnealedRepertoire
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
 
 
-@pytest.mark.parametrize("name", MAKERS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(n, marks=() if n in ("line", "cma_mega") else pytest.mark.slow)
+        for n in MAKERS
+    ],
+)
 def test_beats_random_variation(name: str) -> None:
     _, state, first, rows = result(name)
     assert float(rows["qd_score"][-1]) > 3 * float(first["qd_score"])

@@ -49,9 +49,8 @@ def line() -> tuple[Episode, jax.Array]:
     return episode, 0.1 * jnp.ones((3, STEPS, 1), jnp.float32)
 
 
-@pytest.mark.parametrize(
-    "options", [None, pytest.param(OPTIONS, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("options", [None, OPTIONS])
 def test_methods_are_the_functions_that_were(hopper: Any, options: Any) -> None:
     """Bitwise, with default options and others."""
     parts, weights = hopper

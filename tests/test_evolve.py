@@ -137,6 +137,7 @@ def test_default_grid_is_filled_in() -> None:
         config.resolve(5)
 
 
+@pytest.mark.slow
 def test_x64_changes_no_type(x64: None) -> None:
     result = run(SMALL.replace(iterations=2))
     assert result.archive.genotypes.dtype == np.float32

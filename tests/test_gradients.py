@@ -89,6 +89,7 @@ def single(tree: Any) -> Any:
     return jax.tree.map(lambda x: x.astype(np.float32) if x.dtype == wide else x, tree)
 
 
+@pytest.mark.slow
 def test_single_precision(x64: None) -> None:
     """The float32 gradient of a reward sum points where the float64 one does."""
     envs = {

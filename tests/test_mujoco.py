@@ -114,7 +114,14 @@ def off_centre_spec(path: Path) -> RobotSpec:
     )
 
 
-@pytest.fixture(scope="module", params=[*DISTINCT, "off_centre"])
+CASES = [
+    # its self-contacts need kernels of their own
+    pytest.param(n, marks=pytest.mark.slow if n == "halfcheetah" else ())
+    for n in (*DISTINCT, "off_centre")
+]
+
+
+@pytest.fixture(scope="module", params=CASES)
 def robot(request: pytest.FixtureRequest, tmp_path_factory) -> RobotSpec:
     if request.param in ROBOTS:
         return ROBOTS[request.param]

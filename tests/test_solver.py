@@ -218,6 +218,7 @@ def test_wrench_changes_the_momentum(tmp_path: Path, device: jax.Device) -> None
         np.testing.assert_allclose(rate, expected, atol=0.02 * np.abs(expected).max())
 
 
+@pytest.mark.slow  # compiles kernels of Newton
 def test_free_flight_about_an_off_centre_mass(
     tmp_path: Path, device: jax.Device
 ) -> None:

@@ -250,7 +250,8 @@ def test_several_iterations_hold_what_is_promised(tmp_path: Path, shot: Shot) ->
     assert limits[1] < 0.8 * limits[0]
 
 
-@pytest.mark.parametrize("speed", [pytest.param(7.5, marks=pytest.mark.slow), 10.0])
+@pytest.mark.slow
+@pytest.mark.parametrize("speed", [7.5, 10.0])
 def test_ball_of_3_cm_and_box_of_20_cm(tmp_path: Path, speed: float) -> None:
     """The contact is soft: shorter substeps hold less, and stiffer material more."""
     shares, limits = [], []

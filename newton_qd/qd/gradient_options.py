@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 from typing import Any
 
-
 # Algorithms with defaults for environments when this module had the table.
 _THEN = ("me-gradient", "omg-mega", "cma-mega", "cma-maega")
 
