@@ -49,6 +49,7 @@ from typing import Any
 import study_runs
 from study_pool import Pool
 from study_protocols import PROTOCOLS
+from study_runs import TUNING_SEED
 
 FOLDER = Path(__file__).resolve().parent / "study"
 TASKS = (
@@ -70,27 +71,10 @@ ALGORITHMS = (
 )
 # Rows of a file: enough for a curve.
 POINTS = 200
-TUNING_SEED = 1000
 
 
-@dataclasses.dataclass(frozen=True)
-class Run:
-    """A run of the study.
-
-    Attributes:
-        task: Name of the environment.
-        variant: Key of ``variants.toml``, such as ``me@1``.
-        seed: Seed of every random number.
-    """
-
-    task: str
-    variant: str
-    seed: int
-
-    @property
-    def algorithm(self) -> str:
-        """Name of the algorithm, such as ``me``."""
-        return self.variant.split("@")[0]
+class Run(study_runs.Run):
+    """A run of the study, whose settings are in ``variants.toml``."""
 
     def file(self, folder: Path, name: str) -> Path:
         """Where its csv file is, under the name of its variant or algorithm."""
