@@ -26,6 +26,7 @@ from newton_qd.envs.pointmaze import PointMaze
 from newton_qd.envs.pusher import Pusher
 from newton_qd.envs.reacher import Reacher, ReacherAngle
 from newton_qd.envs.swimmer import Swimmer
+from newton_qd.envs.ur5e import Ur5e
 from newton_qd.envs.walker2d import Walker2d
 from newton_qd.extractors import (
     get_feet_contact_proportion,
@@ -239,4 +240,5 @@ ENVIRONMENTS: dict[str, EnvironmentSpec] = {
     "reacher": EnvironmentSpec(Reacher, "reacher"),
     "reacherangle": EnvironmentSpec(ReacherAngle, "reacherangle"),
     "swimmer": EnvironmentSpec(Swimmer, "swimmer"),
+    "ur5e": EnvironmentSpec(Ur5e, "ur5e"),
 }

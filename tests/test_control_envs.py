@@ -39,6 +39,7 @@ NAMES = (
     "reacher",
     "reacherangle",
     "swimmer",
+    "ur5e",
 )
 REACHERS = ("reacher", "reacherangle")
 # One with a drawn target; the others run with the slow tests.

@@ -98,6 +98,7 @@ ROBOTS = {
     "reacher": (11, 2),
     "reacherangle": (11, 2),
     "swimmer": (8, 2),
+    "ur5e": (66, 6),
 }
 
 

@@ -32,6 +32,7 @@ SUITE = {
     "reacher": THREE,
     "reacherangle": THREE,
     "swimmer": THREE,
+    "ur5e": THREE,
 }
 
 

@@ -26,7 +26,8 @@ BODY_NAMES: Mapping[str, Mapping[str, str]] = types.MappingProxyType(
                 **{f"aux_{leg}": f"Aux {leg}" for leg in range(1, 5)},
                 **{f"foot_{leg}": f"$ Body {1 + 3 * leg}" for leg in range(1, 5)},
             }
-        )
+        ),
+        "ur5e": types.MappingProxyType({"target": "Target"}),
     }
 )
 """For each robot, the name of a link's body in the original suite."""

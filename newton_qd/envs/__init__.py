@@ -15,6 +15,7 @@ from newton_qd.envs.pusher import Pusher
 from newton_qd.envs.reacher import Reacher, ReacherAngle
 from newton_qd.envs.state import State, check
 from newton_qd.envs.swimmer import Swimmer
+from newton_qd.envs.ur5e import Ur5e
 from newton_qd.envs.walker2d import Walker2d
 
 __all__ = [
@@ -37,6 +38,7 @@ __all__ = [
     "ReacherAngle",
     "State",
     "Swimmer",
+    "Ur5e",
     "Walker2d",
     "check",
 ]

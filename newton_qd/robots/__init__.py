@@ -18,6 +18,7 @@ from newton_qd.robots.reacher import REACHER
 from newton_qd.robots.reacherangle import REACHERANGLE
 from newton_qd.robots.spec import Contact, Material, RobotSpec
 from newton_qd.robots.swimmer import SWIMMER
+from newton_qd.robots.ur5e import UR5E
 from newton_qd.robots.walker2d import WALKER2D
 
 ROBOTS = {
@@ -36,6 +37,7 @@ ROBOTS = {
         REACHER,
         REACHERANGLE,
         SWIMMER,
+        UR5E,
     )
 }
 
@@ -53,6 +55,7 @@ __all__ = [
     "REACHERANGLE",
     "ROBOTS",
     "SWIMMER",
+    "UR5E",
     "WALKER2D",
     "Contact",
     "Material",

@@ -1,0 +1,173 @@
+"""Robots that go to targets: tasks reckoned in NumPy, and where targets go."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from contract import same
+from control_tasks import agree, bodies, make, metrics_are, moving, play, thrown
+
+import newton_qd
+from newton_qd.compat import brax_envs
+from newton_qd.envs.state import State
+from newton_qd.physics import reference
+
+ARM = tuple(f"{name}_link" for name in ("shoulder", "upper_arm", "forearm"))
+WRISTS = tuple(f"wrist_{number}_link" for number in (1, 2, 3))
+TORSO = {"ur5e": "wrist_3_link"}
+RADIUS = {"ur5e": 0.02}
+SPREAD = {"ur5e": 0.5}
+ORDER = {"ur5e": ("ground", *ARM, *WRISTS, "target")}
+NAMES = tuple(TORSO)
+
+
+def next_place(name: str, data: Any) -> tuple[Any, np.ndarray]:
+    """Data of the next key, and the place drawn, as the original computes them."""
+    rng, near, turn = jax.random.split(data, 3)
+    distance = RADIUS[name] + SPREAD[name] * float(jax.random.uniform(near))
+    angle = 2 * np.pi * float(jax.random.uniform(turn))
+    return rng, distance * np.array([np.cos(angle), np.sin(angle)])
+
+
+def near_targets(name: str) -> State:
+    """Random worlds, of which the first four are about to reach their target."""
+    env = make(name)
+    state, _ = thrown(env)
+    physics = state.pipeline_state
+    q, v = np.array(physics.q), np.array(physics.v)
+    if name == "ur5e":
+        # the arm leans forward until the hand is at the height of targets
+        lean = np.arccos((0.5 - 0.163) / 0.917)
+        q[:4] = (0, lean, 0, 0, 0, 0, 0.917 * np.sin(lean), 0.147)
+    v[:4] = 0
+    v[:, env.system.v_start[list(env._links)]] = 0
+    return state.replace(pipeline_state=moving(env, q, v))
+
+
+def expected_observation(name: str, state: State) -> np.ndarray:
+    """From the bodies of states (t, n), with their targets."""
+    system, links = make(name).system, bodies(name, state)
+    frame = links[TORSO[name]][0]
+    shape = frame.shape[:2]
+    turn = np.array(
+        [reference.rotation_matrix(row[3:]) for row in frame.reshape(-1, 7)]
+    ).reshape(*shape, 3, 3)
+    zeros = np.zeros((*shape, 3))
+    places, speeds, touching = [], [], []
+    for link in ORDER[name]:
+        where, twist, hit = zeros, zeros, zeros[..., 0]
+        if link != "ground":
+            body = system.body_names.index(link)
+            where, twist = centre(name, links[link][0], link), links[link][1][..., :3]
+            change = state.pipeline_state.impulse[..., body, :3] / system.mass[body]
+            hit = np.sum(change**2, axis=-1) > 1e-5
+        places.append(where)
+        speeds.append(twist)
+        touching.append(hit)
+    torso = centre(name, frame, TORSO[name])
+    local = [np.einsum("...ji,...j->...i", turn, place - torso) for place in places]
+    speed = [np.einsum("...ji,...j->...i", turn, speed) for speed in speeds]
+    aim = local[ORDER[name].index("target")]
+    distance = np.linalg.norm(aim, axis=-1, keepdims=True)
+    blocks = [turn[..., 0], turn[..., 2], distance, aim / (1e-6 + distance)]
+    return np.concatenate([*blocks, *local, *speed, np.stack(touching, -1)], axis=-1)
+
+
+def centre(name: str, frame: np.ndarray, link: str) -> np.ndarray:
+    """Centre of mass (t, n, 3) of a link with frames (t, n, 7)."""
+    system = make(name).system
+    offset = np.append(system.com[system.body_names.index(link)], [0, 0, 0, 1])
+    rows = [reference.compose(row, offset)[:3] for row in frame.reshape(-1, 7)]
+    return np.array(rows).reshape(*frame.shape[:-1], 3)
+
+
+def with_target(state: State, slides: np.ndarray, place: np.ndarray) -> State:
+    """States with the target elsewhere."""
+    q = np.array(state.pipeline_state.q)
+    q[..., slides] = place
+    return state.replace(pipeline_state=dataclasses.replace(state.pipeline_state, q=q))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_task(name: str) -> None:
+    """Observation and reward are those of the old place, also in the step of a hit."""
+    env = make(name)
+    slides = env._target
+    state, (_, actions) = near_targets(name), thrown(env)
+    actions[:, :4] = 0
+    before, after = jax.tree.map(np.asarray, play(env)(state, actions))
+    old = before.pipeline_state.q[..., slides]
+    seen = with_target(after, slides, old)
+    agree(after.obs, expected_observation(name, seen), 2.0)
+    start, end = (
+        centre(name, bodies(name, s)[TORSO[name]][0], TORSO[name])
+        for s in (before, after)
+    )
+    away = centre(name, bodies(name, seen)["target"][0], "target") - end
+    distance = np.linalg.norm(away, axis=-1)
+    aim = away / (1e-6 + distance)[..., None]
+    hit = (distance < RADIUS[name]).astype(float)
+    assert hit[0, :4].all() and hit.mean() < 0.5
+    going = 0.1 * np.sum((end - start) * aim, axis=-1)
+    metrics_are(after, {"hits": hit, "weightedHits": hit, "movingToTarget": going})
+    agree(after.reward, going + hit)
+    assert not after.done.any()
+    for step, world in ((0, 0), (0, 1), (0, 7), (2, 3)):
+        data, place = next_place(name, before.info["rng"][step, world])
+        np.testing.assert_array_equal(after.info["rng"][step, world], data)
+        if not hit[step, world]:
+            place = old[step, world]
+        agree(after.pipeline_state.q[step, world][slides], place, RADIUS[name])
+    # the reported bodies, which the next step reads, have the new place
+    links = bodies(name, after)
+    for body, link in enumerate(env.system.body_names):
+        found = after.pipeline_state.bodies.position[..., body, :]
+        agree(found, links[link][0][..., :3], 2.0)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_reset(name: str) -> None:
+    """The pose is always the same; the place is that of the original for a key."""
+    env: Any = make(name)
+    keys = jax.random.split(jax.random.key(0), 1000)
+    state = jax.jit(jax.vmap(env.reset))(keys)
+    q, slides = np.asarray(state.pipeline_state.q), env._target
+    rest = np.delete(env.system.rest_q.astype(np.float32), slides)
+    np.testing.assert_array_equal(
+        np.delete(q, slides, axis=1), np.tile(rest, (1000, 1))
+    )
+    assert not np.any(state.pipeline_state.v)
+    radius = np.linalg.norm(q[:, slides], axis=1) - RADIUS[name]
+    assert 0 <= radius.min() and radius.max() <= SPREAD[name]
+    assert np.mean(radius) == pytest.approx(SPREAD[name] / 2, rel=0.05)
+    for world in range(3):
+        data, place = next_place(name, jax.random.key_data(keys[world]))
+        np.testing.assert_array_equal(state.info["rng"][world], data)
+        agree(q[world, slides], place, RADIUS[name])
+    viewed = brax_envs.create(name)
+    row = viewed.sys.body.index["Target"]
+    found = jax.jit(viewed.reset)(keys[0]).qp.pos[row, :2]
+    agree(found, q[0, slides], RADIUS[name])
+    # old keys, and keys of other generators
+    raw = env.reset(jax.random.key_data(keys[0]))
+    assert same(raw.info, jax.tree.map(lambda x: x[0], state.info))
+    other = env.step(env.reset(jax.random.key(0, impl="rbg")), np.zeros(6, np.float32))
+    assert other.info["rng"].shape == (4,)
+
+
+def test_targets_go_on_after_an_auto_reset() -> None:
+    """Back to the first place, as in the original; the next ones are new."""
+    env = newton_qd.create("ur5e", episode_length=2, batch_size=2)
+    first = jax.jit(env.reset)(jax.random.key(0))
+    assert not same(first.obs[0], first.obs[1])
+    step, state, action = jax.jit(env.step), first, np.zeros((2, 6), np.float32)
+    keys = [np.asarray(first.info["rng"])]
+    for _ in range(2):
+        state = step(state, action)
+        keys.append(np.asarray(state.info["rng"]))
+    assert same(state.pipeline_state, first.pipeline_state)
+    assert len(np.unique(np.concatenate(keys), axis=0)) == 6
