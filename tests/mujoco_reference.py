@@ -35,7 +35,10 @@ class MujocoReference:
         spec = mujoco.MjSpec.from_string(
             text.replace("</robot>", _COMPILER + "</robot>")
         )
-        if system.joint_kind[0] == JointKind.FREE:
+        floating = [j for j in spec.joints if j.type == mujoco.mjtJoint.mjJNT_FREE]
+        if floating:
+            floating[0].name = _ROOT_JOINT  # a joint of the file, of the type floating
+        elif system.joint_kind[0] == JointKind.FREE:
             # MuJoCo welds the root link of a URDF file to the world.
             spec.body(system.body_names[0]).add_freejoint(name=_ROOT_JOINT)
         for name in np.array(system.body_names)[system.mass == 0]:

@@ -71,8 +71,13 @@ BAD_FILES = {
     ),
     "joint type": (
         'type="revolute"',
+        'type="planar"',
+        r"line 32, <joint name='hip_1'>: type: got 'planar'; allowed: rev",
+    ),
+    "floating in a robot": (
+        'type="revolute"',
         'type="floating"',
-        r"line 32, <joint name='hip_1'>: type: got 'floating'; allowed: rev",
+        r"joint 'hip_1' of the type floating, origin: got frame in a link that moves",
     ),
     "no link": (
         '<child link="aux_1"/>',

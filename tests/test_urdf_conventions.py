@@ -219,6 +219,24 @@ def test_a_base_is_fixed_by_an_option(tmp_path: Path) -> None:
     assert fixed.scene_links == ("base", "plate")
 
 
+def test_a_body_of_a_world_may_float(tmp_path: Path) -> None:
+    """A joint of the type floating from the world makes what a floating root is."""
+    root = built(tmp_path, ARM, "base")
+    hung = ARM.replace("</robot>", '<link name="world"/>')
+    hung += joint("free", "floating", "world", "base") + "</robot>"
+    system = built(tmp_path, hung, "base")
+    for field in ("joint_kind", "parent", "q_start", "v_start", "mass", "rest_q"):
+        np.testing.assert_array_equal(getattr(system, field), getattr(root, field))
+    assert (system.body_names, system.joint_names) == (root.body_names, ("", "hinge"))
+    moved = hung.replace(
+        'child link="base"/>', 'child link="base"/><origin xyz="1 0 0"/>'
+    )
+    with pytest.raises(
+        RobotDescriptionError, match=r"'free' of .* floating, origin: g"
+    ):
+        built(tmp_path, moved, "base")
+
+
 def test_a_world_may_float(tmp_path: Path) -> None:
     text = ARM.replace('"base"', '"world"')
     with pytest.raises(RobotDescriptionError, match="neither on a robot's world link"):

@@ -20,6 +20,7 @@ from newton_qd.envs.pointmaze import PointMaze
 from newton_qd.physics import reference
 from newton_qd.physics.kinds import JointKind
 from newton_qd.physics.model import newton_builder
+from newton_qd.physics.model.description import read_description
 from newton_qd.physics.system import System
 
 if TYPE_CHECKING:
@@ -267,8 +268,8 @@ def system_builder(system: System) -> tuple[newton.ModelBuilder, ...]:
         OSError: A URDF file cannot be read.
     """
     robot = system.robot
-    floating = bool(np.any(system.joint_kind == JointKind.FREE))
-    files = [(robot.urdf, floating)]
+    read = read_description(find_urdf(robot.urdf), robot.fixed_base)
+    files = [(robot.urdf, read.floating)]
     if system.scene is not None:
         files.append((system.scene.urdf, False))
     return tuple(

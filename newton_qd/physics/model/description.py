@@ -44,7 +44,7 @@ class Body:
         link: The moving link, with the mass, the centre of mass and the inertia of
             all links of the body. Its frame is the frame of the body.
         joint: The joint that moves it. The joint's frame is in the parent body.
-            ``None`` for a floating root.
+            ``None`` for a body that floats.
         parent: Name of the parent body. ``None`` for the world.
         links: Names of all links of the body.
         shapes: Colliders of all links of the body, in the body frame.
@@ -222,6 +222,23 @@ def _check_masses(path: Path, bodies: dict[str, Body]) -> None:
             carried[body.parent] += carried[name]
 
 
+def _check_floating(path: Path, joint: Joint, fixed: bool) -> None:
+    """Checks that a joint of the type floating begins at the origin of the world.
+
+    Its coordinates are then the pose of the link in the world, as those of a root.
+
+    Raises:
+        RobotDescriptionError: It does not.
+    """
+    if not fixed or not np.array_equal(joint.frame, IDENTITY):
+        name = f"{path}: joint {joint.name!r} of the type floating, origin"
+        given = Fact(
+            "frame in a link that moves" if not fixed else joint.frame.tolist()
+        )
+        allowed = "the origin of the world; rest_height and so on give the pose"
+        raise RobotDescriptionError(message(name, given, allowed))
+
+
 def warn_unbounded(description: Description) -> None:
     """Warns about revolute joints for which the file gives no bounds."""
     if description.unbounded:
@@ -261,9 +278,10 @@ def read_description(path: Path, fixed_base: bool | None = None) -> Description:
     bodies: dict[str, Body] = {}
     still: dict[str, np.ndarray] = {}
 
-    def grow(link: Link, joint: Joint | None, parent: str | None) -> None:
+    def grow(
+        link: Link, joint: Joint | None, parent: str | None, *, fixed: bool = False
+    ) -> None:
         merged, frames, shapes, moving = _merge_fixed(link, links, children)
-        fixed = joint is None and not floating
         if fixed and link.name == WORLD and (link.shapes or link.mass > 0):
             given = Fact("a collider or a mass")
             allowed = "neither on a robot's world link"
@@ -275,9 +293,13 @@ def read_description(path: Path, fixed_base: bool | None = None) -> Description:
         else:
             bodies[link.name] = Body(merged, joint, parent, tuple(frames), shapes)
         for next_joint in moving:
-            grow(links[next_joint.child], next_joint, None if fixed else link.name)
+            if next_joint.kind == "floating":
+                _check_floating(path, next_joint, fixed)
+                grow(links[next_joint.child], None, None)
+            else:
+                grow(links[next_joint.child], next_joint, None if fixed else link.name)
 
-    grow(root, None, None)
+    grow(root, None, None, fixed=not floating)
     if not bodies:
         raise reader.error(reader.root, "nothing in it moves")
     _check_masses(path, bodies)

@@ -26,7 +26,8 @@ UNLIMITED = 1e9
 # A body of this size is a point [m].
 _POINT = 1e-9
 
-_JOINT_TYPES = ("revolute", "continuous", "prismatic", "fixed")
+_JOINT_TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating")
+_WITHOUT_AXIS = ("fixed", "floating")
 # Attributes that a shape must have. Newton uses 1 for a missing size.
 _SHAPES = {
     "sphere": ("radius",),
@@ -254,7 +255,7 @@ def read_joint(reader: XmlReader, element: ElementTree.Element) -> Joint:
     child = reader.text(reader.child(element, "child"), "link")
     frame = reader.frame(element)
     axis, damping, limits = np.array([1.0, 0.0, 0.0]), 0.0, None
-    if kind != "fixed":  # what a fixed joint says about its motion has no meaning
+    if kind not in _WITHOUT_AXIS:  # what such a joint says of an axis has no meaning
         axis, damping = _read_axis(reader, element), _read_damping(reader, element)
         limits = _read_limits(reader, element)
     lower, upper = limits or (-math.inf, math.inf)

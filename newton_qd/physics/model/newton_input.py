@@ -29,6 +29,7 @@ from newton_qd.physics.reference import compose, inverse, rotation_matrix
 
 _READ = ("link", "joint", "material")
 _MOTION = ("axis", "dynamics", "limit")
+_WITHOUT_AXIS = ("fixed", "floating")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -168,8 +169,8 @@ def _drop_unread(root: ElementTree.Element) -> None:
     """Removes what this package does not read of joints, if Newton cannot read it."""
     for joint in root.iter("joint"):
         for child in list(joint):
-            # what a fixed joint says about its motion has no meaning
-            if joint.get("type") == "fixed" and child.tag in _MOTION:
+            # what a joint without an axis says of one has no meaning
+            if joint.get("type") in _WITHOUT_AXIS and child.tag in _MOTION:
                 joint.remove(child)
             for name in ("effort", "velocity"):
                 if child.tag == "limit" and not _is_number(child.get(name, "0")):
