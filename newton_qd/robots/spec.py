@@ -15,12 +15,13 @@ DEGREE = 3.141592653589793 / 180.0
 
 @dataclasses.dataclass(frozen=True)
 class Contact:
-    """One sphere of a robot that may touch the scene.
+    """One sphere of a robot that may touch the scene, or the corners of a box.
 
     Attributes:
         link: URDF link whose collider carries the sphere.
         end: End of a capsule's axis: ``+1`` or ``-1`` along the local z axis of the
-            collider. ``0`` for a sphere, and for any collider of a pair.
+            collider. ``0`` for a sphere, for all eight corners of a box, and for any
+            collider of a pair. Boxes touch the ground only.
         collider: Name of the collider in the URDF file; ``None`` if the link has only
             one collider of this kind.
     """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 
 import numpy as np
@@ -19,6 +20,8 @@ from newton_qd.physics.model.scene import (
 )
 from newton_qd.robots import Contact, RobotSpec
 from newton_qd.scenes import Scene
+
+_CORNERS = np.array([*itertools.product((-1.0, 1.0), repeat=3)])
 
 
 def body_of(robot: RobotSpec, field: str, link: str, bodies: list[Body]) -> int:
@@ -38,15 +41,21 @@ def body_of(robot: RobotSpec, field: str, link: str, bodies: list[Body]) -> int:
     return links[link]
 
 
-def _contact_sphere(shape: Shape, end: int) -> tuple[np.ndarray, float]:
-    """Returns the sphere at one end of a collider.
+def _contact_spheres(shape: Shape, end: int) -> tuple[np.ndarray, float]:
+    """Returns the spheres with which a collider touches the ground.
+
+    The lowest point of a box is always a corner, so the corners are its spheres, with a
+    radius of 0.
 
     Returns:
-        Centre (3,) in the body frame [m], and radius [m].
+        Centres (n, 3) in the body frame [m], and radius [m].
     """
-    axis = reference.rotation_matrix(shape.frame[3:])[:, 2]
+    turn = reference.rotation_matrix(shape.frame[3:])
+    if shape.kind == "box":
+        return shape.frame[:3] + _CORNERS * shape.size @ turn.T, 0.0
     half_length = shape.size[1] if end else 0.0
-    return shape.frame[:3] + end * half_length * axis, float(shape.size[0])
+    centre = shape.frame[:3] + end * half_length * turn[:, 2]
+    return centre[None], float(shape.size[0])
 
 
 def _colliders(contact: Contact, body: Body, kinds: tuple[str, ...]) -> list[Shape]:
@@ -64,21 +73,23 @@ def _collider(robot: RobotSpec, contact: Contact, body: Body) -> Shape:
     """Returns the only collider of a body that matches a contact of the robot."""
     kind = "capsule" if contact.end else "sphere"
     found = _colliders(contact, body, (kind,))
+    if not found and not contact.end:
+        found = _colliders(contact, body, ("box",))
     if len(found) != 1:
         named = "" if contact.collider is None else f" named {contact.collider!r}"
         raise refusal(
             robot,
             f"contacts: end of {contact.link!r}",
             contact.end,
-            "exactly one, with end 0 for a sphere, 1 or -1 for a capsule, and its name "
-            "in the file where there are several",
+            "exactly one, with end 0 for a sphere or a box, 1 or -1 for a capsule, and "
+            "its name in the file where there are several",
             why=f"which needs a {kind} collider{named}, and the link has {len(found)}",
         )
     return found[0]
 
 
 def _ground_contacts(robot: RobotSpec, bodies: list[Body]) -> Iterator[ContactRow]:
-    """Yields the contacts of the robot's spheres with the ground."""
+    """Yields the contacts of the robot's spheres and boxes with the ground."""
     # A contact may name its collider or leave the name out. Both can mean the same one.
     seen: set[tuple[int, int]] = set()
     for contact in robot.contacts:
@@ -89,8 +100,9 @@ def _ground_contacts(robot: RobotSpec, bodies: list[Body]) -> Iterator[ContactRo
             field = f"contacts: end of {contact.link!r}"
             raise refusal(robot, field, given, "each once")
         seen.add((id(shape), contact.end))
-        centre, radius = _contact_sphere(shape, contact.end)
-        yield ContactRow(body, 0, centre, np.zeros(3), radius)
+        centres, radius = _contact_spheres(shape, contact.end)
+        for centre in centres:
+            yield ContactRow(body, 0, centre, np.zeros(3), radius)
 
 
 def _pair_sides(
