@@ -16,6 +16,7 @@ from newton_qd.checks import listed, message
 from newton_qd.envs.acrobot import Acrobot
 from newton_qd.envs.ant import Ant
 from newton_qd.envs.base import Env
+from newton_qd.envs.fetch import Fetch
 from newton_qd.envs.halfcheetah import HalfCheetah
 from newton_qd.envs.hopper import Hopper
 from newton_qd.envs.humanoid import Humanoid
@@ -231,6 +232,7 @@ ENVIRONMENTS: dict[str, EnvironmentSpec] = {
         original_reward_offset=2.3431,
     ),
     "acrobot": EnvironmentSpec(Acrobot, "acrobot"),
+    "fetch": EnvironmentSpec(Fetch, "fetch"),
     "humanoidstandup": EnvironmentSpec(HumanoidStandup, "humanoidstandup"),
     "inverted_double_pendulum": EnvironmentSpec(
         InvertedDoublePendulum, "inverted_double_pendulum"

@@ -32,6 +32,7 @@ from newton_qd.physics import reference
 
 NAMES = (
     "acrobot",
+    "fetch",
     "humanoidstandup",
     "inverted_double_pendulum",
     "inverted_pendulum",

@@ -91,6 +91,7 @@ ROBOTS = {
     "humanoid_w_trap": (305, 17),
     "walker2d": (17, 6),
     "acrobot": (4, 1),
+    "fetch": (101, 10),
     "humanoidstandup": (227, 17),
     "inverted_double_pendulum": (8, 1),
     "inverted_pendulum": (4, 1),

@@ -25,6 +25,7 @@ SUITE = {
     "humanoid": ONE,
     "humanoidstandup": ONE,
     "walker2d": ONE,
+    "fetch": ONE,
     "pusher": ONE,
     "acrobot": THREE,
     "inverted_double_pendulum": THREE,

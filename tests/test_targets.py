@@ -3,25 +3,51 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from typing import Any
 
 import jax
 import numpy as np
 import pytest
 from contract import same
-from control_tasks import agree, bodies, make, metrics_are, moving, play, thrown
+from control_tasks import (
+    STEPS,
+    WORLDS,
+    agree,
+    bodies,
+    make,
+    metrics_are,
+    moving,
+    play,
+    thrown,
+)
 
 import newton_qd
+from newton_qd import physics
+from newton_qd.assets import find_urdf
 from newton_qd.compat import brax_envs
 from newton_qd.envs.state import State
 from newton_qd.physics import reference
+from newton_qd.physics.model import RobotDescriptionError, build_system
+from newton_qd.physics.model.description import read_description
+from newton_qd.robots import FETCH
+from newton_qd.scenes import TRAP
 
 ARM = tuple(f"{name}_link" for name in ("shoulder", "upper_arm", "forearm"))
 WRISTS = tuple(f"wrist_{number}_link" for number in (1, 2, 3))
-TORSO = {"ur5e": "wrist_3_link"}
-RADIUS = {"ur5e": 0.02}
-SPREAD = {"ur5e": 0.5}
-ORDER = {"ur5e": ("ground", *ARM, *WRISTS, "target")}
+LEGS = tuple(
+    f"{end}_{side}_{half}"
+    for end in ("front", "back")
+    for side in ("right", "left")
+    for half in ("upper", "lower")
+)
+TORSO = {"ur5e": "wrist_3_link", "fetch": "torso"}
+RADIUS = {"ur5e": 0.02, "fetch": 2.0}
+SPREAD = {"ur5e": 0.5, "fetch": 15.0}
+ORDER = {
+    "ur5e": ("ground", *ARM, *WRISTS, "target"),
+    "fetch": ("torso", "shoulders", "hips", *LEGS, "ground", "target"),
+}
 NAMES = tuple(TORSO)
 
 
@@ -43,6 +69,10 @@ def near_targets(name: str) -> State:
         # the arm leans forward until the hand is at the height of targets
         lean = np.arccos((0.5 - 0.163) / 0.917)
         q[:4] = (0, lean, 0, 0, 0, 0, 0.917 * np.sin(lean), 0.147)
+    else:
+        q[:] = np.tile(env.system.rest_q, (len(q), 1))
+        q[:, 7:-2] += np.random.default_rng(2).uniform(-0.5, 0.5, (len(q), 10))
+        q[:4, -2:] = [(1.5, 0), (0, 1.5), (-1, 0), (1, -1)]
     v[:4] = 0
     v[:, env.system.v_start[list(env._links)]] = 0
     return state.replace(pipeline_state=moving(env, q, v))
@@ -98,11 +128,12 @@ def test_task(name: str) -> None:
     env = make(name)
     slides = env._target
     state, (_, actions) = near_targets(name), thrown(env)
-    actions[:, :4] = 0
+    if name == "ur5e":
+        actions[:, :4] = 0
     before, after = jax.tree.map(np.asarray, play(env)(state, actions))
     old = before.pipeline_state.q[..., slides]
     seen = with_target(after, slides, old)
-    agree(after.obs, expected_observation(name, seen), 2.0)
+    agree(after.obs, expected_observation(name, seen), 10.0)
     start, end = (
         centre(name, bodies(name, s)[TORSO[name]][0], TORSO[name])
         for s in (before, after)
@@ -113,8 +144,18 @@ def test_task(name: str) -> None:
     hit = (distance < RADIUS[name]).astype(float)
     assert hit[0, :4].all() and hit.mean() < 0.5
     going = 0.1 * np.sum((end - start) * aim, axis=-1)
-    metrics_are(after, {"hits": hit, "weightedHits": hit, "movingToTarget": going})
-    agree(after.reward, going + hit)
+    expected = {"hits": hit, "weightedHits": hit, "movingToTarget": going}
+    if name == "fetch":
+        frame = bodies(name, after)["torso"][0]
+        turn = [reference.rotation_matrix(row[3:]) for row in frame.reshape(-1, 7)]
+        axes = np.array(turn).reshape(*hit.shape, 3, 3)
+        expected["weightedHits"] = hit * np.sum(aim * axes[..., 0], axis=-1)
+        expected["torsoIsUp"] = 0.002 * axes[..., 2, 2]
+        expected["torsoHeight"] = 0.002 * end[..., 2]
+        assert 0.9 < expected["weightedHits"][0, 0] and after.obs[0, :, -13:-2].any()
+        assert not after.obs[0, :, -2:].any()
+    metrics_are(after, expected)
+    agree(after.reward, sum(expected.values()) - expected["hits"])
     assert not after.done.any()
     for step, world in ((0, 0), (0, 1), (0, 7), (2, 3)):
         data, place = next_place(name, before.info["rng"][step, world])
@@ -126,7 +167,7 @@ def test_task(name: str) -> None:
     links = bodies(name, after)
     for body, link in enumerate(env.system.body_names):
         found = after.pipeline_state.bodies.position[..., body, :]
-        agree(found, links[link][0][..., :3], 2.0)
+        agree(found, links[link][0][..., :3], 10.0)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -148,14 +189,15 @@ def test_reset(name: str) -> None:
         data, place = next_place(name, jax.random.key_data(keys[world]))
         np.testing.assert_array_equal(state.info["rng"][world], data)
         agree(q[world, slides], place, RADIUS[name])
-    viewed = brax_envs.create(name)
+    viewed: Any = brax_envs.create(name)
     row = viewed.sys.body.index["Target"]
     found = jax.jit(viewed.reset)(keys[0]).qp.pos[row, :2]
     agree(found, q[0, slides], RADIUS[name])
     # old keys, and keys of other generators
     raw = env.reset(jax.random.key_data(keys[0]))
     assert same(raw.info, jax.tree.map(lambda x: x[0], state.info))
-    other = env.step(env.reset(jax.random.key(0, impl="rbg")), np.zeros(6, np.float32))
+    other = env.reset(jax.random.key(0, impl="rbg"))
+    other = env.step(other, np.zeros(env.action_size, np.float32))
     assert other.info["rng"].shape == (4,)
 
 
@@ -171,3 +213,76 @@ def test_targets_go_on_after_an_auto_reset() -> None:
         keys.append(np.asarray(state.info["rng"]))
     assert same(state.pipeline_state, first.pipeline_state)
     assert len(np.unique(np.concatenate(keys), axis=0)) == 6
+
+
+def test_the_dog_is_the_originals() -> None:
+    """Numbers are in the original's terms: of a box, half the size."""
+    system = physics.load_system(FETCH)
+    frames = reference.body_frames(system, system.rest_q)
+    files = read_description(find_urdf(FETCH.urdf)).bodies
+    places: dict[str, tuple[float, ...]] = {
+        "torso": (0, 0, 1.375),
+        "shoulders": (1, 0, 1.375),
+        "hips": (-1, 0, 1.375),
+    }
+    sizes = {"torso": (0.75, 0.25, 0.125)}
+    sizes |= dict.fromkeys(("shoulders", "hips"), (0.25, 0.75, 0.125))
+    for leg in LEGS:
+        x, y = 1 if "front" in leg else -1, 1 if "left" in leg else -1
+        low = leg.endswith("lower")
+        places[leg] = (x, y * (0.625 if low else 0.875), 0.5 if low else 1.0)
+        sizes[leg] = (0.25, 0.125, 0.5)
+    for link, place in places.items():
+        body = system.body_names.index(link)
+        assert system.mass[body] == 1.0
+        np.testing.assert_array_equal(system.inertia[body], np.eye(3))
+        middle = reference.compose(frames[body], np.append(system.com[body], [0] * 4))
+        np.testing.assert_allclose(middle[:3], place, atol=1e-12)
+        (shape,) = files[link].shapes
+        assert shape.kind == "box"
+        np.testing.assert_allclose(shape.size, sizes[link], atol=1e-12)
+        np.testing.assert_allclose(shape.frame[:3], system.com[body], atol=1e-12)
+    hinges = [system.joint_names.index(joint) for joint, _ in FETCH.actuators]
+    assert [system.body_names[body] for body in hinges] == ["shoulders", "hips", *LEGS]
+    axes = [(1, 0, 0)] * 2 + [(0, 1, 0)] * 8
+    np.testing.assert_array_equal(system.joint_axis[hinges], axes)
+    np.testing.assert_array_equal(system.gear, np.full(10, 300.0))
+    dofs = system.v_start[hinges]
+    np.testing.assert_allclose(np.degrees(system.limit_upper[dofs]), np.full(10, 60.0))
+    np.testing.assert_array_equal(system.limit_lower, -system.limit_upper)
+    np.testing.assert_array_equal(system.damping[dofs], np.full(10, 35.0))
+    assert (FETCH.dt, FETCH.gravity, FETCH.material.friction) == (0.02, 9.8, 0.6)
+
+
+def test_boxes_touch_with_their_corners() -> None:
+    """The lowest corner of four turned boxes, by hand."""
+    system = physics.load_system(FETCH)
+    assert len(system.contact_body) == len(system.ground_contacts) == 32
+    assert not system.contact_radius.any()
+    q = np.array(system.rest_q)
+    pitch, roll = 0.3, 0.2
+    q[3:7] = reference.rpy_quaternion(roll, pitch, 0.0)
+    # heights of the offsets from the torso's origin, whose height is 1.375
+    up = reference.rotation_matrix(q[3:7])[2]
+    corners = itertools.product((1.25, 0.75, -0.75, -1.25), (0.5, 0.75, -0.5, -0.75))
+    heights = [up @ (x, y, z) for x, y in corners for z in (-1.375, -0.375)]
+    lowest = reference.lowest_contact(system, q)
+    assert lowest == pytest.approx(1.375 + min(heights), abs=1e-12)
+    with pytest.raises(RobotDescriptionError, match=r"got box; allowed: .* of sphere"):
+        build_system(FETCH, "float32", TRAP)
+
+
+def test_the_dog_stands() -> None:
+    """The ground carries its weight with all feet, on the lower corners."""
+    env = make("fetch")
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), WORLDS))
+    still = np.zeros((STEPS, WORLDS, 10), np.float32)
+    for _ in range(20):
+        path = play(env)(state, still)[1]
+        state = jax.tree.map(lambda x: x[-1], path)
+    found = state.pipeline_state
+    weight = 11 * 9.8 * 0.02
+    np.testing.assert_allclose(found.normal_impulse.sum(axis=1), weight, rtol=1e-3)
+    assert np.all(found.feet_contact == 1)
+    assert np.abs(found.q[:, 2] - 1.375).max() < 0.003
+    assert np.abs(found.v).max() < 1e-3

@@ -27,6 +27,23 @@ BODY_NAMES: Mapping[str, Mapping[str, str]] = types.MappingProxyType(
                 **{f"foot_{leg}": f"$ Body {1 + 3 * leg}" for leg in range(1, 5)},
             }
         ),
+        "fetch": types.MappingProxyType(
+            {
+                link: link.replace("_", " ").title()
+                for link in (
+                    "torso",
+                    "shoulders",
+                    "hips",
+                    *(
+                        f"{end}_{side}_{half}"
+                        for end in ("front", "back")
+                        for side in ("right", "left")
+                        for half in ("upper", "lower")
+                    ),
+                    "target",
+                )
+            }
+        ),
         "ur5e": types.MappingProxyType({"target": "Target"}),
     }
 )

@@ -3,6 +3,7 @@
 from newton_qd.envs.acrobot import Acrobot
 from newton_qd.envs.ant import Ant
 from newton_qd.envs.base import Env, PhysicsEnv, QDEnv
+from newton_qd.envs.fetch import Fetch
 from newton_qd.envs.halfcheetah import HalfCheetah
 from newton_qd.envs.hopper import Hopper
 from newton_qd.envs.humanoid import Humanoid
@@ -22,6 +23,7 @@ __all__ = [
     "Acrobot",
     "Ant",
     "Env",
+    "Fetch",
     "HalfCheetah",
     "Hopper",
     "Humanoid",

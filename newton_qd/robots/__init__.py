@@ -7,6 +7,7 @@ from typing import Any
 from newton_qd.moved import moved_name
 from newton_qd.robots.acrobot import ACROBOT
 from newton_qd.robots.ant import ANT
+from newton_qd.robots.fetch import FETCH
 from newton_qd.robots.halfcheetah import HALFCHEETAH
 from newton_qd.robots.hopper import HOPPER
 from newton_qd.robots.humanoid import HUMANOID
@@ -30,6 +31,7 @@ ROBOTS = {
         HUMANOID,
         WALKER2D,
         ACROBOT,
+        FETCH,
         HUMANOID_STANDUP,
         INVERTED_DOUBLE_PENDULUM,
         INVERTED_PENDULUM,
@@ -44,6 +46,7 @@ ROBOTS = {
 __all__ = [
     "ACROBOT",
     "ANT",
+    "FETCH",
     "HALFCHEETAH",
     "HOPPER",
     "HUMANOID",
