@@ -41,15 +41,15 @@ of {HIDDEN[0]} and tanh.
   with uniformly random actions.
 - *Offset*: minus the lowest reward, rounded up. It keeps QD scores positive and is
   `newton_qd.tables.reward_offset`. *Original* is that of the original suite,
-  `newton_qd.tables.original_reward_offset`.
+  `newton_qd.tables.original_reward_offset`; a dash: it has no such task.
 
 | task | coverage [%] | 5 % to 95 % (limits) | lowest reward | original | offset |
 |---|---|---|---|---|---|
 """
 TAIL = """
-The limits are those of the original suite. For position tasks they are wide, because
-trained robots run far. Untrained robots fall near their start and reach few cells,
-humanoids the fewest.
+The limits are those of the original suite, where it has the task. For position tasks of
+walking robots they are wide, because trained robots run far. Untrained robots fall near
+their start and reach few cells, humanoids the fewest.
 
 This is the same in the original suite. For 500 such policies on its `humanoid_omni`
 (`benchmarks/original_spread.py`), the quantiles are -0.36 and 0.54 m in x, -0.50 and
@@ -144,10 +144,11 @@ def survey(name: str) -> str:
     )
     # in hundredths; a task that is never punished needs none
     offset = max(0, math.ceil(-100 * lowest)) / 100
-    original = newton_qd.tables.original_reward_offset[name]
+    original = newton_qd.tables.original_reward_offset.get(name)
+    there = "-" if original is None else f"{original:g}"
     return (
         f"| `{name}` | {100 * coverage(task.limits, descriptors):.1f} | {spread} | "
-        f"{lowest:.4f} | {original:g} | {offset:g} |"
+        f"{lowest:.4f} | {there} | {offset:g} |"
     )
 
 

@@ -91,12 +91,22 @@ def _descriptor(name: str, env: QDEnv) -> str:
     low, high = env.state_descriptor_limits
     extractor = newton_qd.tables.descriptor_extractor[name].__name__
     offset = newton_qd.tables.reward_offset[name]
-    original = newton_qd.tables.original_reward_offset[name]
+    original = newton_qd.tables.original_reward_offset.get(name)
+    other = "" if original is None else f" (in the original suite: {original:g})"
     return (
-        f"\nState descriptor: `{env.state_descriptor_name}`, limits ({_numbers(low)}) "
-        f"to ({_numbers(high)}). Descriptor of an episode: `{extractor}`. Reward "
-        f"offset: {offset:g} (in the original suite: {original:g}).\n"
+        f"\nState descriptor: `{env.state_descriptor_name}`{_place(name)}, limits "
+        f"({_numbers(low)}) to ({_numbers(high)}). Descriptor of an episode: "
+        f"`{extractor}`. Reward offset: {offset:g}{other}.\n"
     )
+
+
+def _place(name: str) -> str:
+    """Of what the position is the descriptor, if not of the torso."""
+    for spec in ENVIRONMENTS[name].wrappers:
+        if "link" in spec.options:
+            at = _numbers(spec.options["offset"])
+            return f" of the point ({at}) of the link `{spec.options['link']}`"
+    return ""
 
 
 def _wrappers(name: str, base_name: str) -> str:

@@ -15,6 +15,7 @@ from typing import Any
 from newton_qd.checks import listed, message
 from newton_qd.envs.acrobot import Acrobot
 from newton_qd.envs.ant import Ant
+from newton_qd.envs.arm_reach import TIP, ArmReach
 from newton_qd.envs.base import Env
 from newton_qd.envs.fetch import Fetch
 from newton_qd.envs.halfcheetah import HalfCheetah
@@ -24,7 +25,7 @@ from newton_qd.envs.humanoid_standup import HumanoidStandup
 from newton_qd.envs.humanoid_trap import HumanoidTrap
 from newton_qd.envs.inverted_pendulum import InvertedDoublePendulum, InvertedPendulum
 from newton_qd.envs.pointmaze import PointMaze
-from newton_qd.envs.pusher import Pusher
+from newton_qd.envs.pusher import Pusher, TablePusher
 from newton_qd.envs.reacher import Reacher, ReacherAngle
 from newton_qd.envs.swimmer import Swimmer
 from newton_qd.envs.ur5e import Ur5e
@@ -34,7 +35,7 @@ from newton_qd.extractors import (
     get_final_xy_position,
 )
 from newton_qd.moved import moved_name
-from newton_qd.robots import HUMANOID, ROBOTS, RobotSpec
+from newton_qd.robots import HUMANOID, PUSHER_TABLE, REACHER, ROBOTS, RobotSpec
 from newton_qd.types import DescriptorExtractor
 from newton_qd.wrappers import (
     FeetContactWrapper,
@@ -140,14 +141,15 @@ class EnvironmentSpec:
 
 
 def _uni(
-    base: Callable[..., Env], base_name: str, offsets: tuple[float, float]
+    base: Callable[..., Env], base_name: str, offsets: tuple[float, float | None]
 ) -> EnvironmentSpec:
     """Returns the task of running forward, with feet contact as the descriptor.
 
     Args:
         base: Makes the environment.
         base_name: Name that wrappers receive.
-        offsets: Reward offset here, and in the original.
+        offsets: Reward offset here, and in the original; ``None``: it has no such
+            task.
     """
     return EnvironmentSpec(
         base,
@@ -162,22 +164,26 @@ def _uni(
 def _position(
     base: Callable[..., Env],
     base_name: str,
-    offsets: tuple[float, float],
+    offsets: tuple[float, float | None],
     limits: tuple[tuple[float, float], tuple[float, float]],
     *wrappers: Callable[..., Env],
     robot: RobotSpec | None = None,
+    **place: object,
 ) -> EnvironmentSpec:
     """Returns a task with the last position, within limits, as the descriptor [m].
 
     Args:
         base: Makes the environment.
         base_name: Name that wrappers receive.
-        offsets: Reward offset here, and in the original.
+        offsets: Reward offset here, and in the original; ``None``: it has no such
+            task.
         limits: Lowest and highest x and y.
         *wrappers: Wrappers around the descriptor wrapper.
         robot: Spec of the robot inside.
+        **place: ``link`` and ``offset`` of ``XYPositionWrapper``, if the position is
+            not that of the torso.
     """
-    options = {"minval": limits[0], "maxval": limits[1]}
+    options = {"minval": limits[0], "maxval": limits[1], **place}
     return EnvironmentSpec(
         base,
         base_name,
@@ -193,6 +199,10 @@ def _position(
 
 
 _ANYWHERE = ((-30.0, -30.0), (30.0, 30.0))
+# around the start of the object, as far as a push brings it
+_TABLE = ((-1.0, -1.0), (1.0, 1.0))
+# a square around the disk of 0.21 m: 78.5 % of it are within reach
+_REACH = ((-0.21, -0.21), (0.21, 0.21))
 
 ENVIRONMENTS: dict[str, EnvironmentSpec] = {
     "ant": EnvironmentSpec(Ant, "ant"),
@@ -243,4 +253,16 @@ ENVIRONMENTS: dict[str, EnvironmentSpec] = {
     "reacherangle": EnvironmentSpec(ReacherAngle, "reacherangle"),
     "swimmer": EnvironmentSpec(Swimmer, "swimmer"),
     "ur5e": EnvironmentSpec(Ur5e, "ur5e"),
+    "pusher_uni": _position(
+        TablePusher, "pusher_table", (1.81, None), _TABLE, robot=PUSHER_TABLE
+    ),
+    "arm_reach": _position(
+        ArmReach,
+        "arm_reach",
+        (2.0, None),
+        _REACH,
+        robot=REACHER,
+        link=TIP[0],
+        offset=TIP[1],
+    ),
 }

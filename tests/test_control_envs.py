@@ -33,10 +33,12 @@ from newton_qd.physics import reference
 NAMES = (
     "acrobot",
     "fetch",
+    "arm_reach",
     "humanoidstandup",
     "inverted_double_pendulum",
     "inverted_pendulum",
     "pusher",
+    "pusher_uni",
     "reacher",
     "reacherangle",
     "swimmer",
@@ -277,10 +279,10 @@ def test_a_fault_stays_in_its_world_and_has_no_gradient(name: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_gradient_of_an_episode(name: str, x64: None) -> None:
-    """Of 16 steps' rewards and last observation, against central differences."""
+    """Of 16 steps' rewards, last observation and last state descriptor."""
     env = make(name, dtype="float64")
     start, _ = thrown(env, 50)
-    if name == "pusher":
+    if name.startswith("pusher"):
         start = start.replace(pipeline_state=moving(env, *presses(50)[:2]))
     size = 16 * env.action_size
     actions = np.random.default_rng(1).uniform(-0.9, 0.9, (50, size))
@@ -294,7 +296,8 @@ def test_gradient_of_an_episode(name: str, x64: None) -> None:
         physics = newton_qd.physics.initial_state(env.system, q, v)
         state = first.replace(pipeline_state=physics)
         last, rewards = jax.lax.scan(advance, state, actions.reshape(16, -1))
-        return rewards.sum() + jnp.sin(last.obs).sum()
+        described = last.info.get("state_descriptor", jnp.zeros(0))
+        return rewards.sum() + jnp.sin(last.obs).sum() + jnp.sin(described).sum()
 
     physics = start.pipeline_state
     inputs = tuple(np.asarray(x) for x in (physics.q, physics.v, actions))

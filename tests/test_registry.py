@@ -55,14 +55,14 @@ def rows(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 class Task(NamedTuple):
-    """What the original says of a task (its offset, too)."""
+    """What is said of a task; its offset is the original's, if that has the task."""
 
     base: str
     observation: int
     action: int
     descriptor: str
     limits: tuple[tuple[float, ...], tuple[float, ...]]
-    offset: float
+    offset: float | None = None
 
 
 _UNIT = ((0.0, 0.0), (1.0, 1.0))
@@ -82,6 +82,10 @@ TASKS = {
     "humanoidtrap": Task("humanoid_w_trap", 305, 17, XY, _LANE, 0.0),
     "walker2d_uni": Task("walker2d", 17, 6, FEET, _UNIT, 1.413),
     "pointmaze": Task("pointmaze", 2, 2, XY, ((-1.0, -1.0), (1.0, 1.0)), 2.3431),
+}
+NEW = {
+    "pusher_uni": Task("pusher_table", 19, 7, XY, ((-1.0, -1.0), (1.0, 1.0))),
+    "arm_reach": Task("reacher", 10, 2, XY, ((-0.21, -0.21), (0.21, 0.21))),
 }
 ROBOTS = {
     "ant": (87, 8),
@@ -104,7 +108,7 @@ ROBOTS = {
 
 
 def test_names() -> None:
-    assert set(newton_qd.registered_envs()) == {*TASKS, *ROBOTS}
+    assert set(newton_qd.registered_envs()) == {*TASKS, *NEW, *ROBOTS}
 
 
 @pytest.mark.parametrize("name", ROBOTS)
@@ -114,9 +118,10 @@ def test_sizes_of_robots_are_those_of_the_original(name: str) -> None:
     assert env.name == name
 
 
-@pytest.mark.parametrize("name", TASKS)
-def test_tasks_are_those_of_the_original(name: str) -> None:
-    task, env = TASKS[name], newton_qd.create(name)
+@pytest.mark.parametrize("name", [*TASKS, *NEW])
+def test_tasks_are_as_declared(name: str) -> None:
+    """Those of the original are as there."""
+    task, env = (TASKS | NEW)[name], newton_qd.create(name)
     assert (env.observation_size, env.action_size) == (task.observation, task.action)
     assert env.name == task.base
     qd: Any = env
@@ -127,7 +132,7 @@ def test_tasks_are_those_of_the_original(name: str) -> None:
         qd.descriptor_limits,
         qd.behavior_descriptor_limits,
     ):
-        np.testing.assert_array_equal(limits, task.limits)
+        np.testing.assert_array_equal(limits, np.array(task.limits, np.float32))
 
 
 def test_wrappers_are_stacked_in_order() -> None:
@@ -215,13 +220,14 @@ def test_float64_needs_x64() -> None:
 def test_tables_are_columns_of_the_rows() -> None:
     extractors = newton_qd.tables.behavior_descriptor_extractor
     read = {FEET: get_feet_contact_proportion, XY: get_final_xy_position}
-    assert dict(extractors) == {n: read[task.descriptor] for n, task in TASKS.items()}
+    every = TASKS | NEW
+    assert dict(extractors) == {n: read[task.descriptor] for n, task in every.items()}
     assert newton_qd.tables.descriptor_extractor is extractors
     offsets = {name: task.offset for name, task in TASKS.items()}
     assert dict(newton_qd.tables.original_reward_offset) == offsets
-    assert list(newton_qd.tables.reward_offset) == list(offsets)
+    assert list(newton_qd.tables.reward_offset) == list(every)
     assert (
-        len(newton_qd.tables.reward_offset) == 12
+        len(newton_qd.tables.reward_offset) == len(every)
         and "ant" not in newton_qd.tables.reward_offset
     )
     assert "ant_uni" in repr(newton_qd.tables.reward_offset)

@@ -84,6 +84,30 @@ def test_wrong_limits(limits: dict[str, Any], message: str) -> None:
 
 
 @pytest.mark.parametrize(
+    ("place", "error", "message"),
+    [
+        ({"link": "hand"}, ValueError, r"link: got 'hand'; allowed: torso, aux_1, "),
+        ({"link": 3}, ValueError, r"link: got 3; allowed: torso, "),
+        ({"link": "foot_1", "offset": (1, 2)}, TypeError, r"offset: got \(1, 2\); "),
+        (
+            {"link": "foot_1", "offset": 1.0},
+            TypeError,
+            r"offset: got 1.0; allowed: thr",
+        ),
+        (
+            {"link": "foot_1", "offset": (1, np.inf, 0)},
+            ValueError,
+            r"offset\[1\]: got inf; ",
+        ),
+        ({"offset": (1, 0, 0)}, ValueError, r"offset: got .*\(0.0, 0.0, 0.0\) without"),
+    ],
+)
+def test_wrong_place(place: Any, error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        XYPositionWrapper(Ant(), "ant", **place)
+
+
+@pytest.mark.parametrize(
     "wrapper", [XYPositionWrapper, NoForwardRewardWrapper, FeetContactWrapper]
 )
 def test_robots_only(wrapper: Callable[[Env, str], Env]) -> None:

@@ -2,6 +2,7 @@
 
 from newton_qd.envs.acrobot import Acrobot
 from newton_qd.envs.ant import Ant
+from newton_qd.envs.arm_reach import ArmReach
 from newton_qd.envs.base import Env, PhysicsEnv, QDEnv
 from newton_qd.envs.fetch import Fetch
 from newton_qd.envs.halfcheetah import HalfCheetah
@@ -12,7 +13,7 @@ from newton_qd.envs.humanoid_trap import HumanoidTrap
 from newton_qd.envs.inverted_pendulum import InvertedDoublePendulum, InvertedPendulum
 from newton_qd.envs.locomotion import Locomotion
 from newton_qd.envs.pointmaze import PointMaze
-from newton_qd.envs.pusher import Pusher
+from newton_qd.envs.pusher import Pusher, TablePusher
 from newton_qd.envs.reacher import Reacher, ReacherAngle
 from newton_qd.envs.state import State, check
 from newton_qd.envs.swimmer import Swimmer
@@ -22,6 +23,7 @@ from newton_qd.envs.walker2d import Walker2d
 __all__ = [
     "Acrobot",
     "Ant",
+    "ArmReach",
     "Env",
     "Fetch",
     "HalfCheetah",
@@ -40,6 +42,7 @@ __all__ = [
     "ReacherAngle",
     "State",
     "Swimmer",
+    "TablePusher",
     "Ur5e",
     "Walker2d",
     "check",

@@ -1,4 +1,4 @@
-"""Pusher: bring an object to its goal with the hand of an arm."""
+"""Pushers: move an object over a table with the hand of an arm."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from newton_qd.envs.base import PhysicsEnv
 from newton_qd.envs.options import checked_options
 from newton_qd.envs.vectors import length, ordered_sum, rounded
 from newton_qd.physics.system import PhysicsState
-from newton_qd.robots import PUSHER
+from newton_qd.robots import PUSHER, PUSHER_TABLE, RobotSpec
 from newton_qd.types import Action, Metrics, RNGKey
 
 # A reset draws the object's position from a rectangle, then limits its distance.
@@ -35,6 +35,7 @@ class Pusher(PhysicsEnv):
             of 0.5 [m].
     """
 
+    _spec: RobotSpec = PUSHER
     reads_bodies = True
 
     @checked_options
@@ -59,7 +60,7 @@ class Pusher(PhysicsEnv):
             ValueError: An option has a value that is not allowed.
         """
         super().__init__(
-            PUSHER,
+            self._spec,
             reset_noise_scale=reset_noise_scale,
             reset_velocity_noise_scale=reset_velocity_noise_scale,
             dtype=dtype,
@@ -78,38 +79,107 @@ class Pusher(PhysicsEnv):
     def observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
         """Returns the blocks of the observation."""
         del action
-        hand, pushed, goal = self._places(state)
+        hand, pushed = self._places(state)
         return {
             "joint angles [rad]": state.q[self._joint_q],
             "joint velocities [rad/s]": state.v[self._joint_v],
             "hand position x y z [m]": hand,
-            "object position x y z [m]": pushed,
-            "goal position x y z [m]": goal,
+            **self._aims(pushed),
         }
 
-    def _places(self, state: PhysicsState) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Returns the positions (3,) of the hand, of the object and of its goal [m]."""
-        system = self.system
-        position = physics.seen_bodies(system, state).position
-        goal = system.scene_frames[system.scene_links.index("goal"), :3]
+    def _places(self, state: PhysicsState) -> tuple[jax.Array, jax.Array]:
+        """Returns the positions (3,) of the hand and of the object [m]."""
+        position = physics.seen_bodies(self.system, state).position
+        names = self.system.body_names
         hand, pushed = (
-            position[system.body_names.index(name)]
-            for name in ("r_wrist_roll_link", "object")
+            position[names.index(name)] for name in ("r_wrist_roll_link", "object")
         )
-        return hand, pushed, jnp.asarray(goal, self.dtype)
+        return hand, pushed
+
+    def _goal(self) -> jax.Array:
+        """Returns the goal of the object (3,) [m]."""
+        system = self.system
+        goal = system.scene_frames[system.scene_links.index("goal"), :3]
+        return jnp.asarray(goal, self.dtype)
+
+    def _aims(self, pushed: jax.Array) -> dict[str, jax.Array]:
+        """Returns the blocks of the observation about object (3,) and goal."""
+        return {
+            "object position x y z [m]": pushed,
+            "goal position x y z [m]": self._goal(),
+        }
 
     def outcome(
         self, before: PhysicsState, after: PhysicsState, action: Action
     ) -> tuple[jax.Array, jax.Array, Metrics]:
         """Returns reward, done and metrics of a step."""
         del after
-        hand, pushed, goal = self._places(before)
-        distance, near = length(pushed - goal), length(pushed - hand)
-        control = ordered_sum(jnp.square(action))
-        metrics = {
-            "reward_dist": -distance,
-            "reward_ctrl": -control,
-            "reward_near": -near,
-        }
-        cost = rounded(_CONTROL * control) + rounded(_NEAR * near)
+        pushed = self._places(before)[1]
+        distance = length(pushed - self._goal())
+        cost, metrics = self._cost(before, action)
+        metrics = {"reward_dist": -distance, **metrics}
         return -distance - cost, jnp.zeros_like(distance), metrics
+
+    def _cost(self, before: PhysicsState, action: Action) -> tuple[jax.Array, Metrics]:
+        """Returns the cost () of control and of a hand away from the object."""
+        hand, pushed = self._places(before)
+        near, control = length(pushed - hand), ordered_sum(jnp.square(action))
+        cost = rounded(_CONTROL * control) + rounded(_NEAR * near)
+        return cost, {"reward_ctrl": -control, "reward_near": -near}
+
+
+class TablePusher(Pusher):
+    """The arm of the pusher and an object that may end anywhere on the table.
+
+    There is no goal. Reward: that of the pusher without the distance from the goal, so
+    minus half of the distance of the object from the hand, minus a cost of control. It
+    is high if the hand goes to the object, and stays with it where it ends, without
+    effort. Never done. The table has drag: 2 N for an object of 1 m/s, so a pushed
+    object stops. It always starts at one place. ``XYPositionWrapper`` reads where the
+    object is.
+
+    Metrics:
+        reward_ctrl: Minus the sum of squared actions, without its weight of 0.1 [-].
+        reward_near: Minus the distance of the object from the hand, without its weight
+            of 0.5 [m].
+    """
+
+    _spec = PUSHER_TABLE
+
+    @checked_options
+    def __init__(
+        self, *, reset_noise_scale: float = 0.005, dtype: str = "float32"
+    ) -> None:
+        """Loads the arm.
+
+        Args:
+            reset_noise_scale: Half width of the uniform noise on joint angles [rad]
+                and joint velocities [rad/s] at a reset.
+            dtype: ``"float32"``, or ``"float64"`` with JAX x64 on.
+
+        Raises:
+            TypeError: An option has the wrong type.
+            ValueError: An option has a value that is not allowed.
+        """
+        super().__init__(
+            reset_noise_scale=reset_noise_scale,
+            reset_velocity_noise_scale=reset_noise_scale,
+            dtype=dtype,
+        )
+
+    def reset_pose(self, rng: RNGKey, q: jax.Array) -> jax.Array:
+        """Returns the default pose (nq,): the object always starts at one place."""
+        del rng
+        return q
+
+    def _aims(self, pushed: jax.Array) -> dict[str, jax.Array]:
+        """Returns the block of the observation about the object (3,)."""
+        return {"object position x y [m]": pushed[:2]}
+
+    def outcome(
+        self, before: PhysicsState, after: PhysicsState, action: Action
+    ) -> tuple[jax.Array, jax.Array, Metrics]:
+        """Returns reward, done and metrics of a step."""
+        del after
+        cost, metrics = self._cost(before, action)
+        return -cost, jnp.zeros_like(cost), metrics

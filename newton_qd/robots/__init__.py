@@ -14,7 +14,7 @@ from newton_qd.robots.humanoid import HUMANOID
 from newton_qd.robots.humanoid_standup import HUMANOID_STANDUP
 from newton_qd.robots.inverted_double_pendulum import INVERTED_DOUBLE_PENDULUM
 from newton_qd.robots.inverted_pendulum import INVERTED_PENDULUM
-from newton_qd.robots.pusher import PUSHER
+from newton_qd.robots.pusher import PUSHER, PUSHER_TABLE
 from newton_qd.robots.reacher import REACHER
 from newton_qd.robots.reacherangle import REACHERANGLE
 from newton_qd.robots.spec import Contact, Material, RobotSpec
@@ -54,6 +54,7 @@ __all__ = [
     "INVERTED_DOUBLE_PENDULUM",
     "INVERTED_PENDULUM",
     "PUSHER",
+    "PUSHER_TABLE",
     "REACHER",
     "REACHERANGLE",
     "ROBOTS",

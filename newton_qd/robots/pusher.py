@@ -1,5 +1,7 @@
 """Pusher: an arm of seven hinges over a table, and an object that it pushes."""
 
+import dataclasses
+
 from newton_qd.robots.spec import DEGREE, Contact, Material, RobotSpec
 
 # Colliders of the arm that touch the table and the object.
@@ -60,4 +62,9 @@ PUSHER = RobotSpec(
     gravity=0.0,
     # no friction, as in the original; half the radius of the tips
     material=Material(friction=0.0, support=1, smoothing=0.005, limit_swing=0.3),
+)
+
+# without a goal, on a table that slows the object down
+PUSHER_TABLE = dataclasses.replace(
+    PUSHER, name="pusher_table", urdf="pusher_table.urdf"
 )
