@@ -384,8 +384,13 @@ def test_ci_runs_the_test_command_of_the_readme() -> None:
     script = (ROOT / ".ci" / "run").read_text(encoding="utf-8").splitlines()
     assert command in script
     # what the README leaves out runs too
-    assert "pytest -n auto -m slow" in script
-    assert "pytest -n auto --optimized -m optimized" in script
+    assert "pytest -n auto -m slow || failed=$?" in script
+    mark = r"mark\.optimized"
+    files = f"$(grep -l '{mark}' tests/test_*.py)"
+    assert f"pytest -n auto --optimized -m optimized {files}" in script
+    # ... and no helper marks a test so
+    helpers = {*(ROOT / "tests").glob("*.py")} - {*(ROOT / "tests").glob("test_*.py")}
+    assert not [path for path in helpers if re.search(mark, path.read_text("utf-8"))]
 
 
 def test_readme_names_commands_that_exist() -> None:
