@@ -12,6 +12,7 @@ that are marked ``gpu`` themselves are skipped.
 from __future__ import annotations
 
 import functools
+import gc
 import os
 import shutil
 import signal
@@ -123,6 +124,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.get_closest_marker("gpu") is not None:
             item.add_marker(pytest.mark.skip(reason="no NVIDIA GPU on this machine"))
+
+
+def pytest_collection_finish() -> None:
+    """Looks for garbage less often: modules and what JAX traced are never garbage."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(50_000, 20, 50)
 
 
 @pytest.fixture(scope="session", autouse=True)
