@@ -30,17 +30,20 @@ def _make(context: EmitterContext, options: CMAMEOptions) -> Any:
     Raises:
         ConfigError: ``sigma_g`` is not positive.
     """
+    import jax
     from qdax.core.emitters.cma_improvement_emitter import CMAImprovementEmitter
     from qdax.core.emitters.cma_pool_emitter import CMAPoolEmitter
 
     checks.number("options: sigma_g", options.sigma_g, above=0, error=ConfigError)
-    emitter = CMAImprovementEmitter(
-        batch_size=context.config.batch_size,
-        genotype_dim=context.policy.size,
-        centroids=context.centroids,
-        sigma_g=options.sigma_g,
-        min_count=1,
-    )
+    # QDax's constructor asks for values, also where JAX compiles a generation
+    with jax.ensure_compile_time_eval():
+        emitter = CMAImprovementEmitter(
+            batch_size=context.config.batch_size,
+            genotype_dim=context.policy.size,
+            centroids=context.centroids,
+            sigma_g=options.sigma_g,
+            min_count=1,
+        )
     return CMAPoolEmitter(num_states=options.emitters, emitter=emitter)
 
 

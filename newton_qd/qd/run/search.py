@@ -67,6 +67,22 @@ class SearchState:
     start: np.ndarray | None = None
 
 
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class _Drawn:
+    """What the seed of a run draws once.
+
+    Attributes:
+        reset_key: Key of the reset to the start state.
+        emitter_key: Key of the emitter's first state.
+        centroids: (cells, D) centres of the cells.
+    """
+
+    reset_key: jax.Array
+    emitter_key: jax.Array
+    centroids: jax.Array
+
+
 class Search:
     """One algorithm of the MAP-Elites family on one task.
 
@@ -107,29 +123,26 @@ class Search:
         self._centroids = cell_centroids(config, task.limits, key_centroids)
         with refused_options():
             score = self._scoring()
-            emitter = self._algorithm.make(
-                EmitterContext(
-                    config,
-                    task,
-                    self._policy,
-                    lambda genotypes, key: score(genotypes, self._own_start(key)),
-                    self._key_reset,
-                    self._centroids,
-                ),
-                self.options,
+            self._drawn = _Drawn(
+                self._key_reset,
+                jax.random.fold_in(self._key_generations, 0),
+                self._centroids,
             )
-        self._generation = Generation(
-            emitter,
-            jax.random.fold_in(self._key_generations, 0),
-            self._algorithm.takes_faulty,
-            task.reward_offset * config.episode_length,
-        )
+            self._generation = self._generation_of(self._drawn, score)
         learns_on_mesh = self._algorithm.evaluates
+
+        def step(method: str) -> Callable[..., Any]:
+            def of_seed(drawn: _Drawn, *arguments: Any) -> Any:
+                made = self._generation_of(drawn, score)
+                return getattr(made, method)(*arguments)
+
+            return of_seed
+
         self._score = self._compiled(score)
-        self._ask = jax.jit(self._generation.propose)
+        self._ask = jax.jit(step("propose"))
         self._enter = jax.jit(self._generation.enter)
-        self._begin = self._compiled(self._generation.begin, learns_on_mesh)
-        self._tell = self._compiled(self._generation.tell, learns_on_mesh)
+        self._begin = self._compiled(step("begin"), learns_on_mesh)
+        self._tell = self._compiled(step("tell"), learns_on_mesh)
         self._population = jax.jit(jax.vmap(self._initial))
 
     def empty(self, start: np.ndarray | None = None) -> SearchState:
@@ -154,15 +167,25 @@ class Search:
             genotypes, repertoire, evaluations, rejected = self._settled(state)
             evaluations *= self._config.starts
             scores = self._score(genotypes, self._start(0))
-            repertoire, emitter, metrics = self._begin(repertoire, genotypes, scores)
+            repertoire, emitter, metrics = self._begin(
+                self._drawn, repertoire, genotypes, scores
+            )
             metrics["rejected"] += rejected
         else:
             key = jax.random.fold_in(self._key_generations, iteration)
-            genotypes, remembered = self._ask(state.repertoire, state.emitter, key)
+            genotypes, remembered = self._ask(
+                self._drawn, state.repertoire, state.emitter, key
+            )
             scores = self._score(genotypes, self._start(iteration))
             initial = np.float32(state.metrics[0][COLUMNS.index("initial_fitness")])
             repertoire, emitter, metrics = self._tell(
-                state.repertoire, state.emitter, genotypes, remembered, scores, initial
+                self._drawn,
+                state.repertoire,
+                state.emitter,
+                genotypes,
+                remembered,
+                scores,
+                initial,
             )
             each = self._episodes
             before = state.metrics[-1][COLUMNS.index("evaluations")]
@@ -213,9 +236,34 @@ class Search:
         # the first of these keys is that of the re-evaluations
         return jax.random.fold_in(self._key_reset, iteration + 2)
 
-    def _own_start(self, key: jax.Array) -> jax.Array:
-        """Returns the key of the start states of an emitter's own evaluations."""
-        return key if self._config.new_starts else self._key_reset
+    def _generation_of(self, drawn: _Drawn, score: ScoringFunction) -> Generation:
+        """Makes the emitter, and a generation with it.
+
+        Args:
+            drawn: What the seed has drawn. It may be traced: a compiled generation is
+                then the same for all seeds, and JAX's cache on disk has it.
+            score: Scoring function of genotypes (N, size) and a key.
+        """
+
+        def score_again(genotypes: jax.Array, key: jax.Array) -> Any:
+            # an emitter's own evaluations
+            start = key if self._config.new_starts else drawn.reset_key
+            return score(genotypes, start)
+
+        context = EmitterContext(
+            self._config,
+            self._task,
+            self._policy,
+            score_again,
+            drawn.reset_key,
+            drawn.centroids,
+        )
+        return Generation(
+            self._algorithm.make(context, self.options),
+            drawn.emitter_key,
+            self._algorithm.takes_faulty,
+            self._task.reward_offset * self._config.episode_length,
+        )
 
     @functools.cached_property
     def _episodes(self) -> int:
