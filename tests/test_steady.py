@@ -43,6 +43,28 @@ def test_nothing_is_compiled_after_the_first_generation(compiled: list[str]) -> 
     assert others == [first] * 3
 
 
+def test_a_generation_is_the_same_program_for_all_seeds() -> None:
+    """What the seed draws is no constant in it, so JAX's cache has other seeds' too."""
+    options = {"actors": 1, "branches": 1, "copies": 1, "worlds": 2, "window": 2}
+    options = {**options, "batches": 2}
+    texts = []
+    for seed in (0, 1):
+        config = SMALL.replace(
+            seed=seed, algorithm="me-actor-critic", options={**options}
+        )
+        search = Search(config, point_task(config))
+        empty, key = search.empty().repertoire, search._start(0)
+        genotypes = search._population(jax.random.split(key, config.batch_size))
+        scores = jax.eval_shape(search._score, genotypes, key)
+        given = (search._drawn, empty, genotypes, scores)
+        emitter = jax.eval_shape(search._begin, *given)[1]
+        propose = search._ask.lower(search._drawn, empty, emitter, key)
+        remembered = jax.eval_shape(search._ask, search._drawn, empty, emitter, key)[1]
+        given = (search._drawn, empty, emitter, genotypes, remembered, scores)
+        texts.append((propose.as_text(), search._tell.lower(*given, 0.0).as_text()))
+    assert texts[0] == texts[1]
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(not STATM.exists(), reason="needs Linux's account of memory")
 def test_memory_is_flat_over_a_thousand_generations() -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from newton_qd.checks import message
-from newton_qd.qd.algorithms import AlgorithmSpec, EmitterContext, algorithm_named
+from newton_qd.qd.algorithms import AlgorithmSpec, algorithm_named
 from newton_qd.qd.algorithms.options import refused_options
 from newton_qd.qd.config import ConfigError, EvolveConfig, settings_text
 from newton_qd.qd.extras import require_extra
@@ -21,7 +21,7 @@ from newton_qd.qd.run.archive import Archive
 from newton_qd.qd.run.cells import cell_centroids
 from newton_qd.qd.run.checkpoint import Checkpoint
 from newton_qd.qd.run.folder import COLUMNS, complete_metrics
-from newton_qd.qd.run.generation import Generation
+from newton_qd.qd.run.generation_parts import Drawn, GenerationParts
 from newton_qd.qd.run.leaves import leaf_to_host, tree_to_device
 from newton_qd.qd.run.reevaluation import (
     Reevaluated,
@@ -67,22 +67,6 @@ class SearchState:
     start: np.ndarray | None = None
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class _Drawn:
-    """What the seed of a run draws once.
-
-    Attributes:
-        reset_key: Key of the reset to the start state.
-        emitter_key: Key of the emitter's first state.
-        centroids: (cells, D) centres of the cells.
-    """
-
-    reset_key: jax.Array
-    emitter_key: jax.Array
-    centroids: jax.Array
-
-
 class Search:
     """One algorithm of the MAP-Elites family on one task.
 
@@ -123,26 +107,21 @@ class Search:
         self._centroids = cell_centroids(config, task.limits, key_centroids)
         with refused_options():
             score = self._scoring()
-            self._drawn = _Drawn(
+            parts = GenerationParts(
+                self._algorithm, self.options, config, task, self._policy, score
+            )
+            self._drawn = Drawn(
                 self._key_reset,
                 jax.random.fold_in(self._key_generations, 0),
                 self._centroids,
             )
-            self._generation = self._generation_of(self._drawn, score)
+            self._generation = parts.of(self._drawn)
         learns_on_mesh = self._algorithm.evaluates
-
-        def step(method: str) -> Callable[..., Any]:
-            def of_seed(drawn: _Drawn, *arguments: Any) -> Any:
-                made = self._generation_of(drawn, score)
-                return getattr(made, method)(*arguments)
-
-            return of_seed
-
         self._score = self._compiled(score)
-        self._ask = jax.jit(step("propose"))
+        self._ask = jax.jit(parts.propose)
         self._enter = jax.jit(self._generation.enter)
-        self._begin = self._compiled(step("begin"), learns_on_mesh)
-        self._tell = self._compiled(step("tell"), learns_on_mesh)
+        self._begin = self._compiled(parts.begin, learns_on_mesh)
+        self._tell = self._compiled(parts.tell, learns_on_mesh)
         self._population = jax.jit(jax.vmap(self._initial))
 
     def empty(self, start: np.ndarray | None = None) -> SearchState:
@@ -235,35 +214,6 @@ class Search:
             return self._key_reset
         # the first of these keys is that of the re-evaluations
         return jax.random.fold_in(self._key_reset, iteration + 2)
-
-    def _generation_of(self, drawn: _Drawn, score: ScoringFunction) -> Generation:
-        """Makes the emitter, and a generation with it.
-
-        Args:
-            drawn: What the seed has drawn. It may be traced: a compiled generation is
-                then the same for all seeds, and JAX's cache on disk has it.
-            score: Scoring function of genotypes (N, size) and a key.
-        """
-
-        def score_again(genotypes: jax.Array, key: jax.Array) -> Any:
-            # an emitter's own evaluations
-            start = key if self._config.new_starts else drawn.reset_key
-            return score(genotypes, start)
-
-        context = EmitterContext(
-            self._config,
-            self._task,
-            self._policy,
-            score_again,
-            drawn.reset_key,
-            drawn.centroids,
-        )
-        return Generation(
-            self._algorithm.make(context, self.options),
-            drawn.emitter_key,
-            self._algorithm.takes_faulty,
-            self._task.reward_offset * self._config.episode_length,
-        )
 
     @functools.cached_property
     def _episodes(self) -> int:
