@@ -54,6 +54,7 @@ def _make(context: EmitterContext, options: ActorCriticOptions) -> Any:
     """
     from newton_qd.qd.emitters import ActorCritic, ActorCriticEmitter
     from newton_qd.qd.emitters.actor_critic_learner import measure_of
+    from newton_qd.qd.emitters.whitening import Whitening
 
     config, policy = context.config, context.policy
     task = differentiable(context.task, options)
@@ -63,6 +64,7 @@ def _make(context: EmitterContext, options: ActorCriticOptions) -> Any:
         measure_of(task),
         config.episode_length,
         options,
+        Whitening.of(policy) if options.whiten else Whitening(),
     )
     emitter = ActorCriticEmitter(
         method,

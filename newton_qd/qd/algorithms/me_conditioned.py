@@ -76,14 +76,17 @@ def _make(context: EmitterContext, options: ConditionedOptions) -> Any:
     """MAP-Elites with the policies of an actor that is told the target descriptor."""
     from newton_qd.qd.emitters import ActorCritic, ConditionedActorEmitter
     from newton_qd.qd.emitters.aims import AimedEnv, ConditionedPolicy, no_measure
+    from newton_qd.qd.emitters.whitening import Whitening
 
     config = context.config
     copies, between = options.numbers(config)
     task = differentiable(context.task, options)
     env = AimedEnv(task, config.episode_length)
     policy = ConditionedPolicy(context.policy, task.descriptor_length)
+    white = Whitening.of(context.policy) if options.whiten else Whitening()
+    length = config.episode_length
     emitter = ConditionedActorEmitter(
-        ActorCritic(env, policy.act, no_measure, config.episode_length, options),
+        ActorCritic(env, policy.act, no_measure, length, options, white),
         env,
         policy,
         task.env.reset(context.reset_key),

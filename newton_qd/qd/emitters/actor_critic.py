@@ -30,7 +30,8 @@ class ActorCriticState:
     Attributes:
         learners: The K actors, leaves (K, ...).
         scale: Mean and standard deviation of observations, (no,) each.
-        snapshots: (branches, K, size) weights of the actors during the generation.
+        snapshots: (branches, K, size) weights of the actors during the generation, for
+            whitened observations.
         failed: (K,) number of updates of the generation without a finite gradient.
         generation: () number of generations of the actors.
         key: Key of the next generation.
@@ -134,7 +135,11 @@ class ActorCriticEmitter(Emitter):
         descriptors: jax.Array,
         extra_scores: ExtraScores,
     ) -> PyTree:
-        """Starts from the best of the initial population, which it emits again."""
+        """Starts from weights of the initial population.
+
+        With whitening, they are read as weights for whitened observations, which makes
+        them other policies.
+        """
         del repertoire, descriptors, extra_scores
         key, scale_key, aim_key, critic_key = jax.random.split(key, 4)
         # repeats the best if there are more actors than individuals
@@ -159,13 +164,15 @@ class ActorCriticEmitter(Emitter):
             (copies * branches * actors, size) weights, and the number of gradients that
             ``overflowed``, (actors,).
         """
+        white, scale = self._method.whitening, emitter_state.scale
         snapshots = emitter_state.snapshots
         actors = snapshots.reshape(-1, snapshots.shape[-1])
         cell_key, part_key, size_key, noise_key = jax.random.split(key, 4)
         filled = repertoire.fitnesses[:, 0] > -jnp.inf
         shape = (self._copies - 1, len(actors))
         cells = draw_cells(cell_key, filled, shape[0] * shape[1])
-        elites = repertoire.genotypes[cells].reshape(*shape, actors.shape[-1])
+        elites = white.whitened(repertoire.genotypes[cells], scale)
+        elites = elites.reshape(*shape, actors.shape[-1])
         dtype = actors.dtype
         part = jax.random.uniform(part_key, (*shape, 1), dtype)
         smallest, largest = self._spread
@@ -174,7 +181,8 @@ class ActorCriticEmitter(Emitter):
         noise = jax.random.normal(noise_key, elites.shape, dtype)
         between = actors + part * (elites - actors) + sizes * noise
         offspring = jnp.concatenate([actors, between.reshape(-1, actors.shape[-1])])
-        return offspring, {"overflowed": emitter_state.failed}
+        overflowed = {"overflowed": emitter_state.failed}
+        return white.plain(offspring, scale), overflowed
 
     def state_update(
         self,
@@ -245,6 +253,7 @@ class ActorCriticEmitter(Emitter):
         filled = repertoire.fitnesses[:, 0] > -jnp.inf
         cells = draw_cells(cell_key, filled, self._actors)
         weights = repertoire.genotypes[cells]
+        weights = self._method.whitening.whitened(weights, state.scale)
         new = self._begun(critic_key, weights, self._aims(aim_key))
         number = jnp.arange(self._actors)
         # one after the other, so that there are actors of all ages

@@ -16,6 +16,7 @@ from newton_qd.envs.state import select
 from newton_qd.extractors import get_final_xy_position
 from newton_qd.gradients.flow import passed_back
 from newton_qd.qd.emitters.actor_critic_settings import ActorCriticSettings
+from newton_qd.qd.emitters.whitening import Whitening
 from newton_qd.qd.scoring.task import Task
 from newton_qd.types import Environment, PyTree, StateLike
 
@@ -23,6 +24,7 @@ Layers: TypeAlias = list[tuple[jax.Array, jax.Array]]
 """Weights and bias of each layer of a perceptron."""
 
 _SETTLING = 100  # random steps to measure the scale of observations
+_LEAST = 0.1  # smallest deviation of an entry of an observation
 
 
 @jax.tree_util.register_dataclass
@@ -31,7 +33,7 @@ class Learner:
     """One actor between two updates; for K actors, leaves (K, ...).
 
     Attributes:
-        weights: (size,) weights of the policy.
+        weights: (size,) weights of the policy, for whitened observations.
         aim: (1 + D,) weights of the reward and of each component of the measure.
         critic: The critic.
         target: A slower copy of the critic, from which the actor learns.
@@ -76,6 +78,8 @@ class ActorCritic:
             of this step.
         episode_length: Control steps of an episode.
         settings: Settings of the learning.
+        whitening: Converts the weights of an actor, which are for whitened
+            observations, to those of ``policy``; the default changes nothing.
     """
 
     env: Environment
@@ -83,6 +87,7 @@ class ActorCritic:
     measure: Callable[[StateLike, StateLike], jax.Array]
     episode_length: int
     settings: ActorCriticSettings
+    whitening: Whitening = dataclasses.field(default_factory=Whitening)
 
     @property
     def steps(self) -> int:
@@ -114,7 +119,9 @@ class ActorCritic:
             return state, state.obs
 
         obs = jax.lax.scan(advance, first, actions)[1].reshape(-1, first.obs.shape[-1])
-        return obs.mean(axis=0), obs.std(axis=0) + 0.01
+        # entries that hardly change, such as the load of a foot in the air, must not
+        # become large
+        return obs.mean(axis=0), jnp.maximum(obs.std(axis=0), _LEAST)
 
     def begin(
         self, key: jax.Array, weights: jax.Array, aim: jax.Array, first: PyTree
@@ -123,7 +130,7 @@ class ActorCritic:
 
         Args:
             key: Key of the weights of the critic.
-            weights: (size,) weights of the actor.
+            weights: (size,) weights of the actor, for whitened observations.
             aim: (1 + D,) weights of the reward and of each measure.
             first: Initial states of its worlds, leaves (W, ...).
         """
@@ -162,7 +169,8 @@ class ActorCritic:
         noise = jax.random.normal(noise_key, shape, learner.weights.dtype)
 
         def loss(weights: jax.Array) -> tuple[jax.Array, PyTree]:
-            run = functools.partial(self._window, weights, learner, scale)
+            plain = self.whitening.plain(weights, scale)
+            run = functools.partial(self._window, plain, learner, scale)
             returns, found = jax.vmap(run)(
                 learner.first, learner.worlds, settings.noise * noise
             )

@@ -26,6 +26,7 @@ class ActorCriticSettings:
             state of a window has a value.
         epochs: Number of times that the critic learns from a window.
         batches: Optimizer steps of the critic in each epoch.
+        whiten: Whether an actor learns weights for whitened observations.
 
     Raises:
         ValueError: A value is out of its range.
@@ -43,6 +44,7 @@ class ActorCriticSettings:
     actor_trace: float = 1.0
     epochs: int = 2
     batches: int = 4
+    whiten: bool = True
 
     def __post_init__(self) -> None:
         """Checks every value.

@@ -34,7 +34,8 @@ class ConditionedState:
     Attributes:
         learner: The actor; its worlds have targets.
         scale: Mean and standard deviation of observations, (no,) each.
-        unit: () return that counts as much as half of the descriptor's extent.
+        unit: () return that counts as much as half of the descriptor's extent: the
+            largest deviation of the archive's fitness so far.
         logits: (cells,) multiplier of the distance to each cell, as a logit.
         cells: (copies,) targets of the next copies.
         failed: (1,) number of updates of the generation without a finite gradient.
@@ -180,7 +181,8 @@ class ConditionedActorEmitter(Emitter):
         cell_key, part_key, size_key, noise_key = jax.random.split(key, 4)
         filled = repertoire.fitnesses[:, 0] > -jnp.inf
         cells = draw_cells(cell_key, filled, self._between)
-        elites = repertoire.genotypes[cells]
+        white = self._method.whitening
+        elites = white.whitened(repertoire.genotypes[cells], state.scale)
         actors = special(state, repertoire.descriptors[cells])
         shape, dtype = (self._between, 1), elites.dtype
         part = jax.random.uniform(part_key, shape, dtype)
@@ -188,7 +190,8 @@ class ConditionedActorEmitter(Emitter):
         sizes = low * (high / low) ** jax.random.uniform(size_key, shape, dtype)
         noise = jax.random.normal(noise_key, elites.shape, dtype)
         mixed = actors + part * (elites - actors) + sizes * noise
-        return jnp.concatenate([copies, mixed]), {"overflowed": state.failed}
+        offspring = white.plain(jnp.concatenate([copies, mixed]), state.scale)
+        return offspring, {"overflowed": state.failed}
 
     def state_update(
         self,
@@ -204,8 +207,9 @@ class ConditionedActorEmitter(Emitter):
         state = emitter_state
         key, aim_key, cell_key, learn_key = jax.random.split(state.key, 4)
         logits = self._multipliers(state, repertoire, descriptors[: self._copies])
+        unit = jnp.maximum(state.unit, _spread(repertoire.fitnesses[:, 0]))
         # worlds take new targets when their episodes begin
-        worlds = self._worlds(repertoire, logits, state.unit, aim_key)
+        worlds = self._worlds(repertoire, logits, unit, aim_key)
         learner = dataclasses.replace(state.learner, first=worlds)
 
         def learn(carry: tuple, key: jax.Array) -> tuple[tuple, None]:
@@ -217,9 +221,7 @@ class ConditionedActorEmitter(Emitter):
         begin = (learner, jnp.zeros_like(state.failed))
         (learner, failed), _ = jax.lax.scan(learn, begin, keys)
         cells = self._targets(repertoire, cell_key, self._copies)
-        return ConditionedState(
-            learner, state.scale, state.unit, logits, cells, failed, key
-        )
+        return ConditionedState(learner, state.scale, unit, logits, cells, failed, key)
 
     def _specialized(self, state: PyTree, descriptors: jax.Array) -> jax.Array:
         """Returns the actor's policies (N, size) for descriptors (N, D)."""
@@ -275,3 +277,9 @@ class ConditionedActorEmitter(Emitter):
         change = jnp.where(jnp.isfinite(excess), self._dual_rate * excess, 0)
         logits = state.logits.at[state.cells].add(change)
         return jnp.clip(logits, -_LARGEST, _LARGEST)
+
+
+def _spread(fitnesses: jax.Array) -> jax.Array:
+    """Returns the standard deviation () of the fitness of the filled cells."""
+    filled = fitnesses > -jnp.inf
+    return jnp.std(jnp.where(filled, fitnesses, 0), where=filled)

@@ -1,0 +1,51 @@
+"""Weights of a policy in terms of whitened observations."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from point_runs import PointEnv
+
+from newton_qd.qd.emitters.whitening import Whitening
+from newton_qd.qd.scoring.networks import policy_of
+from newton_qd.qd.scoring.rollout import make_policy
+
+
+def test_plain_weights_do_what_the_whitened_ones_do() -> None:
+    """A policy of plain observations equals one of whitened observations."""
+    policy = make_policy(PointEnv(), (5, 4))
+    white = Whitening.of(policy)
+    keys = jax.random.split(jax.random.key(0), 4)
+    size = PointEnv().observation_size
+    mean = 3 * jax.random.normal(keys[0], (size,))
+    deviation = jnp.exp(2 * jax.random.normal(keys[1], (size,)))
+    # an environment may tell the critic more than the policy sees
+    scale = jnp.append(mean, 7.0), jnp.append(deviation, 9.0)
+    weights = jax.vmap(policy.init)(jax.random.split(keys[2], 3))
+    obs = mean + deviation * jax.random.normal(keys[3], (size,))
+
+    plain = white.plain(weights, scale)
+    act = jax.vmap(policy.of_weights, (0, None))
+    expected = act(weights, (obs - mean) / deviation)
+    np.testing.assert_allclose(act(plain, obs), expected, atol=1e-5)
+    np.testing.assert_allclose(white.whitened(plain, scale), weights, atol=1e-5)
+    assert float(jnp.abs(plain - weights).max()) > 0.1
+
+
+def test_a_network_without_a_known_first_layer_stays_as_it_is() -> None:
+    """Its weights have no places that could be converted."""
+
+    class Model:
+        def init(self, key: jax.Array, obs: jax.Array) -> dict[str, jax.Array]:
+            return {"matrix": jax.random.normal(key, (obs.size, 2))}
+
+        def apply(self, tree: dict[str, jax.Array], obs: jax.Array) -> jax.Array:
+            return jnp.tanh(obs @ tree["matrix"])
+
+    policy = policy_of(PointEnv(), Model())
+    white = Whitening.of(policy)
+    weights = policy.init(jax.random.key(0))
+    scale = jnp.zeros(9), 2 * jnp.ones(9)
+    assert white.plain(weights, scale) is weights
+    assert white.whitened(weights, scale) is weights
