@@ -16,7 +16,8 @@ variant is best on a task is found first, with another seed:
     python benchmarks/study_report.py runs --out benchmarks/results/study.csv
 
 With ``--workers N`` N runs go on at once, on a CPU each with its share of the cores, on
-GPUs in turn on each of them.
+GPUs in turn on each of them. Runs of a protocol below that share a GPU take turns: one
+has its clock running, and the others compile.
 
 All this is the protocol ``core``, for one core of a CPU. ``study_protocols.py`` has two
 more. ``field`` is that of published comparisons, for one GPU: a million evaluations in

@@ -95,6 +95,7 @@ FIELD = Protocol(
     own={name: {"hidden": [256, 256]} for name in HUMANOIDS},
     stops=(
         Stop("evaluations", 1_000_000),
+        Stop("s", 20),
         Stop("s", 60),
         Stop("s", 250),
         Stop("s", 1000),
@@ -102,7 +103,7 @@ FIELD = Protocol(
     seeds=20,
     slow_seeds=5,
 )
-"""As in the evaluations of ASCII-ME and DCRL-ME, on one GPU."""
+"""As in the evaluations of ASCII-ME and DCRL-ME, on one GPU; 20 s are for tuning."""
 
 SMALL = Protocol(
     name="small",

@@ -8,14 +8,17 @@ command continues; it is removed when the run has reached its last stop.
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import dataclasses
 import fcntl
 import json
 import math
+import os
 import subprocess
 import time
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -221,6 +224,8 @@ class Progress:
         state = self.search.empty()
         for _ in range(3):  # compiles, and runs what is compiled
             state = self.search.advance(state)
+        self.state = state
+        self.scores()
         self.state = self.search.empty()
         if self._path.is_file() and self._clock.is_file():
             from newton_qd.qd.run.checkpoint import load_checkpoint
@@ -307,6 +312,33 @@ def execute(
     }
     here = Progress(protocol, run, out, until)
     wall = device == "cuda"
+    with turn(out) if wall else contextlib.nullcontext():
+        return _to_the_end(protocol, here, done, out, until, device, deadline)
+
+
+@contextlib.contextmanager
+def turn(out: Path) -> Iterator[None]:
+    """Waits until no other run of this GPU has its clock running.
+
+    Other runs build and compile meanwhile.
+    """
+    gpu = os.environ.get("CUDA_VISIBLE_DEVICES", "")
+    with (out / f"gpu{gpu}.lock").open("w", encoding="utf-8") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def _to_the_end(
+    protocol: Protocol,
+    here: Progress,
+    done: set[str],
+    out: Path,
+    until: float,
+    device: str,
+    deadline: float,
+) -> bool:
+    """Advances a run past its stops that are not done, and writes a line at each."""
+    wall = device == "cuda"
     left = [stop for stop in here.stops if str(stop) not in done]
     saved = here.seconds(wall)
     while left:
@@ -374,6 +406,8 @@ def add_line(path: Path, line: dict[str, str]) -> None:
 
 def commit() -> str:
     """Returns the version of the code."""
+    if "STUDY_COMMIT" in os.environ:  # a copy without the repository
+        return os.environ["STUDY_COMMIT"]
     command = ["git", "describe", "--always", "--dirty"]
     folder = Path(__file__).parent
     done = subprocess.run(

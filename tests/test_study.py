@@ -88,6 +88,7 @@ def test_stops_come_by_evaluations_and_time() -> None:
     assert Stop("s", 60).reached(0, 60.0) and not Stop("s", 60).reached(99, 59.9)
     assert [str(x) for x in FIELD.stops_until(250)] == [
         "1000000 evaluations",
+        "20 s",
         "60 s",
         "250 s",
     ]
