@@ -91,6 +91,10 @@
     view.renderer.setPixelRatio(Math.min(window.devicePixelRatio || 1, 2));
     container.appendChild(view.renderer.domElement);
     view.controls = new THREE.OrbitControls(view.camera, view.renderer.domElement);
+    view.changed = true; // whether the next frame has to draw
+    const again = () => { view.changed = true; };
+    view.controls.addEventListener("change", again);
+    view.renderer.domElement.addEventListener("webglcontextrestored", again);
     view.controls.maxPolarAngle = 0.497 * Math.PI; // not below the ground
     view.controls.minDistance = 0.3 * drawing.radius;
     view.controls.maxDistance = 60 * drawing.radius;
@@ -173,6 +177,7 @@
 
   // Gives worlds their colours: the first has those of the files if it is alone.
   View.paint = function () {
+    this.changed = true;
     const own = new THREE.Color(), mark = new THREE.Color();
     for (const each of this.shapes) {
       const c = each.shape.color;
@@ -249,6 +254,7 @@
   const placed = new Float64Array(7);
 
   View.place = function () {
+    this.changed = true;
     const size = 7 * this.tree.size;
     for (const each of this.shapes) {
       if (!each.mesh.visible) continue;
@@ -284,6 +290,7 @@
 
   // Draws the way of a world: `points` holds three numbers for each frame up to `last`.
   View.trail = function (world, points, last) {
+    this.changed = true;
     const line = this.trails[world], array = line.geometry.attributes.position;
     const stride = Math.max(1, Math.ceil((last + 1) / TRAIL));
     let n = 0;
@@ -298,6 +305,7 @@
 
   // Draws arrows: six numbers each, start and end.
   View.impulses = function (points) {
+    this.changed = true;
     const out = this.arrows.instanceMatrix.array;
     const count = Math.min(points.length / 6, out.length / 16);
     const along = new THREE.Vector3(), first = new THREE.Vector3();
@@ -342,6 +350,7 @@
   };
 
   View.theme = function (name) {
+    this.changed = true;
     const t = THEMES[name];
     this.scene.background = new THREE.Color(t.sky);
     this.scene.fog = new THREE.Fog(t.sky);
@@ -351,6 +360,7 @@
   };
 
   View.resize = function () {
+    this.changed = true;
     const width = Math.max(1, this.container.clientWidth);
     const height = Math.max(1, this.container.clientHeight);
     this.renderer.setSize(width, height, false);
@@ -358,7 +368,11 @@
     this.camera.updateProjectionMatrix();
   };
 
+  // Draws, if the picture has changed since it was drawn.
   View.render = function () {
+    this.controls.update(); // tells of a camera that has moved
+    if (!this.changed) return;
+    this.changed = false;
     const t = this.controls.target, r = this.drawing.radius;
     this.plane.position.set(t.x, t.y, 0);
     const away = this.camera.position.distanceTo(t);
@@ -366,7 +380,6 @@
     this.scene.fog.far = 70 * r + 5 * away;
     this.sun.position.set(t.x - 3 * r, t.y - 4 * r, t.z + 8 * r);
     this.sun.target.position.copy(t);
-    this.controls.update();
     this.renderer.render(this.scene, this.camera);
   };
 
