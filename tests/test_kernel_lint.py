@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import textwrap
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from kernel_lint import lint
 from kernel_program import Program
 
 import newton_qd
+from newton_qd.physics.precision import SHARED
 
 KERNELS = Path(newton_qd.__file__).parent / "physics" / "kernels"
 
@@ -313,6 +315,21 @@ def dedented(sources: dict[str, str]) -> dict[str, str]:
 def test_the_kernels_keep_the_rules() -> None:
     files = sorted(KERNELS.glob("*.py"))
     assert lint({path.stem: path.read_text() for path in files}) == []
+
+
+def test_shared_modules_depend_neither_on_boxes_nor_on_pairs() -> None:
+    for path in (path for path in KERNELS.rglob("*.py") if path.stem != "__init__"):
+        own = path.relative_to(KERNELS).with_suffix("").parts
+        if own[0] not in SHARED:
+            continue
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if not isinstance(node, ast.ImportFrom) or node.level != len(own):
+                continue
+            names = {alias.name for alias in node.names}
+            if node.module is None:
+                assert not names & {"boxes", "pairs"}, path
+            elif (own, names) != (("inspect",), {"kinematics"}):
+                assert node.module.split(".")[0] in SHARED, (path, node.module)
 
 
 def test_the_kernels_are_seen() -> None:

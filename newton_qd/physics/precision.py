@@ -28,6 +28,11 @@ _VECTOR_BYTES = 32
 _OPTIMIZATION = 2
 # Modules in a folder of the package.
 _FILES = {"memory": "cpp.memory"}
+# Modules that are the same with and without boxes and pairs. Variants share them, and
+# Warp compiles `inspect` once for all. It is the only one that needs others: it takes
+# the kinematics from `simulate`.
+SHARED = ("answers", "box", "cpp", "inertia", "inspect", "integration", "joints")
+SHARED += ("kinematics", "parameters", "readings", "rows", "structs", "world")
 SCALARS = {"float32": wp.float32, "float64": wp.float64}
 
 
@@ -120,10 +125,14 @@ def build_kernels(variant: Variant) -> Kernels:
 
     Returns:
         The modules of the variant. Their names begin with ``variant.package``, so that
-        Warp compiles and caches each variant separately.
+        Warp compiles and caches each variant separately. What does not depend on boxes
+        and pairs comes from the variant without them.
     """
     _VARIANTS[variant.package] = variant
     package = _run_template(variant.package)
+    plain = dataclasses.replace(variant, boxes=False, pairs=False)
+    if plain != variant:
+        _share(build_kernels(plain).package.__name__, variant.package)
     names = [field.name for field in dataclasses.fields(Kernels)[1:]]
     modules = {
         name: importlib.import_module(f"{variant.package}.{_FILES.get(name, name)}")
@@ -150,6 +159,14 @@ def _run_template(name: str) -> ModuleType:
         del sys.modules[name]
         raise
     return package
+
+
+def _share(owner: str, package: str) -> None:
+    """Lets a package import the shared modules of another one as its own."""
+    for name in list(sys.modules):
+        own = name.removeprefix(f"{owner}.")
+        if own != name and own.split(".")[0] in SHARED:
+            sys.modules[f"{package}.{own}"] = sys.modules[name]
 
 
 def pack_width(dtype: str, device: wp.Device) -> int:
