@@ -25,7 +25,7 @@ import newton_qd
 
 pytestmark = [pytest.mark.usefixtures("x64"), pytest.mark.slow]
 
-WALKING = ["ant", "hopper", "walker2d", "humanoid"]
+WALKING = ["ant", "fetch", "hopper", "walker2d", "humanoid"]
 
 
 # Energy
