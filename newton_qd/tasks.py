@@ -26,6 +26,7 @@ from newton_qd.envs.humanoid_trap import HumanoidTrap
 from newton_qd.envs.inverted_pendulum import InvertedDoublePendulum, InvertedPendulum
 from newton_qd.envs.pointmaze import PointMaze
 from newton_qd.envs.pusher import Pusher, TablePusher
+from newton_qd.envs.quadruped import Quadruped
 from newton_qd.envs.reacher import Reacher, ReacherAngle
 from newton_qd.envs.swimmer import Swimmer
 from newton_qd.envs.ur5e import Ur5e
@@ -199,6 +200,7 @@ def _position(
 
 
 _ANYWHERE = ((-30.0, -30.0), (30.0, 30.0))
+_YARD = ((-15.0, -15.0), (15.0, 15.0))
 # around the start of the object, as far as a push brings it
 _TABLE = ((-1.0, -1.0), (1.0, 1.0))
 # a square around the disk of 0.21 m: 78.5 % of it are within reach
@@ -264,5 +266,10 @@ ENVIRONMENTS: dict[str, EnvironmentSpec] = {
         robot=REACHER,
         link=TIP[0],
         offset=TIP[1],
+    ),
+    "quadruped": EnvironmentSpec(Quadruped, "quadruped"),
+    "quadruped_uni": _uni(Quadruped, "quadruped", (0.95, None)),
+    "quadruped_omni": _position(
+        Quadruped, "quadruped", (0.14, None), _YARD, NoForwardRewardWrapper
     ),
 }

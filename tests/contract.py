@@ -17,8 +17,8 @@ from newton_qd.envs.state import State
 from newton_qd.physics.system import PhysicsState
 
 # The tasks, and of those that differ by constants only, one: plain robots are the
-# bases of their tasks, and two names repeat what other names do.
-_REPEATED = {"antnotrap", "humanoid_omni"}
+# bases of their tasks, and three names repeat what other names do.
+_REPEATED = {"antnotrap", "humanoid_omni", "quadruped_omni"}
 NAMES = [
     name
     for name in newton_qd.registered_envs()

@@ -86,6 +86,8 @@ TASKS = {
 NEW = {
     "pusher_uni": Task("pusher_table", 19, 7, XY, ((-1.0, -1.0), (1.0, 1.0))),
     "arm_reach": Task("reacher", 10, 2, XY, ((-0.21, -0.21), (0.21, 0.21))),
+    "quadruped_uni": Task("quadruped", 35, 12, FEET, ((0.0,) * 4, (1.0,) * 4)),
+    "quadruped_omni": Task("quadruped", 35, 12, XY, ((-15.0, -15.0), (15.0, 15.0))),
 }
 ROBOTS = {
     "ant": (87, 8),
@@ -104,6 +106,7 @@ ROBOTS = {
     "reacherangle": (11, 2),
     "swimmer": (8, 2),
     "ur5e": (66, 6),
+    "quadruped": (35, 12),
 }
 
 
@@ -112,7 +115,7 @@ def test_names() -> None:
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_sizes_of_robots_are_those_of_the_original(name: str) -> None:
+def test_sizes_of_robots_are_as_declared(name: str) -> None:
     env = newton_qd.create(name)
     assert (env.observation_size, env.action_size) == ROBOTS[name]
     assert env.name == name

@@ -34,6 +34,7 @@ SUITE = {
     "reacherangle": THREE,
     "swimmer": THREE,
     "ur5e": THREE,
+    "quadruped": ONE,
 }
 
 

@@ -14,6 +14,7 @@ from newton_qd.envs.inverted_pendulum import InvertedDoublePendulum, InvertedPen
 from newton_qd.envs.locomotion import Locomotion
 from newton_qd.envs.pointmaze import PointMaze
 from newton_qd.envs.pusher import Pusher, TablePusher
+from newton_qd.envs.quadruped import Quadruped
 from newton_qd.envs.reacher import Reacher, ReacherAngle
 from newton_qd.envs.state import State, check
 from newton_qd.envs.swimmer import Swimmer
@@ -38,6 +39,7 @@ __all__ = [
     "PointMaze",
     "Pusher",
     "QDEnv",
+    "Quadruped",
     "Reacher",
     "ReacherAngle",
     "State",

@@ -11,7 +11,8 @@ from newton_qd.envs.base import PhysicsEnv
 from newton_qd.envs.options import checked_options
 from newton_qd.envs.points import point
 from newton_qd.envs.rollouts import RolloutOrder
-from newton_qd.envs.vectors import length, ordered_sum, rounded
+from newton_qd.envs.servos import servo_targets
+from newton_qd.envs.vectors import length, ordered_sum
 from newton_qd.physics.inspection import Kinematics
 from newton_qd.physics.system import PhysicsState
 from newton_qd.robots import REACHER, REACHERANGLE, RobotSpec
@@ -143,10 +144,7 @@ class ReacherAngle(Reacher):
     def control(self, state: PhysicsState, action: Action) -> jax.Array:
         """Returns the target angles of the joints (nu,) [rad]."""
         del state
-        dofs = self.system.control_dof
-        low = jnp.asarray(self.system.limit_lower[dofs], self.dtype)
-        high = jnp.asarray(self.system.limit_upper[dofs], self.dtype)
-        return low + rounded((high - low) * (jnp.clip(action, -1, 1) + 1) / 2)
+        return servo_targets(self.system, action)
 
     def outcome(
         self, before: PhysicsState, after: PhysicsState, action: Action

@@ -15,6 +15,7 @@ from newton_qd.robots.humanoid_standup import HUMANOID_STANDUP
 from newton_qd.robots.inverted_double_pendulum import INVERTED_DOUBLE_PENDULUM
 from newton_qd.robots.inverted_pendulum import INVERTED_PENDULUM
 from newton_qd.robots.pusher import PUSHER, PUSHER_TABLE
+from newton_qd.robots.quadruped import QUADRUPED
 from newton_qd.robots.reacher import REACHER
 from newton_qd.robots.reacherangle import REACHERANGLE
 from newton_qd.robots.spec import Contact, Material, RobotSpec
@@ -40,6 +41,7 @@ ROBOTS = {
         REACHERANGLE,
         SWIMMER,
         UR5E,
+        QUADRUPED,
     )
 }
 
@@ -55,6 +57,7 @@ __all__ = [
     "INVERTED_PENDULUM",
     "PUSHER",
     "PUSHER_TABLE",
+    "QUADRUPED",
     "REACHER",
     "REACHERANGLE",
     "ROBOTS",
