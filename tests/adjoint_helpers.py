@@ -111,9 +111,10 @@ def readings(env: Any) -> Callable[..., jax.Array]:
 @functools.cache
 def weighted(env: Any) -> Callable[..., jax.Array]:
     """A random linear functional of the readings."""
+    read = readings(env)  # here, because a trace of ``value`` must not reset
 
     def value(inputs: Inputs, *options: Any) -> jax.Array:
-        seen = readings(env)(inputs, *options)
+        seen = read(inputs, *options)
         return (np.random.default_rng(1).normal(size=seen.shape) * seen).sum()
 
     return value
