@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import jax
+import jax.numpy as jnp
 
 from newton_qd.envs.locomotion import Locomotion
 from newton_qd.envs.options import checked_options
@@ -10,7 +11,7 @@ from newton_qd.envs.rollouts import RolloutOrder
 from newton_qd.envs.servos import servo_targets
 from newton_qd.physics.system import PhysicsState
 from newton_qd.robots import QUADRUPED
-from newton_qd.types import Action
+from newton_qd.types import Action, Metrics
 
 
 class Quadruped(Locomotion):
@@ -72,3 +73,10 @@ class Quadruped(Locomotion):
         """Returns the target angles of the joints (nu,) [rad]."""
         del state
         return servo_targets(self.system, action)
+
+    def outcome(
+        self, before: PhysicsState, after: PhysicsState, action: Action
+    ) -> tuple[jax.Array, jax.Array, Metrics]:
+        """Returns reward, done and metrics of a step."""
+        # a huge action is clipped, and must not cost infinitely much
+        return super().outcome(before, after, jnp.clip(action, -1, 1))
