@@ -75,28 +75,29 @@ def test_a_mesh_has_the_devices_that_exist() -> None:
 
 @pytest.mark.optimized
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["ant_uni", "pointmaze"])
-def test_results_do_not_depend_on_the_number_of_devices(name: str) -> None:
+def test_results_do_not_depend_on_the_number_of_devices() -> None:
     code = """
-score, genotypes = problem("NAME", 22)
-key = jax.random.key(2)
-expected = jax.jit(score)(genotypes, key)
-shapes = []
+def shapes_of(name):
+    score, genotypes = problem(name, 22)
+    key = jax.random.key(2)
+    expected = jax.jit(score)(genotypes, key)
+    shapes = []
 
-def watched(genotypes, key):
-    shapes.append(genotypes.shape[0])
-    return score(genotypes, key)
+    def watched(genotypes, key):
+        shapes.append(genotypes.shape[0])
+        return score(genotypes, key)
 
-for count in (1, 2, 4):
-    found = jax.jit(shard_scoring(watched, device_mesh(count)))(genotypes, key)
-    assert len(found[0].sharding.device_set) == count
-    for a, b in zip(expected[:2], found[:2]):
-        np.testing.assert_array_equal(a, b)
-print(json.dumps(shapes))
+    for count in (1, 2, 4):
+        found = jax.jit(shard_scoring(watched, device_mesh(count)))(genotypes, key)
+        assert len(found[0].sharding.device_set) == count, name
+        for a, b in zip(expected[:2], found[:2]):
+            np.testing.assert_array_equal(a, b, err_msg=name)
+    return shapes
+
+print(json.dumps([shapes_of(name) for name in ("ant_uni", "pointmaze")]))
 """
     # 22 individuals on 4 devices are 24 with the copies that fill up.
-    process = start(code.replace("NAME", name), **FOUR_DEVICES)
-    assert answer(process) == [22, 11, 6]
+    assert answer(start(code, **FOUR_DEVICES)) == [[22, 11, 6]] * 2
 
 
 @pytest.mark.slow
@@ -113,28 +114,6 @@ print(json.dumps([step.launches, step.most_worlds, step.worlds]))
 """
     # Five steps on each of four devices.
     assert answer(start(code, **FOUR_DEVICES)) == [20, 8, 160]
-
-
-@pytest.mark.slow
-def test_two_processes_agree_with_one() -> None:
-    code = """
-from jax.sharding import NamedSharding, PartitionSpec
-score, genotypes = problem("ant_uni", 16, 5)
-mesh = device_mesh()
-data = np.asarray(jax.random.key_data(jax.random.key(2)))
-
-def run(genotypes, data):
-    return shard_scoring(score, mesh)(genotypes, jax.random.wrap_key_data(data))
-
-everywhere = NamedSharding(mesh, PartitionSpec())
-found = jax.jit(run)(*jax.device_put((genotypes, data), everywhere))
-print(json.dumps([mesh.size, *(np.asarray(x).tolist() for x in found[:2])]))
-"""
-    first, second, alone = two_processes_and_one(code)
-    assert (first[0], alone[0]) == (2, 1)
-    assert first == second
-    np.testing.assert_array_equal(first[1], alone[1])
-    np.testing.assert_array_equal(first[2], alone[2])
 
 
 def test_devices_that_do_not_exist_are_refused(tmp_path: Path) -> None:
@@ -164,41 +143,55 @@ def evolved(name, algorithm="me", options=(), **arguments):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "algorithm", "options"),
-    [
+def test_an_archive_does_not_depend_on_the_number_of_devices() -> None:
+    tasks: list[tuple[str, str, dict[str, Any]]] = [
         ("ant_uni", "me", {}),
         ("pointmaze", "pga-me", CRITIC),
         ("pointmaze", "me-es", {"num_optimizer_steps": 2}),
-    ],
-)
-def test_an_archive_does_not_depend_on_the_number_of_devices(
-    name: str, algorithm: str, options: dict[str, Any]
-) -> None:
+    ]
     code = f"""
-task = {name!r}, {algorithm!r}, {options!r}
-alone = evolved(*task)
-print(json.dumps([evolved(*task, devices=count) == alone for count in (1, 3, 4)]))
+found = []
+for task in {tasks!r}:
+    alone = evolved(*task)
+    found += [evolved(*task, devices=count) == alone for count in (1, 3, 4)]
+print(json.dumps(found))
 """
-    assert answer(start(EVOLVE + code, **FOUR_DEVICES)) == [True] * 3
+    assert answer(start(EVOLVE + code, **FOUR_DEVICES)) == [True] * 9
 
 
 @pytest.mark.slow
-def test_two_processes_evolve_one_archive() -> None:
+def test_two_processes_agree_with_one() -> None:
+    """In the scores of a batch, and in the archive of a run."""
     code = """
+from jax.sharding import NamedSharding, PartitionSpec
+score, genotypes = problem("ant_uni", 16, 5)
+mesh = device_mesh()
+data = np.asarray(jax.random.key_data(jax.random.key(2)))
+
+def run(genotypes, data):
+    return shard_scoring(score, mesh)(genotypes, jax.random.wrap_key_data(data))
+
+everywhere = NamedSharding(mesh, PartitionSpec())
+found = jax.jit(run)(*jax.device_put((genotypes, data), everywhere))
+scored = [mesh.size, *(np.asarray(x).tolist() for x in found[:2])]
+
 found = evolved("pointmaze", devices=jax.device_count())
 try:
     evolved("pointmaze", resume=True)
     refused = ""
 except newton_qd.qd.ConfigError as error:
     refused = str(error)
-print(json.dumps([found, refused]))
+print(json.dumps([scored, found, refused]))
 """
     first, second, alone = two_processes_and_one(EVOLVE + code)
-    assert first[0] == second[0] == alone[0]
+    assert (first[0][0], alone[0][0]) == (2, 1)
+    assert first[0] == second[0]
+    np.testing.assert_array_equal(first[0][1], alone[0][1])
+    np.testing.assert_array_equal(first[0][2], alone[0][2])
+    assert first[1] == second[1] == alone[1]
     assert (
-        first[1].startswith("resume: got True, with 2 processes; allowed: ")
-        and alone[1] == ""
+        first[2].startswith("resume: got True, with 2 processes; allowed: ")
+        and alone[2] == ""
     )
 
 
