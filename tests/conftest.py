@@ -32,9 +32,12 @@ FAST_COMPILING = (
     "--xla_backend_optimization_level=0",
     "--xla_llvm_disable_expensive_passes=true",
 )
-# JAX 0.11 has lost this flag, and XLA ends the process where it does not know one.
+# JAX 0.11 has lost the first flag, and XLA ends the process where it does not know one.
+# The second leaves a program whole: to compile its parts side by side costs more than
+# it gains where a test runs on every core.
 if jax.__version_info__ < (0, 11):
     FAST_COMPILING += ("--xla_cpu_use_fusion_emitters=false",)
+    FAST_COMPILING += ("--xla_cpu_parallel_codegen_split_count=1",)
 
 # JAX's cache of what XLA compiled keeps every program, however small.
 PROGRAM_CACHE: dict[str, Any] = {
