@@ -119,9 +119,11 @@ def normalized(run: Scored, limits: tuple[float, float]) -> float:
 
 
 def text(values: list[float], spec: str) -> str:
-    """Interquartile mean and its interval."""
+    """Interquartile mean and its interval; one value has none."""
     if not values:
         return "-"
+    if len(values) == 1:
+        return f"{values[0]:{spec}}"
     middle, low, high = interval([np.asarray(values)])
     return f"{middle:{spec}} ({low:{spec}} to {high:{spec}})"
 
@@ -183,9 +185,10 @@ def verdict(results: Results, stop: str) -> str:
         ours, other = (max(side) for side in sides)
         apart = ours[1] > other[2] or ours[2] < other[1]
         ratio = ours[0] / other[0] if other[0] > 0 else np.inf
-        cells = [
-            f"{x[3]} {x[0]:,.0f} ({x[1]:,.0f} to {x[2]:,.0f})" for x in (ours, other)
-        ]
+        cells = [f"{x[3]} {x[0]:,.0f}" for x in (ours, other)]
+        if not few:
+            pairs = zip(cells, (ours, other), strict=True)
+            cells = [f"{cell} ({x[1]:,.0f} to {x[2]:,.0f})" for cell, x in pairs]
         rows.append(
             f"| {task} | {' | '.join(cells)} | {ratio:.2f} | "
             f"{'too few seeds' if few else 'apart' if apart else 'overlap'} |"
