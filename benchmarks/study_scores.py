@@ -224,7 +224,8 @@ def figure(results: Results, stop: str, path: Path) -> None:
     mpl.use("Agg")
     import matplotlib.pyplot as plt
 
-    limits = references(results)
+    there = {key[0] for key in results if key[2] == stop}
+    limits = {k: v for k, v in references(results).items() if k in there}
     names = sorted({key[1] for key in results})
     columns = min(4, len(limits))
     size = (3.2 * columns, 2.6 * -(-len(limits) // columns))
