@@ -101,6 +101,7 @@ def test_nearest_points(x64: None, tmp_path: Path, size: str) -> None:
     rng = np.random.default_rng(0)
     n = 4000
     at = rng.uniform(-1.0, 1.0, (n, 3)) * (half + 0.5)
+    at[-n // 8 :] *= 5.0  # beyond 1.1 m, no nearest point is searched
     along = rng.normal(size=(n, 3))
     along[: n // 4, :2] *= 0.02  # nearly parallel to the faces
     along[n // 4 : n // 2, 1:] *= 0.02
@@ -118,6 +119,10 @@ def test_nearest_points(x64: None, tmp_path: Path, size: str) -> None:
     assert excess.min() > -1e-6  # grid of the brute force
     assert excess.max() < 0.5 * system.robot.material.smoothing
     assert np.median(excess) < 1e-4
+    beyond = exact > ROD_RADIUS + 1.1
+    assert beyond.sum() > 200
+    excess = (found.distance - exact)[beyond]
+    assert -1e-3 < excess.min() and excess.max() < 2 * ROD_HALF
     np.testing.assert_allclose(np.linalg.norm(found.normal, axis=1), 1, atol=1e-6)
     assert np.abs(found.share).max() <= 1.0
 

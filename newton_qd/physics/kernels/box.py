@@ -10,7 +10,7 @@ import warp as wp
 
 from . import real, scalar, vec3
 from .cpp.algebra import component, dot, vector
-from .cpp.numbers import clamp, uniform
+from .cpp.numbers import above, choose, clamp, occurs, uniform
 from .cpp.operators import add, div, mul, neg, sub  # noqa: F401
 from .cpp.smooth import finite_length, gate, penetration
 from .structs import Model
@@ -22,6 +22,9 @@ HALVINGS = wp.constant(17)
 NEWTON_STEPS = wp.constant(2)
 # Times this, all numbers but the smallest are beyond 1.
 SIGN = wp.constant(scalar(1.0e20))
+# No wall holds what is faster [m/s]: what does not reach a box at this speed within a
+# substep is not searched on.
+FASTEST = wp.constant(scalar(100.0))
 
 
 @wp.func
@@ -115,43 +118,62 @@ def pull(half: vec3, width: real, k: real, at: vec3, along: vec3, s: real):
 
 
 @wp.func
-def searched_share(half: vec3, width: real, k: real, at: vec3, along: vec3):
-    """Where ``pull`` changes its sign, by bisection; without adjoint."""
+def searched_share(
+    half: vec3, width: real, k: real, at: vec3, along: vec3, reach: real
+):
+    """Where ``pull`` changes its sign, by bisection; without adjoint.
+
+    0 for a sphere, and where nothing of the segment is within ``reach`` of the box. If
+    that holds in all worlds of the pack, nothing is searched.
+    """
     s = real()
     step = scalar(SEARCHED)
     one = uniform(scalar(1.0))
-    for _ in range(HALVINGS):
+    length = finite_length(along)
+    away = finite_length(beyond_faces(at, half, width))
+    near = above(reach + length - away, scalar(0.0))
+    near = near * above(dot(along, along), scalar(0.0))
+    for _ in range(HALVINGS * occurs(near)):
         step = scalar(0.5) * step
         sign = clamp(SIGN * pull(half, width, k, at, along, s), neg(one), one)
         s = s - step * sign
-    return s
+    return choose(near, s, real())
 
 
 @wp.func_grad(searched_share)
 def adj_searched_share(
-    half: vec3, width: real, k: real, at: vec3, along: vec3, adj_ret: real
+    half: vec3,
+    width: real,
+    k: real,
+    at: vec3,
+    along: vec3,
+    reach: real,
+    adj_ret: real,
 ):
     """Nothing: the steps that follow carry the derivative."""
 
 
 @wp.func
-def box_share(m: Model, half: vec3, k: real, at: vec3, along: vec3):
+def box_share(m: Model, half: vec3, radius: real, at: vec3, along: vec3):
     """Where a segment is nearest to a box: -1 to 1, and beyond if its end is.
 
-    Minimises |distance|^2 + k s^2. ``pull`` grows with s, so its zero is unique;
-    Newton's method from the place found gives its value and its derivative.
+    Minimises |distance|^2 + k s^2, with k = smoothing * radius. ``pull`` grows with s,
+    so its zero is unique; Newton's method from the place found gives its value and its
+    derivative.
 
-    Reads: m.contact_smoothing.
+    Reads: m.contact_smoothing, m.h.
 
     Args:
         m: The model.
         half: Half extents of the box [m].
-        k: Weight of the share [m^2].
+        radius: Of the segment [m].
         at: Centre of the segment.
         along: From the centre to an end; zero for a sphere, which gives 0.
     """
     w = uniform(m.contact_smoothing)
-    s = searched_share(half, w, k, at, along)
+    k = m.contact_smoothing * radius
+    reach = radius + uniform(m.contact_smoothing + FASTEST * m.h)
+    s = searched_share(half, w, k, at, along, reach)
     for _ in range(NEWTON_STEPS):
         slopes = beyond_slopes(at + s * along, half, w)
         growth = (

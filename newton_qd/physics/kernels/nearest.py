@@ -75,7 +75,7 @@ def segment_share(
 def nearest_share(m: Model, c: int, o: int, at: vec3, along: vec3):
     """Where on its segment contact ``c`` is nearest to capsule or box ``o``, -1 to 1.
 
-    Reads: m.contact_radius, m.obstacle_kind, m.obstacle_size, m.contact_smoothing.
+    Reads: m.contact_radius, m.obstacle_kind, m.obstacle_size.
 
     Args:
         m: The model.
@@ -99,7 +99,7 @@ def nearest_share(m: Model, c: int, o: int, at: vec3, along: vec3):
         )
     if BOXES:
         if load(m.obstacle_kind, o) == ObstacleKind.BOX:
-            free = box_share(m, size, m.contact_smoothing * radius, at, along)
+            free = box_share(m, size, radius, at, along)
             share = bounded(free, uniform(scalar(1.0)), uniform(SHARE_ROUNDING))
     return share
 
