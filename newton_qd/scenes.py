@@ -25,5 +25,25 @@ class Scene:
 TRAP = Scene("trap", "trap.urdf")
 HUMANOID_TRAP = Scene("humanoid_trap", "humanoid_trap.urdf")
 MAZE = Scene("maze", "maze.urdf")
+ANTMAZE_U = Scene("antmaze_u", "antmaze_u.urdf")
+ANTMAZE_BIG = Scene("antmaze_big", "antmaze_big.urdf")
+ANTMAZE_HARDEST = Scene("antmaze_hardest", "antmaze_hardest.urdf")
+# the torso too: its position is the descriptor
+HUMANOID_MAZE = Scene(
+    "humanoid_maze", "humanoid_maze.urdf", ("torso", "left_shin", "right_shin")
+)
+HURDLES = Scene("hurdles", "hurdles.urdf")
 
-SCENES = {scene.name: scene for scene in (TRAP, HUMANOID_TRAP, MAZE)}
+SCENES = {
+    scene.name: scene
+    for scene in (
+        TRAP,
+        HUMANOID_TRAP,
+        MAZE,
+        ANTMAZE_U,
+        ANTMAZE_BIG,
+        ANTMAZE_HARDEST,
+        HUMANOID_MAZE,
+        HURDLES,
+    )
+}

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import inspect
+import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -37,6 +38,14 @@ from newton_qd.extractors import (
 )
 from newton_qd.moved import moved_name
 from newton_qd.robots import HUMANOID, PUSHER_TABLE, REACHER, ROBOTS, RobotSpec
+from newton_qd.scenes import (
+    ANTMAZE_BIG,
+    ANTMAZE_HARDEST,
+    ANTMAZE_U,
+    HUMANOID_MAZE,
+    HURDLES,
+    Scene,
+)
 from newton_qd.types import DescriptorExtractor
 from newton_qd.wrappers import (
     FeetContactWrapper,
@@ -199,6 +208,40 @@ def _position(
     )
 
 
+def _maze(
+    base: Callable[..., Env],
+    base_name: str,
+    scene: Scene,
+    far: tuple[float, float],
+    *,
+    cell: float,
+    **options: object,
+) -> EnvironmentSpec:
+    """Returns the task of reaching the target of a maze; descriptor: last position [m].
+
+    Args:
+        base: Makes the environment.
+        base_name: Name that wrappers receive.
+        scene: The maze.
+        far: x and y of the far corner of its area; the start is in the near corner.
+        cell: Edge of a cell, with the start in the middle of one.
+        **options: More options of the ``MazeWrapper``.
+    """
+    area = ((-cell / 2, -cell / 2), far)
+    limits = {"minval": area[0], "maxval": area[1]}
+    return EnvironmentSpec(
+        base,
+        base_name,
+        wrappers=(
+            WrapperSpec(XYPositionWrapper, limits),
+            WrapperSpec(MazeWrapper, {"scene": scene, "area": area, **options}),
+        ),
+        descriptor_extractor=get_final_xy_position,
+        # nothing is farther from a target than the diagonal
+        reward_offset=math.ceil(math.dist(*area)),
+    )
+
+
 _ANYWHERE = ((-30.0, -30.0), (30.0, 30.0))
 _YARD = ((-15.0, -15.0), (15.0, 15.0))
 # around the start of the object, as far as a push brings it
@@ -242,6 +285,19 @@ ENVIRONMENTS: dict[str, EnvironmentSpec] = {
         descriptor_extractor=get_final_xy_position,
         reward_offset=2.35,
         original_reward_offset=2.3431,
+    ),
+    "antmaze_u": _maze(Ant, "ant", ANTMAZE_U, (10.0, 10.0), cell=4.0),
+    "antmaze_big": _maze(Ant, "ant", ANTMAZE_BIG, (22.0, 22.0), cell=4.0),
+    "antmaze_hardest": _maze(Ant, "ant", ANTMAZE_HARDEST, (26.0, 38.0), cell=4.0),
+    "humanoid_maze": _maze(
+        Humanoid, "humanoid", HUMANOID_MAZE, (5.0, 5.0), cell=2.0, heights=(0.8, 2.1)
+    ),
+    "walker2d_trap": _uni(
+        functools.partial(
+            Walker2d, scene=HURDLES, exclude_current_positions_from_observation=False
+        ),
+        "walker2d",
+        (1.33, None),
     ),
     "acrobot": EnvironmentSpec(Acrobot, "acrobot"),
     "fetch": EnvironmentSpec(Fetch, "fetch"),

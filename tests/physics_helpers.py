@@ -18,7 +18,7 @@ from newton_qd import physics
 from newton_qd.physics import reference
 from newton_qd.physics.model import build_system
 from newton_qd.physics.model.rest import raising_coordinate
-from newton_qd.physics.system import JointKind, PhysicsState, System
+from newton_qd.physics.system import JointKind, ObstacleKind, PhysicsState, System
 from newton_qd.robots import ROBOTS, Contact, Material, RobotSpec
 
 Arrays = tuple[np.ndarray, ...]
@@ -76,6 +76,13 @@ def beside_a_wall(
 ) -> np.ndarray:
     """The coordinates with every second robot moved within reach of the first wall."""
     frame, (radius, half, _) = system.obstacle_frame[1], system.obstacle_size[1]
+    if system.obstacle_kind[1] == ObstacleKind.BOX:
+        moved = q.copy()
+        count = len(q[::2])
+        moved[::2, 0] = frame[0] + radius + rng.uniform(0.2, 0.6, count)
+        if system.torso_floats:  # otherwise the robot is in a plane
+            moved[::2, 1] = frame[1] + half * rng.uniform(-0.8, 0.8, count)
+        return moved
     axis = reference.rotation_matrix(frame[3:])[:, 2]
     aside = np.cross(axis, [0.0, 0.0, 1.0])
     count = len(q[::2])

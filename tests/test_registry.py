@@ -84,6 +84,11 @@ TASKS = {
     "pointmaze": Task("pointmaze", 2, 2, XY, ((-1.0, -1.0), (1.0, 1.0)), 2.3431),
 }
 NEW = {
+    "antmaze_u": Task("ant", 101, 8, XY, ((-2.0, -2.0), (10.0, 10.0))),
+    "antmaze_big": Task("ant", 101, 8, XY, ((-2.0, -2.0), (22.0, 22.0))),
+    "antmaze_hardest": Task("ant", 101, 8, XY, ((-2.0, -2.0), (26.0, 38.0))),
+    "humanoid_maze": Task("humanoid", 229, 17, XY, ((-1.0, -1.0), (5.0, 5.0))),
+    "walker2d_trap": Task("walker2d", 18, 6, FEET, _UNIT),
     "pusher_uni": Task("pusher_table", 19, 7, XY, ((-1.0, -1.0), (1.0, 1.0))),
     "arm_reach": Task("reacher", 10, 2, XY, ((-0.21, -0.21), (0.21, 0.21))),
     "quadruped_uni": Task("quadruped", 35, 12, FEET, ((0.0,) * 4, (1.0,) * 4)),
@@ -226,7 +231,7 @@ def test_tables_are_columns_of_the_rows() -> None:
     every = TASKS | NEW
     assert dict(extractors) == {n: read[task.descriptor] for n, task in every.items()}
     assert newton_qd.tables.descriptor_extractor is extractors
-    offsets = {name: task.offset for name, task in TASKS.items()}
+    offsets = {n: task.offset for n, task in TASKS.items() if task.offset is not None}
     assert dict(newton_qd.tables.original_reward_offset) == offsets
     assert list(newton_qd.tables.reward_offset) == list(every)
     assert (
@@ -401,7 +406,7 @@ def test_arguments_of_wrappers_are_named() -> None:
     words += "FeetContactWrapper; allowed: smooth_width, straight_through, smooth_tail$"
     with pytest.raises(TypeError, match=words):
         newton_qd.create("ant_uni", qdax_wrappers_kwargs=[{"smooth": 1}])
-    with pytest.raises(TypeError, match=r"of MazeWrapper; allowed: no argument$"):
+    with pytest.raises(TypeError, match=r"of MazeWrapper; allowed: scene, area, heig"):
         newton_qd.create("antmaze", qdax_wrappers_kwargs=[{}, {"wall": 1}])
 
 

@@ -18,8 +18,16 @@ from newton_qd.physics import reference
 from newton_qd.physics.model import build_system
 from newton_qd.physics.stepping import substep_solves
 from newton_qd.physics.system import System
-from newton_qd.robots import ANT, HUMANOID, Contact, Material
-from newton_qd.scenes import HUMANOID_TRAP, MAZE, TRAP, Scene
+from newton_qd.robots import ANT, HUMANOID, WALKER2D, Contact, Material
+from newton_qd.scenes import (
+    ANTMAZE_HARDEST,
+    HUMANOID_MAZE,
+    HUMANOID_TRAP,
+    HURDLES,
+    MAZE,
+    TRAP,
+    Scene,
+)
 
 HIGH = 5.0  # height of walls that nothing leads around [m]
 SHOTS = 64
@@ -290,7 +298,14 @@ def test_ground_and_pairs_hold_all_speeds(tmp_path: Path) -> None:
 
 
 def test_walls_of_the_suite_hold() -> None:
-    for robot, place in ((ANT, TRAP), (ANT, MAZE), (HUMANOID, HUMANOID_TRAP)):
+    for robot, place in (
+        (ANT, TRAP),
+        (ANT, MAZE),
+        (HUMANOID, HUMANOID_TRAP),
+        (ANT, ANTMAZE_HARDEST),
+        (HUMANOID, HUMANOID_MAZE),
+        (WALKER2D, HURDLES),
+    ):
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             system = physics.load_system(robot, "float32", place)

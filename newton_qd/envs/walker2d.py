@@ -9,6 +9,7 @@ from newton_qd.envs.base import PhysicsEnv
 from newton_qd.envs.options import checked_options
 from newton_qd.physics.system import PhysicsState
 from newton_qd.robots import WALKER2D
+from newton_qd.scenes import Scene
 from newton_qd.types import Action, Metrics
 
 
@@ -41,6 +42,7 @@ class Walker2d(PhysicsEnv):
         reset_noise_scale: float = 5e-3,
         exclude_current_positions_from_observation: bool = True,
         dtype: str = "float32",
+        scene: Scene | None = None,
     ) -> None:
         """Loads the walker2d.
 
@@ -58,6 +60,7 @@ class Walker2d(PhysicsEnv):
             exclude_current_positions_from_observation: Whether the observation
                 omits x of the torso.
             dtype: ``"float32"``, or ``"float64"`` with JAX x64 on.
+            scene: Obstacles on the ground; ``None``: no obstacles.
 
         Raises:
             TypeError: An option has the wrong type.
@@ -72,7 +75,9 @@ class Walker2d(PhysicsEnv):
             healthy_angle_range=healthy_angle_range,
         )
         self._omit_x = exclude_current_positions_from_observation
-        super().__init__(WALKER2D, reset_noise_scale=reset_noise_scale, dtype=dtype)
+        super().__init__(
+            WALKER2D, reset_noise_scale=reset_noise_scale, dtype=dtype, scene=scene
+        )
 
     def observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
         """Returns the blocks of the observation."""

@@ -1,51 +1,83 @@
-"""A maze with a target in one corner."""
+"""A maze with a target."""
 
 from __future__ import annotations
 
 import jax.numpy as jnp
 import numpy as np
 
+from newton_qd import checks
+from newton_qd.checks import Fact, listed, message
 from newton_qd.envs.base import Env
 from newton_qd.envs.state import State
 from newton_qd.envs.vectors import length
-from newton_qd.scenes import MAZE
-from newton_qd.wrappers.scene_task import SceneTaskWrapper
-
-_HEIGHTS = (0.2, 5.0)  # an episode ends if the torso is not between these [m]
+from newton_qd.scenes import MAZE, Scene
+from newton_qd.wrappers.scene_task import Corners, SceneTaskWrapper
 
 
 class MazeWrapper(SceneTaskWrapper):
-    """A maze of 45 m by 45 m with borders, three walls inside, and a target.
+    """A maze with walls and a target.
 
-    The observation begins with (x - 17.5, y - 17.5) / 22.5. The reward is minus the
-    horizontal distance of the torso from the target [m], also at a reset. Done when the
-    torso is below 0.2 m or above 5 m. An episode does not end at the target.
+    By default, it is 45 m by 45 m, with borders and three walls inside. The observation
+    begins with x and y of the torso, scaled so that they are -1 and 1 at the borders:
+    by default, (x - 17.5, y - 17.5) / 22.5. The reward is minus the horizontal distance
+    of the torso from the target [m], also at a reset. Done when the torso is below 0.2
+    m or above 5 m, by default. An episode does not end at the target.
     """
 
-    scene = MAZE
-    xy_centre = (17.5, 17.5)
-    xy_scale = (22.5, 22.5)
+    scene: Scene = MAZE
+    area: Corners = ((-5.0, -5.0), (40.0, 40.0))
+    heights: tuple[float, float] = (0.2, 5.0)
+    """An episode ends if the torso is not between these [m]."""
 
-    def __init__(self, env: Env, env_name: str) -> None:
+    def __init__(
+        self,
+        env: Env,
+        env_name: str,
+        scene: Scene | None = None,
+        area: Corners | None = None,
+        heights: tuple[float, float] | None = None,
+    ) -> None:
         """Wraps a simulated robot with a floating torso; ``env`` is not changed.
 
         Args:
             env: The environment, with or without wrappers.
             env_name: Its name, used in errors.
+            scene: The walls, and a link ``target``; ``None``: the maze of ``antmaze``.
+            area: Lowest x and y, and highest x and y, inside the borders [m]; ``None``:
+                those of ``antmaze``.
+            heights: Lowest and highest height of the torso [m]; ``None``: 0.2 and 5.
 
         Raises:
             NotImplementedError: The environment is not such a robot.
-            ValueError: The robot has a scene already.
+            TypeError: An argument has the wrong type.
+            ValueError: The robot has a scene already, the scene cannot be built or has
+                no target, or the area or the heights are not ranges.
         """
+        allowed = "a newton_qd.Scene"
+        checks.instance("scene", scene, Scene, allowed, optional=True)
+        if scene is not None:
+            self.scene = scene
+        if area is not None:
+            _check_area(area)
+            self.area = area
+        if heights is not None:
+            checks.interval("heights", heights)
+            self.heights = heights
         super().__init__(env, env_name)
-        system = self.system
-        self._target = system.scene_frames[system.scene_links.index("target"), :2]
+        links = self.system.scene_links
+        if "target" not in links:
+            given = Fact(f"{self.scene.name!r} with {listed(links)}")
+            raise ValueError(message("scene", given, "a scene with a link 'target'"))
+        self._target = self.system.scene_frames[links.index("target"), :2]
+
+    def _inside(self, env: Env, env_name: str) -> Env:
+        return type(self)(env, env_name, self.scene, self.area, self.heights)
 
     def _outcome(self, state: State) -> State:
         """Returns the state with the reward and the end of the task."""
         position = self._position(state)
         away = position[:2] - np.asarray(self._target, self.dtype)
-        low, high = (np.asarray(height, self.dtype) for height in _HEIGHTS)
+        low, high = (np.asarray(x, self.dtype) for x in self.heights)
         outside = (position[2] < low) | (position[2] > high)
         # a world that has a fault is frozen: reward 0 and done 1, as without this
         # wrapper
@@ -55,3 +87,19 @@ class MazeWrapper(SceneTaskWrapper):
             reward=jnp.where(faulty, jnp.zeros_like(reward), reward),
             done=(outside | faulty).astype(self.dtype),
         )
+
+
+def _check_area(area: object) -> None:
+    """Checks the corners of an area.
+
+    Raises:
+        ValueError: They are not two points, the lowest values first.
+    """
+    try:
+        corners = np.asarray(area, np.float64)
+    except (TypeError, ValueError):
+        corners = np.zeros(())
+    finite = corners.shape == (2, 2) and np.all(np.isfinite(corners))
+    if not finite or not np.all(corners[0] < corners[1]):
+        allowed = "lowest and highest x and y, such as ((0.0, 0.0), (9.0, 9.0))"
+        raise ValueError(message("area", area, allowed))

@@ -17,6 +17,9 @@ from newton_qd.scenes import Scene
 from newton_qd.types import Action, Params, RNGKey
 from newton_qd.wrappers.base import Wrapper, unsupported
 
+Corners = tuple[tuple[float, float], tuple[float, float]]
+"""Lowest x and y, and highest x and y [m]."""
+
 
 class SceneTaskWrapper(Wrapper):
     """Adds a scene, and puts the scaled position at the front of the observation.
@@ -27,10 +30,8 @@ class SceneTaskWrapper(Wrapper):
 
     scene: Scene
     """The walls."""
-    xy_centre: tuple[float, float]
-    """Position with the observation zero [m]."""
-    xy_scale: tuple[float, float]
-    """Distances from the centre with the observation one [m]."""
+    area: Corners
+    """Positions with the observations -1 and 1 [m]."""
 
     rollout_order = RolloutOrder.AT_ONCE
 
@@ -57,8 +58,12 @@ class SceneTaskWrapper(Wrapper):
         if self._effective:
             env = base.with_scene(self.scene)
         else:
-            env = env.with_base(lambda inside: type(self)(inside, env_name))
+            env = env.with_base(lambda inside: self._inside(inside, env_name))
         super().__init__(env)
+
+    def _inside(self, env: Env, env_name: str) -> Env:
+        """Returns the same wrapper around another environment."""
+        return type(self)(env, env_name)
 
     def reset(self, rng: RNGKey) -> State:
         """Begins an episode.
@@ -90,9 +95,8 @@ class SceneTaskWrapper(Wrapper):
     def _judged(self, state: State) -> State:
         if not self._effective:
             return state
-        centre, scale = (
-            np.asarray(pair, self.dtype) for pair in (self.xy_centre, self.xy_scale)
-        )
+        low, high = np.asarray(self.area, self.dtype)
+        centre, scale = (low + high) / 2, (high - low) / 2
         place = (self._position(state)[:2] - centre) / scale
         return self._outcome(state.replace(obs=jnp.concatenate([place, state.obs])))
 

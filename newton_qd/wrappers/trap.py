@@ -13,5 +13,4 @@ class TrapWrapper(SceneTaskWrapper):
     """
 
     scene = TRAP
-    xy_centre = (15.0, 0.0)
-    xy_scale = (15.0, 8.0)
+    area = ((0.0, -8.0), (30.0, 8.0))
