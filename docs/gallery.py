@@ -23,6 +23,7 @@ import numpy as np
 
 import newton_qd
 from newton_qd.qd import load_run
+from newton_qd.scenes import HURDLES
 from newton_qd.tasks import ENVIRONMENTS
 from newton_qd.viewing import record, record_elites, render
 
@@ -110,8 +111,12 @@ def page() -> str:
     """Returns the text of the page."""
     text = HEAD
     for name, spec in ENVIRONMENTS.items():
-        about = inspect.getdoc(spec.base) or ""
+        base: Any = spec.base
+        options = getattr(base, "keywords", {})
+        about = inspect.getdoc(getattr(base, "func", base)) or ""
         summary = " ".join(about.split("\n\n")[0].split())
+        if options.get("scene") == HURDLES:
+            summary += " Here, five hurdles are ahead."
         wrappers = [getattr(one.wrapper, "__name__", "") for one in spec.wrappers]
         summary += "".join(f" {CHANGES[one]}" for one in wrappers if one in CHANGES)
         extractor = getattr(spec.descriptor_extractor, "__name__", None)

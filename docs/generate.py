@@ -8,6 +8,7 @@ python docs/generate.py --check    fails if a page is out of date
 from __future__ import annotations
 
 import argparse
+import functools
 import inspect
 import re
 import sys
@@ -19,11 +20,13 @@ import jax
 import numpy as np
 
 import newton_qd
+from newton_qd.assets import find_urdf
 from newton_qd.envs.base import Env, PhysicsEnv, QDEnv
 from newton_qd.envs.pointmaze import PointMaze
 from newton_qd.physics.system import JointKind
 from newton_qd.qd.algorithms import ALGORITHMS
 from newton_qd.qd.algorithms.options import option_texts
+from newton_qd.scenes import Scene
 from newton_qd.tasks import ENVIRONMENTS
 
 PAGE = Path(__file__).with_name("environments.md")
@@ -110,15 +113,37 @@ def _place(name: str) -> str:
 
 
 def _wrappers(name: str, base_name: str) -> str:
-    """What the wrappers of a task change."""
+    """What the wrappers of a task change, and its options."""
+    spec = ENVIRONMENTS[name]
+    given = spec.base.keywords if isinstance(spec.base, functools.partial) else {}
     text = (
-        f"The environment [`{base_name}`](#{base_name}) with these wrappers, from the "
-        "inside to the outside:\n\n"
+        f"The environment [`{base_name}`](#{base_name}){_given(given)} with these "
+        "wrappers, from the inside to the outside:\n\n"
     )
-    for spec in ENVIRONMENTS[name].wrappers:
-        meaning = " ".join((inspect.getdoc(spec.wrapper) or "").split())
-        text += f"- `{getattr(spec.wrapper, '__name__', '')}`: {meaning}\n"
+    for one in spec.wrappers:
+        meaning = " ".join((inspect.getdoc(one.wrapper) or "").split())
+        title = f"`{getattr(one.wrapper, '__name__', '')}`{_given(one.options)}"
+        text += f"- {title}: {meaning}\n"
+    scene = given.get("scene") or spec.wrappers[-1].options.get("scene")
+    if isinstance(scene, Scene):
+        text += f"\nScene: {_head(scene)}\n"
     return text
+
+
+def _given(options: Mapping[str, object]) -> str:
+    """Options that differ from their defaults."""
+    values = {
+        name: value.name if isinstance(value, Scene) else value
+        for name, value in options.items()
+    }
+    texts = [f"`{name}={value!r}`" for name, value in values.items()]
+    return f" ({', '.join(texts)})" if texts else ""
+
+
+def _head(scene: Scene) -> str:
+    """The first paragraph of the comment at the head of a scene's file."""
+    text = find_urdf(scene.urdf).read_text(encoding="utf-8")
+    return " ".join(text.partition("<!--")[2].partition("\n\n")[0].split())
 
 
 def _drive(env: PhysicsEnv, joint: str, gear: float) -> str:

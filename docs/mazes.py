@@ -32,7 +32,7 @@ class Maze(NamedTuple):
     """A maze of boxes.
 
     Attributes:
-        about: What it is, for the head of its file.
+        about: Name, for the head of the file.
         layout: Rows of cells.
         cell: Edge of a cell [m].
         height: Height of the walls [m].
@@ -110,7 +110,13 @@ class Maze(NamedTuple):
             _wall(title, box, self.height) for title, box in self.walls().items()
         )
         x, y = self.place("T")
-        return _FILE.format(about=self.about, name=name, walls=links, x=x, y=y)
+        free = sum(row.count(mark) for row in self.layout for mark in ".ST")
+        about = (
+            f"{self.about}: {free} free cells of {self.cell:g} m by {self.cell:g} m,\n"
+            f"  walls {self.height:g} m high. The start is at (0, 0), the target at"
+            f" ({x:g}, {y:g})."
+        )
+        return _FILE.format(about=about, name=name, walls=links, x=x, y=y)
 
 
 def _length(
@@ -183,14 +189,10 @@ _FILE = """\
 """
 
 MAZES = {
-    "antmaze_u": Maze("Maze of the ant in the shape of a U.", U_MAZE, 4.0, 2.0),
-    "antmaze_big": Maze("Maze of the ant with 26 free cells.", BIG_MAZE, 4.0, 2.0),
-    "antmaze_hardest": Maze(
-        "Maze of the ant with 46 free cells.", HARDEST_MAZE, 4.0, 2.0
-    ),
-    "humanoid_maze": Maze(
-        "Maze of the humanoid in the shape of a U.", U_MAZE, 2.0, 2.0
-    ),
+    "antmaze_u": Maze("U_MAZE of JaxGCRL", U_MAZE, 4.0, 2.0),
+    "antmaze_big": Maze("BIG_MAZE of JaxGCRL", BIG_MAZE, 4.0, 2.0),
+    "antmaze_hardest": Maze("HARDEST_MAZE of JaxGCRL", HARDEST_MAZE, 4.0, 2.0),
+    "humanoid_maze": Maze("U_MAZE of JaxGCRL, smaller", U_MAZE, 2.0, 2.0),
 }
 
 

@@ -77,12 +77,7 @@ def beside_a_wall(
     """The coordinates with every second robot moved within reach of the first wall."""
     frame, (radius, half, _) = system.obstacle_frame[1], system.obstacle_size[1]
     if system.obstacle_kind[1] == ObstacleKind.BOX:
-        moved = q.copy()
-        count = len(q[::2])
-        moved[::2, 0] = frame[0] + radius + rng.uniform(0.2, 0.6, count)
-        if system.torso_floats:  # otherwise the robot is in a plane
-            moved[::2, 1] = frame[1] + half * rng.uniform(-0.8, 0.8, count)
-        return moved
+        return beside_a_box(system, q, rng)
     axis = reference.rotation_matrix(frame[3:])[:, 2]
     aside = np.cross(axis, [0.0, 0.0, 1.0])
     count = len(q[::2])
@@ -90,6 +85,29 @@ def beside_a_wall(
     reach = radius + rng.uniform(0.2, 0.6, (count, 1))
     moved = q.copy()
     moved[::2, :2] = (frame[:3] + along + reach * aside)[:, :2]
+    return moved
+
+
+def beside_a_box(system: System, q: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """The same for boxes: beside the far face of the first one along x.
+
+    Robots that are not in a plane are otherwise in the first cell.
+    """
+    (middle, *others), (size, *sizes) = (
+        table[1:, :2] for table in (system.obstacle_frame, system.obstacle_size)
+    )
+    moved, count = q.copy(), len(q[::2])
+    places = rng.uniform([0.2, -0.8], [0.6, 0.8], (100 * count, 2))
+    places[:, 0] += size[0]
+    places[:, 1] *= size[1]
+    places += middle
+    if not system.torso_floats:  # a robot in a plane
+        moved[::2, 0] = places[:count, 0]
+        return moved
+    away = np.abs(places[:, None] - others) - sizes
+    free = (away.max(axis=2) > 1.0).all(axis=1)
+    moved[1::2, :2] = np.clip(0.1 * moved[1::2, :2], -0.8, 0.8)
+    moved[::2, :2] = places[free][:count]
     return moved
 
 
