@@ -17,12 +17,16 @@ from newton_qd.envs.state import State
 from newton_qd.physics.system import PhysicsState
 
 # The tasks, and of those that differ by constants only, one: plain robots are the
-# bases of their tasks, and three names repeat what other names do.
-_REPEATED = {"antnotrap", "humanoid_omni", "quadruped_omni"}
+# bases of their tasks, and these names repeat what other names do.
+BOXES = {  # tests/test_mazes.py has these too
+    *("antmaze_u", "antmaze_big", "antmaze_hardest"),
+    *("humanoid_maze", "walker2d_trap"),
+}
+REPEATED = {"antnotrap", "humanoid_omni", "quadruped_omni", *BOXES}
 NAMES = [
     name
     for name in newton_qd.registered_envs()
-    if name in newton_qd.tables.descriptor_extractor and name not in _REPEATED
+    if name in newton_qd.tables.descriptor_extractor and name not in REPEATED
 ]
 # One with four feet, one with walls and one without physics; the others share their
 # code with these and run with the slow tests.

@@ -157,12 +157,13 @@ def test_mazes_of_others(tmp_path: Path) -> None:
     assert state.obs.shape == (env.observation_size,) == (101,)
     inside = env.env.env.env
     assert (inside.scene, inside.heights) == (ANTMAZE_HARDEST, (0.5, 1))
-    for wrong, error, message in (
+    wrongs: list[tuple[dict[str, Any], type[Exception], str]] = [
         ({"scene": "maze"}, TypeError, "scene: got 'maze'; allowed: None, or a newt"),
         ({"scene": TRAP}, ValueError, "scene: got 'trap' with trap; allowed: .*target"),
         ({"area": ((0, 0), (0, 1))}, ValueError, r"area: got .*; allowed: lowest and"),
         ({"area": 3}, ValueError, "area: got 3; allowed: lowest and"),
         ({"heights": (1, 0)}, ValueError, r"heights: got \(1, 0\); allowed: two num"),
-    ):
+    ]
+    for wrong, error, message in wrongs:
         with pytest.raises(error, match=f"^{message}"):
             MazeWrapper(Ant(), "ant", **wrong)

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from contract import REPEATED
 
 import newton_qd
 from newton_qd import physics
@@ -59,7 +60,7 @@ def test_states_are_those_of_steps(name: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", sorted(newton_qd.registered_envs()))
+@pytest.mark.parametrize("name", sorted({*newton_qd.registered_envs()} - REPEATED))
 def test_states_of_every_task_are_those_of_steps(name: str) -> None:
     check(newton_qd.create(name, auto_reset=False, episode_length=None))
 
