@@ -14,7 +14,7 @@ import re
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import jax
 import numpy as np
@@ -92,7 +92,8 @@ def _observation(env: PhysicsEnv | PointMaze) -> list[tuple[object, ...]]:
 
 def _descriptor(name: str, env: QDEnv) -> str:
     low, high = env.state_descriptor_limits
-    extractor = newton_qd.tables.descriptor_extractor[name].__name__
+    found: Any = newton_qd.tables.descriptor_extractor[name]
+    extractor = found.__name__
     offset = newton_qd.tables.reward_offset[name]
     original = newton_qd.tables.original_reward_offset.get(name)
     other = "" if original is None else f" (in the original suite: {original:g})"

@@ -48,7 +48,7 @@ class Maze(NamedTuple):
         (row, column), (first, start) = (self._index(m) for m in (mark, "S"))
         return (row - first) * self.cell, (column - start) * self.cell
 
-    def walls(self) -> dict[str, tuple[float, float, float, float]]:
+    def walls(self) -> dict[str, tuple[float, ...]]:
         """Returns lowest x, lowest y, highest x and highest y of each box [m]."""
         rows, columns = len(self.layout) - 2, len(self.layout[0]) - 2
         low_x, low_y, high_x, high_y = self._box((1, 1, rows, columns))

@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import inspect
-import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -212,6 +211,7 @@ def _maze(
     base: Callable[..., Env],
     base_name: str,
     scene: Scene,
+    offset: float,
     far: tuple[float, float],
     *,
     cell: float,
@@ -223,6 +223,7 @@ def _maze(
         base: Makes the environment.
         base_name: Name that wrappers receive.
         scene: The maze.
+        offset: The reward offset.
         far: x and y of the far corner of its area; the start is in the near corner.
         cell: Edge of a cell, with the start in the middle of one.
         **options: More options of the ``MazeWrapper``.
@@ -237,8 +238,7 @@ def _maze(
             WrapperSpec(MazeWrapper, {"scene": scene, "area": area, **options}),
         ),
         descriptor_extractor=get_final_xy_position,
-        # nothing is farther from a target than the diagonal
-        reward_offset=math.ceil(math.dist(*area)),
+        reward_offset=offset,
     )
 
 
@@ -286,18 +286,26 @@ ENVIRONMENTS: dict[str, EnvironmentSpec] = {
         reward_offset=2.35,
         original_reward_offset=2.3431,
     ),
-    "antmaze_u": _maze(Ant, "ant", ANTMAZE_U, (10.0, 10.0), cell=4.0),
-    "antmaze_big": _maze(Ant, "ant", ANTMAZE_BIG, (22.0, 22.0), cell=4.0),
-    "antmaze_hardest": _maze(Ant, "ant", ANTMAZE_HARDEST, (26.0, 38.0), cell=4.0),
+    "antmaze_u": _maze(Ant, "ant", ANTMAZE_U, 12.63, (10.0, 10.0), cell=4.0),
+    "antmaze_big": _maze(Ant, "ant", ANTMAZE_BIG, 30.21, (22.0, 22.0), cell=4.0),
+    "antmaze_hardest": _maze(
+        Ant, "ant", ANTMAZE_HARDEST, 45.26, (26.0, 38.0), cell=4.0
+    ),
     "humanoid_maze": _maze(
-        Humanoid, "humanoid", HUMANOID_MAZE, (5.0, 5.0), cell=2.0, heights=(0.8, 2.1)
+        Humanoid,
+        "humanoid",
+        HUMANOID_MAZE,
+        4.84,
+        (5.0, 5.0),
+        cell=2.0,
+        heights=(0.8, 2.1),
     ),
     "walker2d_trap": _uni(
         functools.partial(
             Walker2d, scene=HURDLES, exclude_current_positions_from_observation=False
         ),
         "walker2d",
-        (1.33, None),
+        (1.51, None),
     ),
     "acrobot": EnvironmentSpec(Acrobot, "acrobot"),
     "fetch": EnvironmentSpec(Fetch, "fetch"),
