@@ -26,6 +26,7 @@ from newton_qd.qd import load_run
 from newton_qd.scenes import HURDLES
 from newton_qd.tasks import ENVIRONMENTS
 from newton_qd.viewing import record, record_elites, render
+from newton_qd.wrappers import MazeWrapper
 
 FOLDER = Path(__file__).with_name("gallery")
 PAGE = Path(__file__).with_name("gallery.md")
@@ -34,6 +35,7 @@ RATE = 12.5  # pictures per second: GIFs count in hundredths of a second
 SIZE = 200, 150  # [px]
 GAITS = 64
 CLOSE, WALLS = 1.15, 0.4  # zoom; walls are seen from farther away
+ABOVE = 65.0  # elevation [deg] over the boxes of a maze, which are higher than a robot
 MAZE_STEPS = 30  # of the point maze, which has no time
 
 HEAD = """# Gallery
@@ -84,9 +86,21 @@ def make(name: str) -> Path:
     shown = found.world(best)
     system = getattr(env.unwrapped, "system", None)
     walls = system is not None and system.scene is not None
-    zoom = WALLS if walls else CLOSE
+    maze = walls and system.has_boxes and MazeWrapper in _wrappers(name)
     width, height = SIZE
-    return render(shown, path, width=width, height=height, rate=RATE, zoom=zoom)
+    return render(
+        shown,
+        path,
+        width=width,
+        height=height,
+        rate=RATE,
+        zoom=WALLS if walls else CLOSE,
+        elevation=ABOVE if maze else None,
+    )
+
+
+def _wrappers(name: str) -> list[Any]:
+    return [one.wrapper for one in ENVIRONMENTS[name].wrappers]
 
 
 def evolved(folder: str) -> Path:

@@ -34,6 +34,7 @@ class Camera:
         width: int = 640,
         height: int = 480,
         zoom: float = 1.0,
+        elevation: float | None = None,
     ) -> None:
         """Builds the scene.
 
@@ -43,6 +44,8 @@ class Camera:
             width: Width of a picture [px].
             height: Height of a picture [px].
             zoom: Size of the robot in the picture; 1: as in the pages.
+            elevation: Angle of the view above the ground [deg]; ``None``: as in the
+                pages.
 
         Raises:
             ValueError: A number is not allowed.
@@ -50,11 +53,12 @@ class Camera:
         checks.integer("width", width)
         checks.integer("height", height)
         checks.number("zoom", zoom, above=0)
+        checks.number("elevation", elevation, above=0, below=90, optional=True)
         import warp as wp
         from newton.sensors import SensorCamera
 
         self.width, self.height = width, height
-        self._drawing, self._zoom = drawing, zoom
+        self._drawing, self._zoom, self._elevation = drawing, zoom, elevation
         self._model = newton_model(drawing, area)
         self._state = self._model.state()
         options = SensorCamera.RenderConfig()
@@ -90,9 +94,8 @@ class Camera:
         if self._drawing.follow:
             # the height stays, so that a hopping robot is seen to hop
             aim[:2] = frames[self._drawing.torso, :2]
-        place = wp.array(
-            [wp.transform(*_pose(self._drawing, aim, self._zoom))], dtype=wp.transformf
-        )
+        pose = _pose(self._drawing, aim, self._zoom, self._elevation)
+        place = wp.array([wp.transform(*pose)], dtype=wp.transformf)
         self._sensor.update(self._state, place, self._rays, color_image=self._image)
         image: Any = self._image
         packed = image.numpy()[0]
@@ -100,11 +103,15 @@ class Camera:
         return np.stack(parts, axis=-1).astype(np.uint8)
 
 
-def _pose(drawing: Drawing, aim: np.ndarray, zoom: float) -> list[float]:
+def _pose(
+    drawing: Drawing, aim: np.ndarray, zoom: float, elevation: float | None
+) -> list[float]:
     """Returns the frame (7,) of a camera that looks at a point, as the pages do."""
-    flat, side = (0.45, 0.42) if drawing.follow else (1.1, 0.2)
+    up, side = (0.45, 0.42) if drawing.follow else (1.1, 0.2)
+    if elevation is not None:
+        up = math.tan(math.radians(elevation))
     distance = 1.15 * drawing.radius / math.sin(_FIELD / 2) / zoom
-    away = np.array([-side, -math.sqrt(1 - side * side), flat])
+    away = np.array([-side, -math.sqrt(1 - side * side), up])
     back = away / np.linalg.norm(away)
     right = np.cross([0.0, 0.0, 1.0], back)
     right /= np.linalg.norm(right)
@@ -136,6 +143,7 @@ def pictures(
     width: int = 640,
     height: int = 480,
     zoom: float = 1.0,
+    elevation: float | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Iterator[np.ndarray]:
     """Yields pictures of all worlds, beside and below each other.
@@ -146,19 +154,20 @@ def pictures(
         width: Width of the picture of one world [px].
         height: Height of the picture of one world [px].
         zoom: Size of the robot in the picture; 1: as in the pages.
+        elevation: Angle of the view above the ground [deg]; ``None``: as in the pages.
         progress: Called after each picture with its number from 1 and n.
 
     Yields:
         (rows * height, columns * width, 3) red, green and blue, uint8.
 
     Raises:
-        ValueError: ``width``, ``height`` or ``zoom`` is not allowed.
+        ValueError: ``width``, ``height``, ``zoom`` or ``elevation`` is not allowed.
     """
     drawing = trajectory.drawing
     torso = body_frames(drawing, trajectory.q)[..., drawing.torso, :2].reshape(-1, 2)
     reach = max(_REACH * drawing.radius / min(zoom, 1.0), 2 * drawing.grid)
     area = torso.min(axis=0) - reach, torso.max(axis=0) + reach
-    camera = Camera(drawing, area, width, height, zoom)
+    camera = Camera(drawing, area, width, height, zoom, elevation)
     columns = math.ceil(math.sqrt(trajectory.worlds))
     rows = math.ceil(trajectory.worlds / columns)
     for number, frame in enumerate(frames):

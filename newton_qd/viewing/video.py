@@ -46,6 +46,7 @@ def render(
     time: float | None = None,
     rate: float = _RATE,
     zoom: float = 1.0,
+    elevation: float | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
     """Renders a trajectory to a file, without a screen. Several worlds make a sheet.
@@ -59,6 +60,7 @@ def render(
             the middle. Only for ``.png``.
         rate: Pictures per second of a GIF or a video [1/s].
         zoom: Size of the robot in the picture; 1: as in the pages.
+        elevation: Angle of the view above the ground [deg]; ``None``: as in the pages.
         progress: Called after each picture with its number from 1 and their count.
 
     Returns:
@@ -86,7 +88,13 @@ def render(
     else:
         frames = times(trajectory, rate)
     found = pictures(
-        trajectory, frames, width=width, height=height, zoom=zoom, progress=progress
+        trajectory,
+        frames,
+        width=width,
+        height=height,
+        zoom=zoom,
+        elevation=elevation,
+        progress=progress,
     )
     temporary = temporary_name(target)
     try:
