@@ -35,7 +35,8 @@ RATE = 12.5  # pictures per second: GIFs count in hundredths of a second
 SIZE = 200, 150  # [px]
 GAITS = 64
 CLOSE, WALLS = 1.15, 0.4  # zoom; walls are seen from farther away
-ABOVE = 65.0  # elevation [deg] over the boxes of a maze, which are higher than a robot
+# the boxes of a maze are higher than a robot: zoom and elevation [deg]
+MAZE, ABOVE = 0.32, 65.0
 MAZE_STEPS = 30  # of the point maze, which has no time
 
 HEAD = """# Gallery
@@ -94,7 +95,7 @@ def make(name: str) -> Path:
         width=width,
         height=height,
         rate=RATE,
-        zoom=WALLS if walls else CLOSE,
+        zoom=MAZE if maze else WALLS if walls else CLOSE,
         elevation=ABOVE if maze else None,
     )
 

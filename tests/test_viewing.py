@@ -307,3 +307,9 @@ def test_pictures(walk: Trajectory, tmp_path: Path) -> None:
     ]
     with pytest.raises(ValueError, match=r"path: got .*; allowed: files with .png"):
         render(one, tmp_path / "one.webm")
+    above = render(one, tmp_path / "above.png", **size, time=0.1, elevation=89)
+    with Image.open(above) as image:
+        seen_above = np.asarray(image.convert("RGB"), int)
+    assert np.abs(seen_above - picture[:, :64]).mean() > 1
+    with pytest.raises(ValueError, match=r"elevation: got 90; allowed: "):
+        render(one, tmp_path / "one.png", elevation=90)
