@@ -16,14 +16,14 @@ variant is best on a task is found first, with another seed:
     python benchmarks/study_report.py runs --out benchmarks/results/study.csv
 
 With ``--workers N`` N runs go on at once, on a CPU each with its share of the cores, on
-GPUs in turn on each of them. Runs of a protocol below that share a GPU take turns: one
-has its clock running, and the others compile.
+GPUs in turn on each of them. Runs of a protocol below that share a GPU compile and warm
+up together, and then take turns: while one has its clock running, the others wait.
 
 All this is the protocol ``core``, for one core of a CPU. ``study_protocols.py`` has two
 more. ``field`` is that of published comparisons, for one GPU: a million evaluations in
 batches of 1,024, and scores after 60, 250 and 1,000 s. ``small`` has the same policies,
 episodes and cells, for minutes on a CPU. Their runs can be stopped at any time and
-continued, see ``study_runs.py``; variants are in ``study/field.toml``:
+continued, see ``study_execution.py``; variants are in ``study/field.toml``:
 
     python benchmarks/study.py --protocol field --device cuda --until 60 --out field
     python benchmarks/study.py --protocol small --out small
@@ -47,6 +47,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import study_execution
 import study_runs
 from study_pool import Pool
 from study_protocols import PROTOCOLS
@@ -236,7 +237,13 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--tuned", type=Path, help="folder of what --tune has found")
     parser.add_argument("--cores", type=int, nargs="*", help=argparse.SUPPRESS)
     parser.add_argument("--run", nargs=4, help=argparse.SUPPRESS)
-    args = parser.parse_args()
+    return checked(parser, parser.parse_args())
+
+
+def checked(
+    parser: argparse.ArgumentParser, args: argparse.Namespace
+) -> argparse.Namespace:
+    """Fills in the protocol's defaults, and ends the command at an unknown name."""
     protocol = PROTOCOLS.get(args.protocol)
     args.tasks = args.tasks or list(protocol.tasks if protocol else TASKS)
     args.algorithms = args.algorithms or list(
@@ -249,6 +256,10 @@ def arguments() -> argparse.Namespace:
         unknown = sorted(set(getattr(args, name)) - set(known))
         if unknown:
             parser.error(f"--{name}: got {', '.join(unknown)}; allowed: {known}")
+    unknown = sorted(set(args.variants or ()) - set(study_runs.variants()))
+    if protocol and unknown:
+        allowed = ", ".join(study_runs.variants())
+        parser.error(f"--variants: got {', '.join(unknown)}; allowed: {allowed}")
     if args.seeds is None:
         args.seeds = protocol.seeds if protocol else 5
     if protocol and args.until is None:
@@ -291,17 +302,16 @@ def left(args: argparse.Namespace) -> list[tuple[str, ...]]:
             for run, file in planned(args)
             if not file.exists()
         ]
-    found = study_runs.missing(
-        PROTOCOLS[args.protocol],
-        args.out,
+    choice = study_runs.Choice(
         tasks=args.tasks,
         algorithms=args.algorithms,
         seeds=args.seeds,
         until=args.until,
         tune=args.tune,
         tuned=args.tuned,
-        chosen_variants=args.variants,
+        variants=args.variants,
     )
+    found = study_runs.missing(PROTOCOLS[args.protocol], args.out, choice)
     return [(run.task, run.variant, str(run.seed), str(args.out)) for run in found]
 
 
@@ -312,7 +322,7 @@ def one(args: argparse.Namespace, begin: float) -> None:
         run = Run(task, variant, int(seed))
         execute(run, args.seconds, args.device, Path(out))
         return
-    study_runs.execute(
+    study_execution.execute(
         PROTOCOLS[args.protocol],
         study_runs.Run(task, variant, int(seed)),
         Path(out),

@@ -75,12 +75,30 @@ def load(folder: Path) -> Results:
     return found
 
 
+def best_known() -> dict[str, float]:
+    """Returns the best known fitness of each task."""
+    if not BEST_KNOWN.is_file():
+        return {}
+    with BEST_KNOWN.open(newline="", encoding="utf-8") as file:
+        return {row["task"]: float(row["fitness"]) for row in csv.DictReader(file)}
+
+
+def note_best(results: Results) -> None:
+    """Writes the best corrected fitnesses of runs where they are better than known."""
+    best = best_known() | {
+        task: high for task, (_, high) in references(results).items()
+    }
+    unfinished = BEST_KNOWN.with_suffix(".unfinished")
+    with unfinished.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(("task", "fitness"))
+        writer.writerows((task, f"{best[task]:.7g}") for task in sorted(best))
+    unfinished.replace(BEST_KNOWN)
+
+
 def references(results: Results) -> dict[str, tuple[float, float]]:
     """Returns the fitness of an untrained policy and the best known one, by task."""
-    known: dict[str, float] = {}
-    if BEST_KNOWN.is_file():
-        with BEST_KNOWN.open(newline="", encoding="utf-8") as file:
-            known = {row["task"]: float(row["fitness"]) for row in csv.DictReader(file)}
+    known = best_known()
     found = {}
     for task in sorted({key[0] for key in results}):
         runs = [
@@ -269,8 +287,15 @@ def main() -> None:
     parser.add_argument("runs", type=Path)
     parser.add_argument("--out", type=Path, help="Markdown file of the tables")
     parser.add_argument("--figures", type=Path)
+    parser.add_argument(
+        "--note-best",
+        action="store_true",
+        help="add the best elites of these runs to study/best_known.csv",
+    )
     args = parser.parse_args()
     results = load(args.runs)
+    if args.note_best:
+        note_best(results)
     known = {str(x) for protocol in PROTOCOLS.values() for x in protocol.stops}
     stops = sorted({key[2] for key in results} & known)
     if args.figures:

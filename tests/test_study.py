@@ -71,7 +71,7 @@ def test_ablations_are_run_by_name(tmp_path: Path) -> None:
     name = "me-conditioned@no-copies"
     assert name in study_runs.variants()
     assert name not in study_runs.numbered("me-conditioned")
-    assert left(tmp_path, chosen_variants=[name], seeds=1) == [f"{TASK}.{name}.0"]
+    assert left(tmp_path, variants=[name], seeds=1) == [f"{TASK}.{name}.0"]
 
 
 def test_humanoids_have_larger_policies() -> None:
@@ -96,7 +96,8 @@ def test_stops_come_by_evaluations_and_time() -> None:
 
 def left(out: Path, until: float = 40, **given: Any) -> list[str]:
     options: dict[str, Any] = {"tasks": [TASK], "algorithms": ["me"], "seeds": 2}
-    found = study_runs.missing(SMALL, out, until=until, **{**options, **given})
+    choice = study_runs.Choice(until=until, **{**options, **given})
+    found = study_runs.missing(SMALL, out, choice)
     return [str(run) for run in found]
 
 
@@ -121,7 +122,20 @@ def test_tuning_chooses_the_corrected_score(tmp_path: Path) -> None:
         study_runs.best_variant(tmp_path, TASK, "pga-me")
 
 
-def test_the_report_compares_corrected_archives(tmp_path: Path) -> None:
+def test_the_best_known_fitness_only_rises(tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setattr(study_scores, "BEST_KNOWN", tmp_path / "best_known.csv")
+    for best in (4.0, 2.0):
+        add(tmp_path, "me", 0, "20 s", [best] * CELLS)
+        study_scores.note_best(study_scores.load(tmp_path))
+        # the elites lose 1 when they are evaluated again
+        assert study_scores.best_known() == {TASK: 3.0}
+        (tmp_path / "runs.csv").unlink()
+
+
+def test_the_report_compares_corrected_archives(
+    tmp_path: Path, monkeypatch: Any
+) -> None:
+    monkeypatch.setattr(study_scores, "BEST_KNOWN", tmp_path / "best_known.csv")
     empty, stop = -np.inf, "20 s"
     me = [4.0, empty, 6.0, empty, 3.0, 2.0, empty, empty]
     ours = [9.0, 5.0, 11.0, empty, empty, empty, empty, empty]

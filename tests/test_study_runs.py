@@ -1,0 +1,64 @@
+"""Runs of the study: one seed gives one result, also if a run stops on the way."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
+sys.path.insert(0, str(FOLDER))
+
+import study_execution  # noqa: E402
+from study_protocols import Protocol, Stop  # noqa: E402
+from study_runs import Run, lines  # noqa: E402
+
+CLOCK = {"wall_s", "processor_s"}
+PROTOCOL = Protocol(
+    name="tiny",
+    tasks=("hopper_uni",),
+    algorithms=("me-actor-critic",),
+    settings={
+        "batch_size": 16,
+        "episode_length": 10,
+        "hidden": [8],
+        "centroids": 16,
+        "reevaluations": 2,
+    },
+    own={},
+    stops=(Stop("evaluations", 40), Stop("evaluations", 90)),
+    seeds=1,
+    slow_seeds=1,
+)
+SETTINGS = {"me-actor-critic@1": {"options": {"copies": 2, "worlds": 4, "window": 4}}}
+RUN = Run("hopper_uni", "me-actor-critic@1", 3)
+
+
+def execute(out: Path, deadline: float = np.inf) -> bool:
+    out.mkdir(exist_ok=True)
+    return study_execution.execute(
+        PROTOCOL, RUN, out, until=60.0, device="cpu", deadline=deadline
+    )
+
+
+@pytest.mark.slow
+def test_a_row_repeats_bitwise(tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setattr(study_execution, "variants", lambda: SETTINGS)
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    assert execute(whole)
+    assert not execute(parts, deadline=0.0)  # stops after the first generation
+    assert (parts / "states" / f"{RUN}.bin").is_file()
+    assert execute(parts)
+    assert not (parts / "states" / f"{RUN}.bin").exists()
+    assert [row["stop"] for row in lines(whole)] == [str(x) for x in PROTOCOL.stops]
+    for one, other in zip(lines(whole), lines(parts), strict=True):
+        assert {k: v for k, v in one.items() if k not in CLOCK} == {
+            k: v for k, v in other.items() if k not in CLOCK
+        }
+    one, other = (np.load(out / "cells" / f"{RUN}.npz") for out in (whole, parts))
+    for stop in PROTOCOL.stops:
+        np.testing.assert_array_equal(one[str(stop)], other[str(stop)])
+        assert np.isfinite(one[str(stop)][0]).any()
