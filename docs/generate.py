@@ -23,6 +23,7 @@ import newton_qd
 from newton_qd.assets import find_urdf
 from newton_qd.envs.base import Env, PhysicsEnv, QDEnv
 from newton_qd.envs.pointmaze import PointMaze
+from newton_qd.envs.servos import Servos
 from newton_qd.physics.system import JointKind
 from newton_qd.qd.algorithms import ALGORITHMS
 from newton_qd.qd.algorithms.options import option_texts
@@ -147,14 +148,16 @@ def _head(scene: Scene) -> str:
     return " ".join(text.partition("<!--")[2].partition("\n\n")[0].split())
 
 
-def _drive(env: PhysicsEnv, joint: str, gear: float) -> str:
+def _drive(env: PhysicsEnv, index: int) -> str:
     """What an action of 1 does to a joint: a servo goes to the end of its range."""
-    system = env.system
+    system, (joint, gear) = env.system, env.robot.actuators[index]
     body = system.joint_names.index(joint)
-    if joint in env.robot.servos:
-        end = system.limit_upper[system.v_start[body]]
-        return f"an angle of {end:g} rad, held with {gear:g} N m/rad"
     slides = system.joint_kind[body] == JointKind.PRISMATIC
+    if isinstance(env, Servos):
+        end = env.servo_range[1][index]
+        if slides:
+            return f"a place of {end:g} m, held with {gear:g} N/m"
+        return f"an angle of {end:g} rad, held with {gear:g} N m/rad"
     return f"a force of {gear:g} N" if slides else f"a torque of {gear:g} N m"
 
 
@@ -167,8 +170,8 @@ def _actions(env: PhysicsEnv | PointMaze) -> str:
         return _table(("action", "an action of 1 is"), rows)
     driven = env.robot.actuators[: env.action_size]
     rows = [
-        (index, f"`{joint}`", _drive(env, joint, gear))
-        for index, (joint, gear) in enumerate(driven)
+        (index, f"`{joint}`", _drive(env, index))
+        for index, (joint, _) in enumerate(driven)
     ]
     return _table(("action", "joint", "an action of 1 is"), rows)
 

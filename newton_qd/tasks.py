@@ -18,6 +18,7 @@ from newton_qd.envs.ant import Ant
 from newton_qd.envs.arm_reach import TIP, ArmReach
 from newton_qd.envs.base import Env
 from newton_qd.envs.fetch import Fetch
+from newton_qd.envs.grasp import Grasp
 from newton_qd.envs.halfcheetah import HalfCheetah
 from newton_qd.envs.hopper import Hopper
 from newton_qd.envs.humanoid import Humanoid
@@ -309,6 +310,7 @@ ENVIRONMENTS: dict[str, EnvironmentSpec] = {
     ),
     "acrobot": EnvironmentSpec(Acrobot, "acrobot"),
     "fetch": EnvironmentSpec(Fetch, "fetch"),
+    "grasp": EnvironmentSpec(Grasp, "grasp"),
     "humanoidstandup": EnvironmentSpec(HumanoidStandup, "humanoidstandup"),
     "inverted_double_pendulum": EnvironmentSpec(
         InvertedDoublePendulum, "inverted_double_pendulum"

@@ -33,6 +33,7 @@ from newton_qd.physics import reference
 NAMES = (
     "acrobot",
     "fetch",
+    "grasp",
     "arm_reach",
     "humanoidstandup",
     "inverted_double_pendulum",

@@ -103,6 +103,7 @@ ROBOTS = {
     "walker2d": (17, 6),
     "acrobot": (4, 1),
     "fetch": (101, 10),
+    "grasp": (132, 19),
     "humanoidstandup": (227, 17),
     "inverted_double_pendulum": (8, 1),
     "inverted_pendulum": (4, 1),

@@ -26,6 +26,7 @@ SUITE = {
     "humanoidstandup": ONE,
     "walker2d": ONE,
     "fetch": ONE,
+    "grasp": ONE,
     "pusher": ONE,
     "acrobot": THREE,
     "inverted_double_pendulum": THREE,

@@ -44,6 +44,18 @@ BODY_NAMES: Mapping[str, Mapping[str, str]] = types.MappingProxyType(
                 )
             }
         ),
+        "grasp": types.MappingProxyType(
+            {
+                "object": "Object",
+                "palm": "HandPalm",
+                "target": "Target",
+                **{
+                    f"finger_{finger}_{part}": f"HandThumb{part.title()}{suffix}"
+                    for finger, suffix in enumerate(("", "Two", "Three", "Four"), 1)
+                    for part in ("proximal", "middle", "distal")
+                },
+            }
+        ),
         "ur5e": types.MappingProxyType({"target": "Target"}),
     }
 )

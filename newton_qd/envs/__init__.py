@@ -5,6 +5,7 @@ from newton_qd.envs.ant import Ant
 from newton_qd.envs.arm_reach import ArmReach
 from newton_qd.envs.base import Env, PhysicsEnv, QDEnv
 from newton_qd.envs.fetch import Fetch
+from newton_qd.envs.grasp import Grasp
 from newton_qd.envs.halfcheetah import HalfCheetah
 from newton_qd.envs.hopper import Hopper
 from newton_qd.envs.humanoid import Humanoid
@@ -27,6 +28,7 @@ __all__ = [
     "ArmReach",
     "Env",
     "Fetch",
+    "Grasp",
     "HalfCheetah",
     "Hopper",
     "Humanoid",

@@ -8,13 +8,13 @@ import jax.numpy as jnp
 from newton_qd.envs.locomotion import Locomotion
 from newton_qd.envs.options import checked_options
 from newton_qd.envs.rollouts import RolloutOrder
-from newton_qd.envs.servos import servo_targets
+from newton_qd.envs.servos import Servos
 from newton_qd.physics.system import PhysicsState
 from newton_qd.robots import QUADRUPED
 from newton_qd.types import Action, Metrics
 
 
-class Quadruped(Locomotion):
+class Quadruped(Servos, Locomotion):
     """A torso on four legs of three joints that hold angles, rewarded for speed.
 
     An action from -1 to 1 is the target angle of a joint, from the lower to the upper
@@ -72,7 +72,7 @@ class Quadruped(Locomotion):
     def control(self, state: PhysicsState, action: Action) -> jax.Array:
         """Returns the target angles of the joints (nu,) [rad]."""
         del state
-        return servo_targets(self.system, action)
+        return self.servo_targets(action)
 
     def outcome(
         self, before: PhysicsState, after: PhysicsState, action: Action

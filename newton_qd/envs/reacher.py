@@ -11,7 +11,7 @@ from newton_qd.envs.base import PhysicsEnv
 from newton_qd.envs.options import checked_options
 from newton_qd.envs.points import point
 from newton_qd.envs.rollouts import RolloutOrder
-from newton_qd.envs.servos import servo_targets
+from newton_qd.envs.servos import Servos
 from newton_qd.envs.vectors import length, ordered_sum
 from newton_qd.physics.inspection import Kinematics
 from newton_qd.physics.system import PhysicsState
@@ -122,7 +122,7 @@ class Reacher(PhysicsEnv):
         return -distance - control, jnp.zeros_like(distance), metrics
 
 
-class ReacherAngle(Reacher):
+class ReacherAngle(Servos, Reacher):
     """The arm of the reacher, with actions that are target angles.
 
     An action from -1 to 1 is the target angle of a joint, from the lower to the upper
@@ -144,7 +144,7 @@ class ReacherAngle(Reacher):
     def control(self, state: PhysicsState, action: Action) -> jax.Array:
         """Returns the target angles of the joints (nu,) [rad]."""
         del state
-        return servo_targets(self.system, action)
+        return self.servo_targets(action)
 
     def outcome(
         self, before: PhysicsState, after: PhysicsState, action: Action

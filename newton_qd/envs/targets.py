@@ -47,18 +47,27 @@ class MovingTarget(PhysicsEnv):
     rollout_order = RolloutOrder.ONE_BY_ONE
     reads_bodies = True
     _slides: tuple[str, ...] = ("target_x", "target_y")
+    _draws = 2  # keys that ``draw_target`` takes
+    _bodies: tuple[str, ...]  # bodies that a subclass observes, in order
 
     @abc.abstractmethod
-    def draw_target(self, first: RNGKey, second: RNGKey) -> jax.Array:
+    def draw_target(self, *keys: RNGKey) -> jax.Array:
         """Returns a random place of the target.
 
         Args:
-            first: One key.
-            second: Another key.
+            *keys: Keys, as many as the subclass says.
 
         Returns:
             Coordinates (n,) of the target's slides [m].
         """
+
+    def first_target(self, rng: RNGKey) -> tuple[RNGKey, jax.Array]:
+        """Returns the key of the first step, and the place (n,) of a reset [m].
+
+        Args:
+            rng: The key of the reset.
+        """
+        return self._next(rng)
 
     def reset(self, rng: RNGKey) -> State:
         """Begins an episode with the target in a random place.
@@ -71,7 +80,7 @@ class MovingTarget(PhysicsEnv):
         inputs.require_key("rng", rng)
         # the noise on the joints has a key of its own; the others are the original's
         state = super().reset(jax.random.fold_in(rng, 1))
-        key, place = self._next(rng)
+        key, place = self.first_target(rng)
         state = self._placed(state, key, place)
         action = jnp.zeros((self.action_size,), self.dtype)
         obs = self._observation(state.pipeline_state, action)
@@ -94,16 +103,15 @@ class MovingTarget(PhysicsEnv):
         place = jnp.where(after.metrics["hits"] > 0, place, old)
         return self._placed(after, key, place)
 
-    def _next(self, rng: RNGKey) -> tuple[jax.Array, jax.Array]:
-        """Returns the data of the next key, and a place of the target (n,) [m]."""
-        following, first, second = jax.random.split(rng, 3)
-        place = self.draw_target(first, second)
-        if jnp.issubdtype(following.dtype, jax.dtypes.prng_key):
-            following = jax.random.key_data(following)
-        return following, place
+    def _next(self, rng: RNGKey) -> tuple[RNGKey, jax.Array]:
+        """Returns the next key, and a place of the target (n,) [m]."""
+        following, *draws = jax.random.split(rng, 1 + self._draws)
+        return following, self.draw_target(*draws)
 
-    def _placed(self, state: State, key: jax.Array, place: jax.Array) -> State:
+    def _placed(self, state: State, key: RNGKey, place: jax.Array) -> State:
         """Returns a state with the target at a place (n,) [m], and with another key."""
+        if jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
+            key = jax.random.key_data(key)
         physical: PhysicsState = state.pipeline_state
         bodies = physics.seen_bodies(self.system, physical)
         position, com = bodies.position, bodies.com
@@ -124,6 +132,20 @@ class MovingTarget(PhysicsEnv):
         key = jax.random.key_data(jax.random.key(0))
         return first.replace(info={**first.info, "rng": key})
 
+    def _rows(self, values: jax.Array) -> jax.Array:
+        """Returns rows (n, 3) of the observed bodies of rows (nb, 3) of all bodies."""
+        known = (*self.system.body_names, GROUND)
+        rows = np.array([known.index(name) for name in self._bodies], np.int32)
+        still = split_as([values], jnp.zeros((1, 3), values.dtype))
+        return jnp.concatenate([values, still])[rows]
+
+    def _contacts(self, state: PhysicsState) -> jax.Array:
+        """Returns 1 for each observed body (n,) that contact made faster, else 0."""
+        masses = dict(zip(self.system.body_names, self.system.mass, strict=True))
+        mass = np.array([masses.get(name, 1.0) for name in self._bodies], self.dtype)
+        change = self._rows(state.impulse[:, :3]) / mass[:, None]
+        return (ordered_sum(jnp.square(change).T) > _CONTACT).astype(self.dtype)
+
     @property
     def _links(self) -> tuple[int, ...]:
         """Body of each slide of the target."""
@@ -142,13 +164,12 @@ class Pursuit(MovingTarget):
     targets are.
     """
 
-    _bodies: tuple[str, ...]
     _radius: float  # distance of the torso from the target at which it is reached [m]
     _spread: float  # drawn radii of the target: from the above to this much more [m]
 
-    def draw_target(self, first: RNGKey, second: RNGKey) -> jax.Array:
+    def draw_target(self, *keys: RNGKey) -> jax.Array:
         """Returns x and y of the target (2,), uniform in its radius and its angle."""
-        shares = [jax.random.uniform(key, (), self.dtype) for key in (first, second)]
+        shares = [jax.random.uniform(key, (), self.dtype) for key in keys]
         radius, spread, turn = np.array([self._radius, self._spread, 2 * np.pi]).astype(
             self.dtype
         )
@@ -177,13 +198,6 @@ class Pursuit(MovingTarget):
             f"contact, 0 or 1: {names}": self._contacts(state),
         }
 
-    def _rows(self, values: jax.Array) -> jax.Array:
-        """Returns rows (n, 3) of the observed bodies of rows (nb, 3) of all bodies."""
-        known = (*self.system.body_names, GROUND)
-        rows = np.array([known.index(name) for name in self._bodies], np.int32)
-        still = split_as([values], jnp.zeros((1, 3), values.dtype))
-        return jnp.concatenate([values, still])[rows]
-
     def _axes(self, seen: Kinematics) -> jax.Array:
         """Returns the axes of the torso (3, 3), a row each, in world axes."""
         turn = jnp.tile(seen.rotation[self.system.torso], (3, 1))
@@ -200,13 +214,6 @@ class Pursuit(MovingTarget):
         away = seen.com[target] - seen.com[self.system.torso]
         distance = length(away)
         return distance, away / (_LEAST + distance)
-
-    def _contacts(self, state: PhysicsState) -> jax.Array:
-        """Returns 1 for each observed body (n,) that contact made faster, else 0."""
-        masses = dict(zip(self.system.body_names, self.system.mass, strict=True))
-        mass = np.array([masses.get(name, 1.0) for name in self._bodies], self.dtype)
-        change = self._rows(state.impulse[:, :3]) / mass[:, None]
-        return (ordered_sum(jnp.square(change).T) > _CONTACT).astype(self.dtype)
 
     def outcome(
         self, before: PhysicsState, after: PhysicsState, action: Action

@@ -8,6 +8,7 @@ from newton_qd.moved import moved_name
 from newton_qd.robots.acrobot import ACROBOT
 from newton_qd.robots.ant import ANT
 from newton_qd.robots.fetch import FETCH
+from newton_qd.robots.grasp import GRASP
 from newton_qd.robots.halfcheetah import HALFCHEETAH
 from newton_qd.robots.hopper import HOPPER
 from newton_qd.robots.humanoid import HUMANOID
@@ -33,6 +34,7 @@ ROBOTS = {
         WALKER2D,
         ACROBOT,
         FETCH,
+        GRASP,
         HUMANOID_STANDUP,
         INVERTED_DOUBLE_PENDULUM,
         INVERTED_PENDULUM,
@@ -49,6 +51,7 @@ __all__ = [
     "ACROBOT",
     "ANT",
     "FETCH",
+    "GRASP",
     "HALFCHEETAH",
     "HOPPER",
     "HUMANOID",
