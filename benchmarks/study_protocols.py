@@ -75,7 +75,12 @@ class Protocol:
 
 
 BASELINES = ("me", "ascii-me", "cma-me", "pga-me", "dcrl-me")
-OURS = ("me-actor-critic", "ascii-me-exact", "me-conditioned")
+OURS = (
+    "me-actor-critic",
+    "ascii-me-exact",
+    "me-conditioned",
+    "cma-maega-actor-critic",
+)
 
 FIELD = Protocol(
     name="field",

@@ -54,6 +54,10 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "omg-mega": {},
     "cma-mega": {"points": 2},
     "cma-maega": {"points": 2, "adam": 0.05},
+    "cma-maega-actor-critic": {
+        **{"points": 2, "probes": 3, "walks": 1, "worlds": 2, "window": 4},
+        **{"batches": 2, "critic": (8,)},
+    },
 }
 
 
@@ -84,7 +88,7 @@ def test_every_algorithm_is_tested() -> None:
 def test_defaults_of_an_environment_are_accepted(env_name: str) -> None:
     task = make_task(EvolveConfig(env_name=env_name))
     names = [spec.name for spec in ALGORITHMS if spec.gradients is not None]
-    assert len(names) == 7
+    assert len(names) == 8
     for name in names:
         config = EvolveConfig(
             env_name=env_name,
@@ -138,6 +142,8 @@ def test_a_stop_changes_nothing(
     more = {"me-gradient": 2, "me-actor-critic": 1, "cma-mega": 2, "cma-maega": 2}
     # two parents, each once for its actions and once for the gradient
     more |= {"ascii-me-exact": 4, "me-conditioned": 1}
+    # two solution points, and the 64 control steps of their actors
+    more |= {"cma-maega-actor-critic": 2 + 4}
     each = 16 + {"me-es": 1, **more}.get(name, 0)
     np.testing.assert_array_equal(np.diff(metrics["evaluations"]), each)
     assert not metrics["rejected"].any()

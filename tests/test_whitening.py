@@ -31,6 +31,14 @@ def test_plain_weights_do_what_the_whitened_ones_do() -> None:
     np.testing.assert_allclose(act(plain, obs), expected, atol=1e-5)
     np.testing.assert_allclose(white.whitened(plain, scale), weights, atol=1e-5)
     assert float(jnp.abs(plain - weights).max()) > 0.1
+    # it is linear, so it converts steps too
+    step = white.plain(weights[1], scale)
+    np.testing.assert_allclose(
+        white.plain(weights[0] + weights[1], scale),
+        plain[0] + step,
+        rtol=1e-5,
+        atol=1e-5,
+    )
 
 
 def test_a_network_without_a_known_first_layer_stays_as_it_is() -> None:

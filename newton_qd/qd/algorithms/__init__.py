@@ -15,6 +15,7 @@ from newton_qd import checks
 from newton_qd.checks import listed, message
 from newton_qd.qd.algorithms.ascii_me import ASCII_ME, ASCII_ME_EXACT
 from newton_qd.qd.algorithms.cma_maega import CMA_MAEGA
+from newton_qd.qd.algorithms.cma_maega_actor_critic import CMA_MAEGA_ACTOR_CRITIC
 from newton_qd.qd.algorithms.cma_me import CMA_ME
 from newton_qd.qd.algorithms.cma_mega import CMA_MEGA
 from newton_qd.qd.algorithms.dcrl_me import DCRL_ME
@@ -51,6 +52,7 @@ ALGORITHMS: tuple[AlgorithmSpec[Any], ...] = (
     OMG_MEGA,
     CMA_MEGA,
     CMA_MAEGA,
+    CMA_MAEGA_ACTOR_CRITIC,
 )
 """The algorithms of ``evolve`` that come with the package."""
 

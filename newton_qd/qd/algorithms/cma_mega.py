@@ -44,22 +44,27 @@ class CMAMEGAOptions(MixedOptions):
     adam: float = 0.0
     restart_period: int = 0
 
-    def population(self, config: EvolveConfig) -> int:
-        """Returns the number of individuals of a generation for one solution point.
 
-        Raises:
-            ConfigError: A generation cannot be divided by the number of points, or
-                there are too many points.
-        """
-        if self.points < 1 or config.batch_size % self.points:
-            allowed = f"divisors of batch_size = {config.batch_size}"
-            raise ConfigError(message("options: points", self.points, allowed))
-        each = config.batch_size // self.points
-        if each < _SMALLEST_POPULATION:
-            why = f"which leave {each} of batch_size = {config.batch_size} each"
-            allowed = f"at least {_SMALLEST_POPULATION} for each point"
-            raise ConfigError(message("options: points", self.points, allowed, why=why))
-        return each
+def population_of(points: int, config: EvolveConfig) -> int:
+    """Returns the number of individuals of a generation for one solution point.
+
+    Args:
+        points: Number of solution points.
+        config: Settings of the run.
+
+    Raises:
+        ConfigError: A generation cannot be divided by the number of points, or there
+            are too many points.
+    """
+    if points < 1 or config.batch_size % points:
+        allowed = f"divisors of batch_size = {config.batch_size}"
+        raise ConfigError(message("options: points", points, allowed))
+    each = config.batch_size // points
+    if each < _SMALLEST_POPULATION:
+        why = f"which leave {each} of batch_size = {config.batch_size} each"
+        allowed = f"at least {_SMALLEST_POPULATION} for each point"
+        raise ConfigError(message("options: points", points, allowed, why=why))
+    return each
 
 
 def make_search(
@@ -73,7 +78,7 @@ def make_search(
     return kind(
         lambda genotypes, _: score(genotypes, context.reset_key),
         sigma_g=options.sigma_g,
-        batch_size=options.population(config),
+        batch_size=population_of(options.points, config),
         num_emitters=options.points,
         optimizer=optax.adam(options.adam) if options.adam else None,
         restart_period=options.restart_period or None,

@@ -9,11 +9,13 @@
 - ``CMAMEGAEmitter``: CMA-ES searches for the steps along the gradients of a solution
   point
 - ``CMAMAEGAEmitter``: the same with an annealed archive, ``AnnealedRepertoire``
+- ``WindowArborescenceEmitter``: the same for large policies, with actors that find the
+  gradients over short windows
 - ``GradientLineEmitter``: several offspring along one gradient of each parent
 - ``GradientVariationEmitter``: elites climb their fitness, or move along descriptors
 - ``SteeringEmitter``: elites move towards empty cells
 
-The emitters of actors, ``ExactAsciiEmitter`` and ``GradientLineEmitter`` evaluate
+The emitters with actors, ``ExactAsciiEmitter`` and ``GradientLineEmitter`` evaluate
 gradients themselves. ``AsciiEmitter`` reads ``extra_scores["transitions"]``. All others
 read ``extra_scores["gradients"]``, see ``scoring/gradient_scores.py``. All emitters
 work with ``jax.jit`` and ``jax.lax.scan``, and together with QDax's emitters in its
@@ -41,6 +43,7 @@ if TYPE_CHECKING:
     from newton_qd.qd.emitters.omg_mega import OMGMEGAEmitter
     from newton_qd.qd.emitters.restarts import RestartRule
     from newton_qd.qd.emitters.steering import SteeringEmitter
+    from newton_qd.qd.emitters.window_arborescence import WindowArborescenceEmitter
     from newton_qd.qd.scoring.gradient_scores import GradientsError
 
 __all__ = [
@@ -59,6 +62,7 @@ __all__ = [
     "OMGMEGAEmitter",
     "RestartRule",
     "SteeringEmitter",
+    "WindowArborescenceEmitter",
 ]
 
 _HOME = {
@@ -77,6 +81,7 @@ _HOME = {
     "OMGMEGAEmitter": "newton_qd.qd.emitters.omg_mega",
     "RestartRule": "newton_qd.qd.emitters.restarts",
     "SteeringEmitter": "newton_qd.qd.emitters.steering",
+    "WindowArborescenceEmitter": "newton_qd.qd.emitters.window_arborescence",
 }
 
 

@@ -149,6 +149,16 @@ class ActorCritic:
             age=jnp.arange(number, dtype=jnp.int32) * self.episode_length // number,
         )
 
+    def moved(self, learner: Learner, weights: jax.Array) -> Learner:
+        """Returns the actor with other weights, and with a new optimizer for them.
+
+        Args:
+            learner: The actor, whose critic and worlds stay.
+            weights: (size,) weights, for whitened observations.
+        """
+        moments = self._optimizers[0].init(weights), learner.moments[1]
+        return dataclasses.replace(learner, weights=weights, moments=moments)
+
     def update(
         self, learner: Learner, scale: tuple[jax.Array, jax.Array], key: jax.Array
     ) -> tuple[Learner, jax.Array]:

@@ -23,15 +23,18 @@ import optax
 from jax.core import Tracer
 from jax.typing import ArrayLike
 from qdax.core.containers.mapelites_repertoire import get_cells_indices
-from qdax.core.emitters.emitter import Emitter, EmitterState
+from qdax.core.emitters.emitter import Emitter
 
 from newton_qd import checks
 from newton_qd.checks import Fact, message
+from newton_qd.envs.state import select
+from newton_qd.qd.emitters.arborescence_state import ArborescenceState
 from newton_qd.qd.emitters.cma_es import CMAES, CMAESState
 from newton_qd.qd.emitters.ranking import best_of
 from newton_qd.qd.emitters.restarts import RestartRule
 from newton_qd.qd.scoring.gradient_scores import (
     GradientsError,
+    Scores,
     check_genotypes,
     finite_scores,
     normalize,
@@ -44,40 +47,6 @@ from newton_qd.types import (
     Repertoire,
     ScoringFunction,
 )
-
-
-class ArborescenceState(EmitterState):
-    """State of E solution points.
-
-    The state contains the coefficients of the next offspring, so that emitting and
-    updating use the same ones.
-
-    Attributes:
-        key: Random key of the next update.
-        points: (E, size) solution points theta.
-        gradients: (E, 1 + D, size) normalized gradients of the points.
-        finite: (E,) whether scores and gradients of the points are finite.
-        bars: (cells,) fitness above which an offspring enters the archive.
-        cma_es: Search distributions of the coefficients, leaves (E, ...).
-        optimizer: State of the gradient optimizer, leaves (E, ...).
-        coefficients: (E, B - 1, 1 + D) coefficients of the offspring.
-        age: (E,) updates since the last restart.
-        restarts: () number of restarts of all points so far.
-        rejected: () number of individuals so far with a score that is not finite, plus
-            the number of points with a gradient that is not finite.
-    """
-
-    key: jax.Array
-    points: jax.Array
-    gradients: jax.Array
-    finite: jax.Array
-    bars: jax.Array
-    cma_es: CMAESState
-    optimizer: Any
-    coefficients: jax.Array
-    age: jax.Array
-    restarts: jax.Array
-    rejected: jax.Array
 
 
 class ArborescenceEmitter(Emitter, abc.ABC):
@@ -193,7 +162,7 @@ class ArborescenceEmitter(Emitter, abc.ABC):
             )
         state = self._state(
             repertoire,
-            self._fresh(points, descriptors.shape[-1]),
+            self._fresh(points, descriptors.shape[-1], state_key, None),
             (state_key, score_key, sample_key),
             restarts=jnp.zeros((), jnp.int32),
             rejected=jnp.zeros((), jnp.int32),
@@ -260,9 +229,7 @@ class ArborescenceEmitter(Emitter, abc.ABC):
             state.bars[cells].reshape(shape)[:, 1:],
             finite.reshape(shape)[:, 1:],
         )
-        points, optimizer = jax.vmap(self._climb)(
-            state.points, state.gradients, cma_es.mean, state.optimizer
-        )
+        points, optimizer = self._moved(state, cma_es.mean)
         strategy = self._strategy(descriptors.shape[-1])
         age = state.age + 1
         restart = flat | ~state.finite | jax.vmap(strategy.stopped)(cma_es)
@@ -270,11 +237,8 @@ class ArborescenceEmitter(Emitter, abc.ABC):
 
         key, elite_key, score_key, sample_key = jax.random.split(state.key, 4)
         elites = repertoire.select(elite_key, self._num_emitters).genotypes
-        search = _where(
-            restart,
-            self._fresh(elites, descriptors.shape[-1]),
-            (points, cma_es, optimizer, age),
-        )
+        fresh = self._fresh(elites, descriptors.shape[-1], elite_key, optimizer)
+        search = select(restart, fresh, (points, cma_es, optimizer, age))
         return self._state(
             repertoire,
             search,
@@ -295,15 +259,49 @@ class ArborescenceEmitter(Emitter, abc.ABC):
     def _strategy(self, descriptor_length: int) -> CMAES:
         return CMAES(1 + descriptor_length, self._population - 1, self._sigma_g)
 
-    def _fresh(self, points: jax.Array, descriptor_length: int) -> tuple:
+    def _fresh(
+        self, points: jax.Array, descriptor_length: int, key: jax.Array, old: Any
+    ) -> tuple:
         """Returns new searches from points: points, CMA-ES, optimizer and age."""
         strategy = self._strategy(descriptor_length)
         return (
             points,
             jax.vmap(lambda point: strategy.init(point.dtype))(points),
-            jax.vmap(self._optimizer.init)(points),
+            self._begun(points, descriptor_length, key, old),
             jnp.zeros(self._num_emitters, jnp.int32),
         )
+
+    def _begun(
+        self, points: jax.Array, descriptor_length: int, key: jax.Array, old: Any
+    ) -> Any:
+        """Returns what moves new points (E, size): states of the optimizer.
+
+        Args:
+            points: (E, size) the points.
+            descriptor_length: Number of components of the descriptor.
+            key: Random key, for subclasses.
+            old: What moved the points before; ``None`` at the start.
+        """
+        del descriptor_length, key, old
+        return jax.vmap(self._optimizer.init)(points)
+
+    def _moved(self, state: PyTree, means: jax.Array) -> tuple[jax.Array, Any]:
+        """Returns all points (E, size) after a step, and what moves them.
+
+        Args:
+            state: State before the step.
+            means: (E, 1 + D) means of the coefficients.
+        """
+        return jax.vmap(self._climb)(
+            state.points, state.gradients, means, state.optimizer
+        )
+
+    def _scored(
+        self, points: jax.Array, optimizer: Any, key: jax.Array
+    ) -> tuple[Scores, Any]:
+        """Returns the scores of points with normalized gradients, and their movers."""
+        scores = read_scores(points, *self._scoring_function(points, key))
+        return scores.replace(gradients=normalize(scores.gradients)), optimizer
 
     def _state(
         self,
@@ -323,14 +321,14 @@ class ArborescenceEmitter(Emitter, abc.ABC):
             rejected: () individuals rejected so far, without the points.
         """
         (points, cma_es, optimizer, age), (key, score_key, sample_key) = search, keys
-        scores = read_scores(points, *self._scoring_function(points, score_key))
+        scores, optimizer = self._scored(points, optimizer, score_key)
         # Only the bars are computed from the repertoire with the points.
         added = repertoire.add(points, scores.descriptors, scores.fitnesses)
         strategy = self._strategy(scores.descriptors.shape[-1])
         return ArborescenceState(
             key=key,
             points=points,
-            gradients=normalize(scores.gradients),
+            gradients=scores.gradients,
             finite=scores.finite,
             bars=self._bars(added),
             cma_es=cma_es,
@@ -380,12 +378,3 @@ class ArborescenceEmitter(Emitter, abc.ABC):
             -(mean @ gradients), optimizer, point
         )
         return jnp.asarray(optax.apply_updates(point, update)), optimizer
-
-
-def _where(choose: jax.Array, new: Any, old: Any) -> Any:
-    """Chooses between trees with leaves (E, ...) by ``choose`` (E,)."""
-
-    def leaf(a: jax.Array, b: jax.Array) -> jax.Array:
-        return jnp.where(choose.reshape(-1, *(1,) * (b.ndim - 1)), a, b)
-
-    return jax.tree.map(leaf, new, old)
