@@ -46,6 +46,8 @@ class Protocol:
         stops: Points at which the scores are read; the last ends a run.
         seeds: Number of seeds.
         slow_seeds: Number of seeds of the slow baselines.
+        variant: Variant of an algorithm that runs without tuning; 0: the defaults of
+            ``newton-qd evolve``.
     """
 
     name: str
@@ -56,6 +58,7 @@ class Protocol:
     stops: tuple[Stop, ...]
     seeds: int
     slow_seeds: int
+    variant: int = 1
 
     def settings_of(self, task: str) -> dict[str, Any]:
         """Settings of the runs of a task."""
@@ -112,14 +115,18 @@ FIELD = Protocol(
 
 SMALL = Protocol(
     name="small",
-    tasks=("hopper_uni", "walker2d_uni"),
-    algorithms=("me", *OURS),
+    tasks=(
+        *("ant_uni", "ant_omni", "anttrap", "halfcheetah_uni"),
+        *("hopper_uni", "walker2d_uni", "humanoid_uni"),
+    ),
+    algorithms=("me", "ascii-me", *OURS),
     settings={**FIELD.settings, "batch_size": 256, "reevaluations": 4},
     own={},
-    stops=(Stop("evaluations", 20_000), Stop("s", 20), Stop("s", 40)),
+    stops=(Stop("evaluations", 20_000), Stop("s", 20), Stop("s", 60)),
     seeds=3,
     slow_seeds=1,
+    variant=0,
 )
-"""The same policies, episodes and cells, for minutes on a core of a CPU."""
+"""The same episodes and cells, for minutes on a core of a CPU, with the defaults."""
 
 PROTOCOLS = {protocol.name: protocol for protocol in (FIELD, SMALL)}

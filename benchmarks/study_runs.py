@@ -50,9 +50,11 @@ class Run:
 
 
 def variants() -> dict[str, dict[str, Any]]:
-    """Returns the settings of all variants."""
+    """Returns the settings of all variants; number 0 has the defaults of ``evolve``."""
     with VARIANTS.open("rb") as file:
-        return tomllib.load(file)
+        found = tomllib.load(file)
+    algorithms = dict.fromkeys(name.split("@")[0] for name in found)
+    return {**found, **{f"{algorithm}@0": {} for algorithm in algorithms}}
 
 
 def lines(out: Path) -> list[dict[str, str]]:
@@ -83,7 +85,11 @@ def best_variant(tuning: Path, task: str, algorithm: str) -> str:
 def numbered(algorithm: str) -> list[str]:
     """Returns the variants of an algorithm that tuning tries; others are ablations."""
     names = [name.split("@") for name in variants()]
-    return [f"{algorithm}@{x}" for own, x in names if own == algorithm and x.isdigit()]
+    return [
+        f"{algorithm}@{number}"
+        for own, number in names
+        if own == algorithm and number.isdigit() and number != "0"
+    ]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,7 +102,7 @@ class Choice:
         seeds: Largest number of seeds.
         until: Longest time of a run [s].
         tune: Whether to run every variant with the seed of the tuning.
-        tuned: Folder of the tuning; ``None``: the first variant of each algorithm.
+        tuned: Folder of the tuning; ``None``: the protocol's variant of each algorithm.
         variants: Variants to run instead of the algorithms; ``None``: none.
     """
 
@@ -139,7 +145,7 @@ def planned(protocol: Protocol, choice: Choice) -> list[Run]:
     for seed in range(choice.seeds):
         for task, algorithm in kinds:
             if seed < protocol.seeds_of(algorithm):
-                chosen = f"{algorithm}@1"
+                chosen = f"{algorithm}@{protocol.variant}"
                 if choice.tuned:
                     chosen = best_variant(choice.tuned, task, algorithm)
                 found.append(Run(task, chosen, seed))

@@ -28,7 +28,7 @@ def line(algorithm: str, seed: int, stop: str, **values: Any) -> dict[str, str]:
     given = {
         **dict.fromkeys(study_runs.HEAD, 1.0),
         **{"protocol": "small", "task": TASK, "algorithm": algorithm, "seed": seed},
-        **{"variant": f"{algorithm}@1", "stop": stop, "device": "cpu"},
+        **{"variant": f"{algorithm}@0", "stop": stop, "device": "cpu"},
         **{"initial_fitness": 2.0, **values},
     }
     return {name: str(given[name]) for name in study_runs.HEAD}
@@ -38,7 +38,7 @@ def add(out: Path, algorithm: str, seed: int, stop: str, fitnesses: Any) -> None
     """Adds a run whose re-evaluated elites lose 1."""
     raw = np.asarray(fitnesses, np.float32)
     (out / "cells").mkdir(exist_ok=True)
-    path = out / "cells" / f"{TASK}.{algorithm}@1.{seed}.npz"
+    path = out / "cells" / f"{TASK}.{algorithm}@0.{seed}.npz"
     cells: dict[str, Any] = {stop: np.stack([raw, raw - 1])}
     np.savez(path, **cells)
     score = float(np.sum(raw[np.isfinite(raw)] + 9))
@@ -94,7 +94,7 @@ def test_stops_come_by_evaluations_and_time() -> None:
     ]
 
 
-def left(out: Path, until: float = 40, **given: Any) -> list[str]:
+def left(out: Path, until: float = 60, **given: Any) -> list[str]:
     options: dict[str, Any] = {"tasks": [TASK], "algorithms": ["me"], "seeds": 2}
     choice = study_runs.Choice(until=until, **{**options, **given})
     found = study_runs.missing(SMALL, out, choice)
@@ -102,12 +102,12 @@ def left(out: Path, until: float = 40, **given: Any) -> list[str]:
 
 
 def test_finished_runs_are_left_out(tmp_path: Path) -> None:
-    assert left(tmp_path) == [f"{TASK}.me@1.0", f"{TASK}.me@1.1"]
+    assert left(tmp_path) == [f"{TASK}.me@0.0", f"{TASK}.me@0.1"]
     study_runs.add_line(tmp_path / "runs.csv", line("me", 0, "20 s"))
-    assert left(tmp_path) == [f"{TASK}.me@1.0", f"{TASK}.me@1.1"]
-    assert left(tmp_path, until=20) == [f"{TASK}.me@1.1"]
-    study_runs.add_line(tmp_path / "runs.csv", line("me", 0, "40 s"))
-    assert left(tmp_path) == [f"{TASK}.me@1.1"]
+    assert left(tmp_path) == [f"{TASK}.me@0.0", f"{TASK}.me@0.1"]
+    assert left(tmp_path, until=20) == [f"{TASK}.me@0.1"]
+    study_runs.add_line(tmp_path / "runs.csv", line("me", 0, "60 s"))
+    assert left(tmp_path) == [f"{TASK}.me@0.1"]
     assert len(study_runs.lines(tmp_path)) == 2
 
 
