@@ -57,7 +57,7 @@ def same(state: Any, wanted: Any) -> bool:
     arrays = {name: getattr(wanted, name) for name in state.parts}
     assert len(arrays) == 6
     pairs = zip(jax.tree.leaves(state), jax.tree.leaves(arrays), strict=True)
-    return all(np.array_equal(a.detach().numpy(), b) for a, b in pairs)
+    return all(np.array_equal(a.detach().cpu().numpy(), b) for a, b in pairs)
 
 
 def test_memory_is_shared(torch: Any, door: Any) -> None:
