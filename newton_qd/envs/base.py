@@ -5,7 +5,6 @@ from __future__ import annotations
 import abc
 import copy
 import dataclasses
-import warnings
 from typing import Any
 
 import jax
@@ -17,6 +16,7 @@ from newton_qd.envs import inputs
 from newton_qd.envs.env import Env, QDEnv
 from newton_qd.envs.joints import joint_indices, joint_slices
 from newton_qd.envs.options import checked_options
+from newton_qd.envs.renamed import keep_old_names
 from newton_qd.envs.rollouts import RolloutOrder
 from newton_qd.envs.state import State, select
 from newton_qd.physics.explicit_mesh import split_as
@@ -26,13 +26,6 @@ from newton_qd.scenes import Scene
 from newton_qd.types import Action, Metrics, Observation, Params, RNGKey
 
 __all__ = ["Env", "PhysicsEnv", "QDEnv"]
-
-_RENAMED = {
-    "_observe": "observe",
-    "_outcome": "outcome",
-    "_control": "control",
-    "_place": "reset_pose",
-}
 
 
 class PhysicsEnv(Env):
@@ -62,16 +55,7 @@ class PhysicsEnv(Env):
     def __init_subclass__(cls, **options: Any) -> None:
         """Keeps methods working that are overridden by their old names."""
         super().__init_subclass__(**options)
-        for old, new in _RENAMED.items():
-            if old in vars(cls):
-                warnings.warn(
-                    f"{cls.__name__}.{old} is now {new}",
-                    DeprecationWarning,
-                    stacklevel=3,
-                )
-                setattr(cls, new, vars(cls)[old])
-            elif new in vars(cls):
-                setattr(cls, old, vars(cls)[new])
+        keep_old_names(cls)
 
     @checked_options
     def __init__(
