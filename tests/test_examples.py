@@ -49,6 +49,7 @@ def no_trace() -> Iterator[None]:
             ["--plans", "2", "--steps", "4", *FEW],
             r"iteration   2: mean return .*best",
         ),
+        ("lift_object", ["--steps", "4"], r"the object is 0\.9\d m high"),
         (
             "train_ant",
             ["--worlds", "2", "--steps", "4", *FEW],
