@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import fcntl
 import sys
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +44,25 @@ def execute(out: Path, deadline: float = np.inf) -> bool:
     return study_execution.execute(
         PROTOCOL, RUN, out, until=60.0, device="cpu", deadline=deadline
     )
+
+
+def test_a_clock_starts_when_no_other_run_uses_the_gpu(tmp_path: Path) -> None:
+    order = []
+
+    def run() -> None:
+        with study_execution._gpu(tmp_path, fcntl.LOCK_EX):
+            order.append("clock")
+
+    waiting = threading.Thread(target=run)
+    with (
+        study_execution._gpu(tmp_path, fcntl.LOCK_SH),
+        study_execution._gpu(tmp_path, fcntl.LOCK_SH),
+    ):
+        waiting.start()
+        waiting.join(timeout=0.2)
+        order.append("compiled")
+    waiting.join(timeout=10)
+    assert order == ["compiled", "clock"]
 
 
 @pytest.mark.slow
