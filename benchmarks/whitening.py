@@ -2,7 +2,7 @@
 
 One actor maximizes the return with gradients of the physics over short windows. The
 table has the return of its policy, without noise, from a start state that it has not
-seen:
+seen, how long the robot stays up, and how far it gets:
 
     python benchmarks/whitening.py humanoid_uni --updates 200
 """
@@ -10,6 +10,7 @@ seen:
 from __future__ import annotations
 
 import argparse
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +24,6 @@ from newton_qd.qd.emitters.actor_critic_learner import ActorCritic, measure_of
 from newton_qd.qd.emitters.actor_critic_settings import ActorCriticSettings
 from newton_qd.qd.emitters.whitening import Whitening
 from newton_qd.qd.scoring.networks import policy_for
-from newton_qd.qd.scoring.rollout import make_scoring_function
 
 SETTINGS = ActorCriticSettings(
     worlds=64, window=32, rate=2e-3, discount=0.99, actor_trace=0.95, epochs=4
@@ -31,8 +31,24 @@ SETTINGS = ActorCriticSettings(
 LENGTH = 250
 
 
+def walk(env: Any, act: Any, key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Return of an episode, its steps before a fall, and the way of the torso [m]."""
+
+    def step(state: Any, _: None) -> tuple[Any, tuple[Any, ...]]:
+        after = env.step(state, act(state.obs))
+        place = after.pipeline_state.torso_xy
+        return after, (after.reward, after.done, place)
+
+    first = env.reset(key)
+    _, (rewards, dones, places) = jax.lax.scan(step, first, length=LENGTH)
+    # the step that ends the episode counts, as in a search
+    up = jnp.cumsum(dones) - dones == 0
+    last = places[up.sum() - 1] - first.pipeline_state.torso_xy
+    return jnp.sum(rewards * up), up.sum(), last[0]
+
+
 def returns(env_name: str, whiten: bool, updates: int, every: int, seed: int) -> list:
-    """Return of the actor's policy after each ``every`` updates."""
+    """What the actor's policy does after each ``every`` updates: see ``walk``."""
     config = EvolveConfig(env_name=env_name, episode_length=LENGTH, hidden=(64, 64))
     task = differentiable(make_task(config), DifferentiableOptions())
     policy = policy_for(task, config.hidden)
@@ -50,12 +66,13 @@ def returns(env_name: str, whiten: bool, updates: int, every: int, seed: int) ->
     aim = jnp.zeros(1 + task.descriptor_length).at[0].set(1)
     actor = method.begin(keys[2], policy.init(keys[3]), aim, worlds)
     update = jax.jit(method.update)
-    score = jax.jit(make_scoring_function(task, policy, LENGTH))
+    try_out = jax.jit(
+        lambda weights: walk(task.env, lambda o: policy.of_weights(weights, o), keys[4])
+    )
     found = []
     for number in range(updates + 1):
         if number % every == 0:
-            weights = white.plain(actor.weights, scale)
-            found.append(float(score(weights[None], keys[4])[0][0]))
+            found.append(try_out(white.plain(actor.weights, scale)))
         actor, _ = update(actor, scale, jax.random.fold_in(keys[5], number))
     return found
 
@@ -70,9 +87,13 @@ def main() -> None:
     args = parser.parse_args()
     given = args.updates, args.every, args.seed
     pair = [returns(args.env_name, whiten, *given) for whiten in (False, True)]
-    print("| updates | plain | whitened |\n|---|---|---|")
-    for index, (plain, whitened) in enumerate(zip(*pair, strict=True)):
-        print(f"| {index * args.every} | {plain:.0f} | {whitened:.0f} |")
+    print(
+        "| updates | plain: return | steps | way [m] | whitened: return | steps | way |"
+    )
+    print("|---" * 7 + "|")
+    for index, rows in enumerate(zip(*pair, strict=True)):
+        cells = [f"{score:.0f} | {steps} | {way:.1f}" for score, steps, way in rows]
+        print(f"| {index * args.every} | {' | '.join(cells)} |")
 
 
 if __name__ == "__main__":
