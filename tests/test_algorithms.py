@@ -167,6 +167,14 @@ def test_what_does_not_exist_is_refused(tmp_path: Path) -> None:
     assert not out.exists()
 
 
+@pytest.mark.parametrize("probes", [0, 4])
+def test_probes_are_shared_equally(probes: int) -> None:
+    options = {"probes": probes, "points": 2}
+    config = SMALL.replace(algorithm="cma-maega-actor-critic", options=options)
+    with pytest.raises(ConfigError, match=f"probes: got {probes}, .* multiples of 3"):
+        run(config)
+
+
 def test_shares_of_a_batch_that_do_not_fit_are_refused() -> None:
     for options in ({"ga_batch_size": 9}, {"dcrl_batch_size": 5, "ga_batch_size": 12}):
         config = SMALL.replace(algorithm="dcrl-me", options=options)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import jax
@@ -165,6 +166,17 @@ def test_task() -> None:
     before, after = jax.tree.map(np.asarray, play(env)(state, actions))
     metrics = is_the_originals(before, after)
     assert metrics["hits"][0, 4:].all() and not metrics["hits"][0, :4].any()
+
+
+def test_the_largest_actions_are_no_fault() -> None:
+    """Every corner of the palm's range, held, and fingers that switch at random."""
+    env, rng, worlds = make("grasp"), np.random.default_rng(0), 27
+    actions = rng.choice([-1.0, 1.0], (40, worlds, 19)).astype(np.float32)
+    actions[..., 16:] = list(itertools.product((-1, 0, 1), repeat=3))
+    state = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), worlds))
+    _, after = play(env)(state, actions)
+    assert not np.any(after.info["fault"])
+    assert np.abs(after.pipeline_state.v).max() < 50
 
 
 def test_reset() -> None:

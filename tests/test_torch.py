@@ -7,6 +7,7 @@ import importlib
 import re
 import runpy
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, cast
 
@@ -29,8 +30,12 @@ def test_a_missing_torch_says_its_command(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 @pytest.fixture(scope="module")
-def torch() -> Any:
-    return pytest.importorskip("torch")
+def torch(device: Any) -> Iterator[Any]:
+    """PyTorch, which makes its tensors where JAX computes."""
+    found = pytest.importorskip("torch")
+    found.set_default_device("cpu" if device.platform == "cpu" else "cuda")
+    yield found
+    found.set_default_device("cpu")
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +71,7 @@ def test_memory_is_shared(torch: Any, door: Any) -> None:
     assert array.unsafe_buffer_pointer() == tensor.data_ptr()
     back = door.to_torch(array)
     assert back.data_ptr() == tensor.data_ptr()
-    assert np.array_equal(door.to_jax(tensor.T), tensor.T.numpy()), "gaps: copied"
+    assert np.array_equal(door.to_jax(tensor.T), tensor.T.cpu().numpy()), "gaps: copied"
     key = jax.random.key(0)
     assert door.to_torch(key) is key and door.to_jax(key) is key
 
@@ -80,7 +85,7 @@ def test_the_numbers_are_those_of_env_step(torch: Any, door: Any, maze: Any) -> 
     assert same(plain, wanted)
     for number in range(6):
         actions = torch.linspace(-1, 1, 2 * WORLDS).reshape(WORLDS, 2) / (1 + number)
-        wanted = env_step(wanted, np.asarray(actions))
+        wanted = env_step(wanted, actions.cpu().numpy())
         plain = step(plain, actions)
         graph = step(graph, actions.clone().requires_grad_())
         assert same(plain, wanted) and same(graph, wanted)
@@ -121,7 +126,7 @@ def test_gradients_are_those_of_jax(torch: Any, door: Any, hopper: Any) -> None:
     for tensor, slope in zip((q, plan), slopes, strict=True):
         scale = float(jnp.abs(slope).max())
         assert scale > 0.1
-        error = np.abs(tensor.grad.numpy() - np.asarray(slope)).max()
+        error = np.abs(tensor.grad.cpu().numpy() - np.asarray(slope)).max()
         assert error < 1e-6 * scale
 
 
@@ -135,7 +140,7 @@ def test_a_gradient_of_every_part(torch: Any, door: Any, maze: Any) -> None:
     slope = jax.grad(lambda a: maze.step(start, a).reward.sum())
     start = maze.reset(jax.random.key(0))
     expected = slope(np.full((WORLDS, 2), 0.3, np.float32))
-    assert np.allclose(actions.grad.numpy(), expected, rtol=1e-6, atol=0)
+    assert np.allclose(actions.grad.cpu().numpy(), expected, rtol=1e-6, atol=0)
     cut = door.detached(step(first, actions))
     assert not any(leaf.requires_grad for leaf in jax.tree.leaves(cut))
     observed = first.replace(obs=first.obs.clone().requires_grad_())

@@ -39,12 +39,15 @@ class Grasp(Servos, MovingTarget):
     An action from -1 to 1 is the target angle of a hinge of the fingers, from the lower
     to the upper end of its range. The last three actions are the target place of the
     palm: x and y from -10 to 10 m, z from 3.5 to 13.5 m. In each step, the palm goes
-    15 % of the way to it, and at most 0.3 m. Other actions are clipped.
+    15 % of the way to it, but never more than 0.3 m. Actions beyond -1 and 1 are
+    clipped.
 
     Observation: ``observation_layout``. Reward: 1.5 times the way of the object towards
-    the target, 5 when the object is within 1.1 m of the target, and small rewards for a
-    hand that moves to the object, is above it, and touches it with the tip of finger 1.
-    A target that was reached moves to a random place. Never done.
+    the target, and 5 when the object is within 1.1 m of the target. There are three
+    small rewards: for a hand that moves to the object, for a palm above it, and for the
+    tip of finger 1 that touches it. A target that was reached moves to a random place.
+    The first target is next to the object, so the first step reaches it, as in the
+    original. Never done.
 
     Metrics:
         hits: 1 if the target was reached, else 0.

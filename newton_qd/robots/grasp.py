@@ -45,6 +45,7 @@ GRASP = RobotSpec(
     dt=0.02,
     substeps=4,
     gravity=9.8,
-    # friction is that of a pair
-    material=Material(friction=0.6, support=4),
+    # friction is that of a pair; contacts carry the object alone, a fourteenth of the
+    # weight, so they are softer than for a robot that stands
+    material=Material(friction=0.6, support=16),
 )

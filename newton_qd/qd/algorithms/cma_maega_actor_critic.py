@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+from newton_qd.checks import message
 from newton_qd.qd.algorithms.cma_mega import population_of
 from newton_qd.qd.algorithms.gradient_options import (
     SHORT,
@@ -13,7 +14,7 @@ from newton_qd.qd.algorithms.gradient_options import (
     initial_scale,
 )
 from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext
-from newton_qd.qd.config import EvolveConfig
+from newton_qd.qd.config import ConfigError, EvolveConfig
 from newton_qd.qd.emitters.actor_critic_settings import ActorCriticSettings
 
 # A fall ends an episode, and a gradient over a window does not see it. Humanoids fall
@@ -29,8 +30,9 @@ class ArborescenceActorOptions(DifferentiableOptions, ActorCriticSettings):
         points: Number of solution points that share a generation equally.
         sigma_g: Initial standard deviation of the coefficients of the gradients, which
             have length 1, in units of policy weights [-].
-        probes: Updates of a generation that find the gradients of a point; fitness and
-            components of the descriptor share them.
+        probes: Updates of a generation that find the gradients of a point. Fitness and
+            the D components of the descriptor get equal parts, so it is a multiple of
+            1 + D.
         walks: Updates of a generation that move a point.
         restart_period: Restart each point after this many generations; 0: only by its
             restart rule.
@@ -39,11 +41,11 @@ class ArborescenceActorOptions(DifferentiableOptions, ActorCriticSettings):
 
     points: int = 4
     sigma_g: float = 0.3
-    probes: int = 6
+    probes: int = 30
     walks: int = 4
     restart_period: int = 0
     learning_rate: float = 0.1
-    worlds: int = 32
+    worlds: int = 16
     window: int = 32
     rate: float = 2e-3
     discount: float = 0.99
@@ -60,7 +62,8 @@ def _make(context: EmitterContext, options: ArborescenceActorOptions) -> Any:
     """CMA-MAEGA as in PPGA, with the short-horizon actor-critic.
 
     Raises:
-        ConfigError: A generation cannot be divided by the number of points.
+        ConfigError: A generation cannot be divided by the number of points, or
+            ``probes`` by the number of gradients.
     """
     from newton_qd.qd.emitters import ActorCritic, WindowArborescenceEmitter
     from newton_qd.qd.emitters.actor_critic_learner import measure_of
@@ -77,12 +80,16 @@ def _make(context: EmitterContext, options: ArborescenceActorOptions) -> Any:
         options,
         Whitening.of(policy) if options.whiten else Whitening(),
     )
-    each = options.probes // (1 + task.descriptor_length)
+    each, rest = divmod(options.probes, 1 + task.descriptor_length)
+    if rest or not each:
+        why = f"which fitness and {task.descriptor_length} descriptors share equally"
+        allowed = f"multiples of {1 + task.descriptor_length}"
+        raise ConfigError(message("options: probes", options.probes, allowed, why=why))
     emitter = WindowArborescenceEmitter(
         context.score,
         method,
         task.env.reset(context.reset_key),
-        probes=max(1, each),
+        probes=each,
         walks=options.walks,
         sigma_g=options.sigma_g,
         batch_size=population_of(options.points, config),
