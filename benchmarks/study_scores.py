@@ -190,17 +190,16 @@ def verdict(results: Results, stop: str) -> str:
         "|---|---|---|---|---|",
     ]
     for task in sorted({key[0] for key in results}):
-        few = False
-        sides: list[list[tuple[float, float, float, str]]] = [[], []]
+        sides: list[list[tuple[float, float, float, str, int]]] = [[], []]
         for (own, algorithm, at), runs in results.items():
             if (own, at) == (task, stop) and "@" not in algorithm:
                 found = [float(run.line["corrected_qd_score"]) for run in runs]
                 scores = interval([np.asarray(found)])
-                sides[algorithm not in OURS].append((*scores, algorithm))
-                few = few or len(runs) < LEAST_SEEDS
+                sides[algorithm not in OURS].append((*scores, algorithm, len(runs)))
         if not all(sides):
             continue
         ours, other = (max(side) for side in sides)
+        few = min(ours[4], other[4]) < LEAST_SEEDS
         apart = ours[1] > other[2] or ours[2] < other[1]
         ratio = ours[0] / other[0] if other[0] > 0 else np.inf
         cells = [f"{x[3]} {x[0]:,.0f}" for x in (ours, other)]
@@ -250,20 +249,21 @@ def figure(results: Results, stop: str, path: Path) -> None:
     drawing, panels = plt.subplots(
         -(-len(limits) // columns), columns, figsize=size, squeeze=False
     )
+    drawn = {}  # not every algorithm is in every panel
     for panel, (task, (low, high)) in zip(panels.flat, limits.items(), strict=False):
         for color, name in enumerate(names):
             if runs := results.get((task, name, stop)):
                 thresholds = low + LEVELS * (high - low)
                 shares = [quality.ccdf(run.corrected, thresholds) for run in runs]
                 mean = np.mean(shares, axis=0)
-                panel.plot(LEVELS, mean, color=f"C{color}", label=name, linewidth=1.2)
+                drawn[name] = panel.plot(LEVELS, mean, f"C{color}", linewidth=1.2)[0]
         panel.set_title(task, fontsize=9)
         panel.tick_params(labelsize=7)
         panel.set_xlabel("normalized fitness", fontsize=8)
     for panel in list(panels.flat)[len(limits) :]:
         panel.axis("off")
     panels[0, 0].set_ylabel("cells at least as fit [%]", fontsize=8)
-    panels.flat[0].legend(fontsize=7)
+    panels.flat[0].legend(drawn.values(), drawn.keys(), fontsize=7)
     drawing.tight_layout()
     path.parent.mkdir(parents=True, exist_ok=True)
     drawing.savefig(path, dpi=120)
