@@ -108,7 +108,7 @@ def test_gradients_are_those_of_jax(torch: Any, door: Any, env: Any) -> None:
     for stream in (torch.cuda.Stream(), torch.cuda.current_stream()):
         with torch.cuda.stream(stream):
             plan = torch.as_tensor(values(env)[:8], device="cuda").requires_grad_()
-            state, loss = reset(0), 0.0
+            state, loss = reset(0), torch.zeros((), device="cuda")
             for row in plan:
                 state = step(state, row)
                 loss = loss + state.reward.sum() + state.obs.sum()

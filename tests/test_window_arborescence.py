@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import inspect
 import itertools
 from typing import Any
 
@@ -23,7 +24,7 @@ POINTS, EACH, PERIOD = 2, 8, 4
 def score(genotypes: jax.Array, key: jax.Array) -> tuple[Any, Any, dict[str, Any]]:
     del key
     # a program inside of another one has no options of its own
-    fitnesses, found = jax.vmap(play.__wrapped__)(genotypes)
+    fitnesses, found = jax.vmap(inspect.unwrap(play))(genotypes)
     return fitnesses, found, {}
 
 
