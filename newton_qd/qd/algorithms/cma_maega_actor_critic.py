@@ -7,15 +7,10 @@ from typing import Any
 
 from newton_qd.checks import message
 from newton_qd.qd.algorithms.cma_mega import population_of
-from newton_qd.qd.algorithms.gradient_options import (
-    SHORT,
-    DifferentiableOptions,
-    differentiable,
-    initial_scale,
-)
+from newton_qd.qd.algorithms.gradient_options import SHORT, initial_scale
+from newton_qd.qd.algorithms.learning import LearningOptions, learning_method
 from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext
 from newton_qd.qd.config import ConfigError, EvolveConfig
-from newton_qd.qd.emitters.actor_critic_settings import ActorCriticSettings
 
 # A fall ends an episode, and a gradient over a window does not see it. Humanoids fall
 # too, but slowly.
@@ -23,7 +18,7 @@ _SMALL_STEPS = {"rate": 3e-4, "sigma_g": 0.1}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ArborescenceActorOptions(DifferentiableOptions, ActorCriticSettings):
+class ArborescenceActorOptions(LearningOptions):
     """Options of CMA-MAEGA with actors that learn over short windows.
 
     Attributes:
@@ -65,21 +60,10 @@ def _make(context: EmitterContext, options: ArborescenceActorOptions) -> Any:
         ConfigError: A generation cannot be divided by the number of points, or
             ``probes`` by the number of gradients.
     """
-    from newton_qd.qd.emitters import ActorCritic, WindowArborescenceEmitter
-    from newton_qd.qd.emitters.actor_critic_learner import measure_of
+    from newton_qd.qd.emitters import WindowArborescenceEmitter
     from newton_qd.qd.emitters.annealed import OnAnnealedRepertoire
-    from newton_qd.qd.emitters.whitening import Whitening
 
-    config, policy = context.config, context.policy
-    task = differentiable(context.task, options)
-    method = ActorCritic(
-        task.env,
-        policy.of_weights,
-        measure_of(task),
-        config.episode_length,
-        options,
-        Whitening.of(policy) if options.whiten else Whitening(),
-    )
+    config, (task, method) = context.config, learning_method(context, options)
     each, rest = divmod(options.probes, 1 + task.descriptor_length)
     if rest or not each:
         why = f"which fitness and {task.descriptor_length} descriptors share equally"

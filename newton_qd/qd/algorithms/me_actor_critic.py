@@ -6,19 +6,15 @@ import dataclasses
 from typing import Any
 
 from newton_qd.checks import message
-from newton_qd.qd.algorithms.gradient_options import (
-    DifferentiableOptions,
-    differentiable,
-    initial_scale,
-)
+from newton_qd.qd.algorithms.gradient_options import initial_scale
+from newton_qd.qd.algorithms.learning import LearningOptions, learning_method
 from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext
 from newton_qd.qd.algorithms.variation import with_isoline
 from newton_qd.qd.config import ConfigError, EvolveConfig
-from newton_qd.qd.emitters.actor_critic_settings import ActorCriticSettings
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ActorCriticOptions(DifferentiableOptions, ActorCriticSettings):
+class ActorCriticOptions(LearningOptions):
     """Options of MAP-Elites with actors that learn with gradients of the physics.
 
     Attributes:
@@ -52,20 +48,9 @@ def _make(context: EmitterContext, options: ActorCriticOptions) -> Any:
     Raises:
         ConfigError: The actors have more offspring than a generation can contain.
     """
-    from newton_qd.qd.emitters import ActorCritic, ActorCriticEmitter
-    from newton_qd.qd.emitters.actor_critic_learner import measure_of
-    from newton_qd.qd.emitters.whitening import Whitening
+    from newton_qd.qd.emitters import ActorCriticEmitter
 
-    config, policy = context.config, context.policy
-    task = differentiable(context.task, options)
-    method = ActorCritic(
-        task.env,
-        policy.of_weights,
-        measure_of(task),
-        config.episode_length,
-        options,
-        Whitening.of(policy) if options.whiten else Whitening(),
-    )
+    config, (task, method) = context.config, learning_method(context, options)
     emitter = ActorCriticEmitter(
         method,
         task.env.reset(context.reset_key),
