@@ -249,22 +249,40 @@ def checked(
     args.algorithms = args.algorithms or list(
         protocol.algorithms if protocol else ALGORITHMS
     )
-    for name, known in (
-        ("tasks", protocol.tasks if protocol else TASKS),
-        ("algorithms", protocol.algorithms if protocol else args.algorithms),
-    ):
-        unknown = sorted(set(getattr(args, name)) - set(known))
+    known = {
+        "tasks": protocol.tasks if protocol else TASKS,
+        "algorithms": protocol.algorithms if protocol else _core_algorithms(),
+    }
+    for name, allowed in known.items():
+        unknown = sorted(set(getattr(args, name)) - set(allowed))
         if unknown:
-            parser.error(f"--{name}: got {', '.join(unknown)}; allowed: {known}")
+            parser.error(
+                f"--{name}: got {', '.join(unknown)}; allowed: {', '.join(allowed)}"
+            )
     unknown = sorted(set(args.variants or ()) - set(study_runs.variants()))
     if protocol and unknown:
         allowed = ", ".join(study_runs.variants())
         parser.error(f"--variants: got {', '.join(unknown)}; allowed: {allowed}")
     if args.seeds is None:
         args.seeds = protocol.seeds if protocol else 5
-    if protocol and args.until is None:
-        args.until = max(x.amount for x in protocol.stops if x.unit == "s")
+    if args.until is None:
+        stops = protocol.stops if protocol else ()
+        args.until = max((x.amount for x in stops if x.unit == "s"), default=math.inf)
+    for name in ("seeds", "gpus", "workers"):
+        value = getattr(args, name)
+        if value < 1:
+            parser.error(f"--{name}: got {value}; allowed: an integer from 1")
+    for name in ("seconds", "until", "stop_after", "start_until"):
+        value = getattr(args, name)
+        if not value > 0:
+            option = name.replace("_", "-")
+            parser.error(f"--{option}: got {value}; allowed: a number above 0")
     return args
+
+
+def _core_algorithms() -> list[str]:
+    """Algorithms that have a variant in the protocol ``core``."""
+    return list(dict.fromkeys(name.split("@")[0] for name in read("variants")))
 
 
 def planned(args: argparse.Namespace) -> list[tuple[Run, Path]]:

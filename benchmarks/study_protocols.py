@@ -46,8 +46,8 @@ class Protocol:
         stops: Points at which the scores are read; the last ends a run.
         seeds: Number of seeds.
         slow_seeds: Number of seeds of the slow baselines.
-        variant: Variant of an algorithm that runs without tuning; 0: the defaults of
-            ``newton-qd evolve``.
+        defaults: Whether algorithms have the defaults of ``newton-qd evolve`` without
+            tuning. If not, they have the first variant for the task.
     """
 
     name: str
@@ -58,7 +58,7 @@ class Protocol:
     stops: tuple[Stop, ...]
     seeds: int
     slow_seeds: int
-    variant: int = 1
+    defaults: bool = False
 
     def settings_of(self, task: str) -> dict[str, Any]:
         """Settings of the runs of a task."""
@@ -125,7 +125,7 @@ SMALL = Protocol(
     stops=(Stop("evaluations", 20_000), Stop("s", 20), Stop("s", 60)),
     seeds=3,
     slow_seeds=1,
-    variant=0,
+    defaults=True,
 )
 """The same episodes and cells, for minutes on a core of a CPU, with the defaults."""
 

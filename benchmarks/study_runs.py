@@ -51,10 +51,18 @@ class Run:
 
 def variants() -> dict[str, dict[str, Any]]:
     """Returns the settings of all variants; number 0 has the defaults of ``evolve``."""
-    with VARIANTS.open("rb") as file:
-        found = tomllib.load(file)
+    found = {
+        name: {key: value for key, value in given.items() if key != "tasks"}
+        for name, given in _file().items()
+    }
     algorithms = dict.fromkeys(name.split("@")[0] for name in found)
     return {**found, **{f"{algorithm}@0": {} for algorithm in algorithms}}
+
+
+def _file() -> dict[str, dict[str, Any]]:
+    """Returns the content of ``field.toml``."""
+    with VARIANTS.open("rb") as file:
+        return tomllib.load(file)
 
 
 def lines(out: Path) -> list[dict[str, str]]:
@@ -82,14 +90,14 @@ def best_variant(tuning: Path, task: str, algorithm: str) -> str:
     return max(scores, key=lambda name: scores[name])
 
 
-def numbered(algorithm: str) -> list[str]:
-    """Returns the variants of an algorithm that tuning tries; others are ablations."""
-    names = [name.split("@") for name in variants()]
-    return [
-        f"{algorithm}@{number}"
-        for own, number in names
-        if own == algorithm and number.isdigit() and number != "0"
-    ]
+def numbered(algorithm: str, task: str) -> list[str]:
+    """Returns the variants that tuning tries on a task; others are ablations."""
+    found = []
+    for name, given in _file().items():
+        own, number = name.split("@")
+        if own == algorithm and number.isdigit() and task in given.get("tasks", [task]):
+            found.append(name)
+    return found
 
 
 @dataclasses.dataclass(frozen=True)
@@ -139,15 +147,18 @@ def planned(protocol: Protocol, choice: Choice) -> list[Run]:
         return [
             Run(task, variant, TUNING_SEED)
             for task, algorithm in kinds
-            for variant in numbered(algorithm)
+            for variant in numbered(algorithm, task)
         ]
     found = []
     for seed in range(choice.seeds):
         for task, algorithm in kinds:
             if seed < protocol.seeds_of(algorithm):
-                chosen = f"{algorithm}@{protocol.variant}"
                 if choice.tuned:
                     chosen = best_variant(choice.tuned, task, algorithm)
+                elif protocol.defaults:
+                    chosen = f"{algorithm}@0"
+                else:
+                    chosen = numbered(algorithm, task)[0]
                 found.append(Run(task, chosen, seed))
     return found
 

@@ -15,6 +15,7 @@ from newton_qd.qd.config import EvolveConfig
 FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
 sys.path.insert(0, str(FOLDER))
 
+import study  # noqa: E402
 import study_runs  # noqa: E402
 import study_scores  # noqa: E402
 from study_protocols import BASELINES, FIELD, HUMANOIDS, PROTOCOLS, SMALL, Stop  # noqa: E402
@@ -61,16 +62,23 @@ def test_every_variant_is_a_setting(protocol: Any) -> None:
     assert protocol.settings_of(TASK)["hidden"] == [64, 64]
 
 
-def test_baselines_get_as_many_variants() -> None:
-    ours = max(len(study_runs.numbered(name)) for name in study_scores.OURS)
-    others = [len(study_runs.numbered(name)) for name in BASELINES]
-    assert ours <= min(others) == 4
+@pytest.mark.parametrize("task", FIELD.tasks)
+def test_baselines_get_as_many_variants(task: str) -> None:
+    ours = [len(study_runs.numbered(name, task)) for name in study_scores.OURS]
+    others = [len(study_runs.numbered(name, task)) for name in BASELINES]
+    assert 1 <= min(ours) and max(ours) <= min(others) == 4
+
+
+def test_variants_name_tasks_of_the_protocol() -> None:
+    for name, given in study_runs._file().items():
+        assert set(given.get("tasks", ())) <= set(FIELD.tasks), name
+        assert "tasks" not in study_runs.variants()[name]
 
 
 def test_ablations_are_run_by_name(tmp_path: Path) -> None:
     name = "me-conditioned@no-copies"
     assert name in study_runs.variants()
-    assert name not in study_runs.numbered("me-conditioned")
+    assert name not in study_runs.numbered("me-conditioned", TASK)
     assert left(tmp_path, variants=[name], seeds=1) == [f"{TASK}.{name}.0"]
 
 
@@ -99,6 +107,16 @@ def left(out: Path, until: float = 60, **given: Any) -> list[str]:
     choice = study_runs.Choice(until=until, **{**options, **given})
     found = study_runs.missing(SMALL, out, choice)
     return [str(run) for run in found]
+
+
+def test_without_tuning_the_first_variant_runs(tmp_path: Path) -> None:
+    choice = study_runs.Choice(
+        tasks=["ant_uni", TASK], algorithms=["me-actor-critic"], seeds=1, until=60
+    )
+    found = [run.variant for run in study_runs.planned(FIELD, choice)]
+    assert found == ["me-actor-critic@1", "me-actor-critic@3"]
+    found = [run.variant for run in study_runs.planned(SMALL, choice)]
+    assert found == ["me-actor-critic@0"] * 2
 
 
 def test_finished_runs_are_left_out(tmp_path: Path) -> None:
@@ -159,3 +177,26 @@ def test_the_report_compares_corrected_archives(
     assert "| 1.02 | apart |" in content
     assert "| hopper_uni | me | 3 | 51 (51 to 51) | 0.0625 (0.0625 to" in content
     assert interval([np.array([1.0, 1.0])]) == (1.0, 1.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["--seeds", "0"], "--seeds: got 0; allowed: an integer from 1"),
+        (["--workers", "-1"], "--workers: got -1; allowed: an integer from 1"),
+        (["--stop-after", "nan"], "--stop-after: got nan; allowed: a number above 0"),
+        (["--tasks", "ant"], "--tasks: got ant; allowed: ant_uni, "),
+        (["--algorithms", "ga"], "--algorithms: got ga; allowed: me, "),
+        (["--protocol", "small", "--tasks", "ant"], "--tasks: got ant; allowed: "),
+    ],
+)
+def test_wrong_words_are_refused(
+    words: list[str],
+    text: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["study.py", *words])
+    with pytest.raises(SystemExit):
+        study.arguments()
+    assert text in capsys.readouterr().err
