@@ -15,6 +15,7 @@ import argparse
 import csv
 import dataclasses
 import itertools
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -60,19 +61,31 @@ Results = dict[Key, list[Scored]]
 def load(folder: Path) -> Results:
     """Reads the runs of a folder; the seed of the tuning is left out.
 
-    An ablation is named by its variant, as if it were an algorithm.
+    The variant of an algorithm with the most runs on a task has the algorithm's name.
+    Others have their own, as if they were algorithms of their own.
     """
+    kept = [line for line in lines(folder) if int(line["seed"]) != TUNING_SEED]
+    main = _main_variants(kept)
     found: Results = {}
-    for line in lines(folder):
+    for line in kept:
         name = f"{line['task']}.{line['variant']}.{line['seed']}.npz"
         cells = np.load(folder / "cells" / name)[line["stop"]].astype(np.float64)
-        own = line["variant"].split("@")[1].isdigit()
+        own = main.get((line["task"], line["algorithm"])) == line["variant"]
         key = line["task"], line["algorithm" if own else "variant"], line["stop"]
-        seed = int(line["seed"])
-        if seed == TUNING_SEED:
-            continue
-        found.setdefault(key, []).append(Scored(seed, line, *cells))
+        found.setdefault(key, []).append(Scored(int(line["seed"]), line, *cells))
     return found
+
+
+def _main_variants(kept: list[dict[str, str]]) -> dict[tuple[str, str], str]:
+    """Returns the variant with the most lines, by task and algorithm; no ablations."""
+    counts = Counter(
+        (line["task"], line["algorithm"], line["variant"])
+        for line in kept
+        if line["variant"].split("@")[1].isdigit()
+    )
+    # later keys replace earlier ones
+    ordered = sorted(counts, key=lambda key: counts[key])
+    return {key[:2]: key[2] for key in ordered}
 
 
 def best_known() -> dict[str, float]:
@@ -235,7 +248,10 @@ def published(results: Results) -> str:
 
 
 def figure(results: Results, stop: str, path: Path) -> None:
-    """Plots the distribution of the corrected normalized fitness over cells."""
+    """Plots the distribution of the corrected normalized fitness over cells.
+
+    Ablations and other variants are left out.
+    """
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -243,7 +259,7 @@ def figure(results: Results, stop: str, path: Path) -> None:
 
     there = {key[0] for key in results if key[2] == stop}
     limits = {k: v for k, v in references(results).items() if k in there}
-    names = sorted({key[1] for key in results})
+    names = sorted({key[1] for key in results if "@" not in key[1]})
     columns = min(4, len(limits))
     size = (3.2 * columns, 2.6 * -(-len(limits) // columns))
     drawing, panels = plt.subplots(

@@ -140,6 +140,22 @@ def test_tuning_chooses_the_corrected_score(tmp_path: Path) -> None:
         study_runs.best_variant(tmp_path, TASK, "pga-me")
 
 
+def test_the_variant_with_most_runs_has_the_name(tmp_path: Path) -> None:
+    (tmp_path / "cells").mkdir()
+    runs = (("me@1", 0), ("me@3", 0), ("me@3", 1), ("me@3", 1000), ("me@cut", 0))
+    for variant, seed in runs:
+        cells: dict[str, Any] = {"20 s": np.ones((2, CELLS))}
+        np.savez(tmp_path / "cells" / f"{TASK}.{variant}.{seed}.npz", **cells)
+        row = line("me", seed, "20 s") | {"variant": variant}
+        study_runs.add_line(tmp_path / "runs.csv", row)
+    found = study_scores.load(tmp_path)
+    assert {key[1]: [run.seed for run in runs] for key, runs in found.items()} == {
+        "me": [0, 1],
+        "me@1": [0],
+        "me@cut": [0],
+    }
+
+
 def test_the_best_known_fitness_only_rises(tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.setattr(study_scores, "BEST_KNOWN", tmp_path / "best_known.csv")
     for best in (4.0, 2.0):
