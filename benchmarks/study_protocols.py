@@ -47,7 +47,7 @@ class Protocol:
         seeds: Number of seeds.
         slow_seeds: Number of seeds of the slow baselines.
         defaults: Whether algorithms have the defaults of ``newton-qd evolve`` without
-            tuning. If not, they have the first variant for the task.
+            tuning. If not, they have the variant of the report.
     """
 
     name: str

@@ -52,7 +52,7 @@ class Run:
 def variants() -> dict[str, dict[str, Any]]:
     """Returns the settings of all variants; number 0 has the defaults of ``evolve``."""
     found = {
-        name: {key: value for key, value in given.items() if key != "tasks"}
+        name: {key: given[key] for key in given.keys() - {"tasks", "chosen"}}
         for name, given in _file().items()
     }
     algorithms = dict.fromkeys(name.split("@")[0] for name in found)
@@ -100,6 +100,12 @@ def numbered(algorithm: str, task: str) -> list[str]:
     return found
 
 
+def chosen(algorithm: str, task: str) -> str:
+    """Returns the variant that the report has for a task, or else the first one."""
+    names, file = numbered(algorithm, task), _file()
+    return next((x for x in names if task in file[x].get("chosen", ())), names[0])
+
+
 @dataclasses.dataclass(frozen=True)
 class Choice:
     """Which runs of a protocol a command asks for.
@@ -110,7 +116,8 @@ class Choice:
         seeds: Largest number of seeds.
         until: Longest time of a run [s].
         tune: Whether to run every variant with the seed of the tuning.
-        tuned: Folder of the tuning; ``None``: the protocol's variant of each algorithm.
+        tuned: Folder of the tuning; ``None``: the variants of the report, or for a
+            protocol with defaults those.
         variants: Variants to run instead of the algorithms; ``None``: none.
     """
 
@@ -154,12 +161,12 @@ def planned(protocol: Protocol, choice: Choice) -> list[Run]:
         for task, algorithm in kinds:
             if seed < protocol.seeds_of(algorithm):
                 if choice.tuned:
-                    chosen = best_variant(choice.tuned, task, algorithm)
+                    variant = best_variant(choice.tuned, task, algorithm)
                 elif protocol.defaults:
-                    chosen = f"{algorithm}@0"
+                    variant = f"{algorithm}@0"
                 else:
-                    chosen = numbered(algorithm, task)[0]
-                found.append(Run(task, chosen, seed))
+                    variant = chosen(algorithm, task)
+                found.append(Run(task, variant, seed))
     return found
 
 

@@ -109,14 +109,17 @@ def left(out: Path, until: float = 60, **given: Any) -> list[str]:
     return [str(run) for run in found]
 
 
-def test_without_tuning_the_first_variant_runs(tmp_path: Path) -> None:
+def test_without_tuning_the_variants_of_the_report_run() -> None:
+    reported = study_runs.lines(FOLDER / "results" / "field")
+    for (task, algorithm), variant in study_scores._main_variants(reported).items():
+        assert study_runs.chosen(algorithm, task) == variant
     choice = study_runs.Choice(
-        tasks=["ant_uni", TASK], algorithms=["me-actor-critic"], seeds=1, until=60
+        tasks=[TASK], algorithms=["me", "me-actor-critic"], seeds=1, until=60
     )
     found = [run.variant for run in study_runs.planned(FIELD, choice)]
-    assert found == ["me-actor-critic@1", "me-actor-critic@3"]
+    assert found == ["me@1", "me-actor-critic@4"]
     found = [run.variant for run in study_runs.planned(SMALL, choice)]
-    assert found == ["me-actor-critic@0"] * 2
+    assert found == ["me@0", "me-actor-critic@0"]
 
 
 def test_finished_runs_are_left_out(tmp_path: Path) -> None:
@@ -204,6 +207,9 @@ def test_the_report_compares_corrected_archives(
         (["--tasks", "ant"], "--tasks: got ant; allowed: ant_uni, "),
         (["--algorithms", "ga"], "--algorithms: got ga; allowed: me, "),
         (["--protocol", "small", "--tasks", "ant"], "--tasks: got ant; allowed: "),
+        (["--protocol", "small", "--run", "ant", "me@1", "0", "x"], "--run: got ant"),
+        (["--protocol", "small", "--run", TASK, "ga@1", "0", "x"], "--run: got ga@1"),
+        (["--protocol", "small", "--run", TASK, "me@1", "a", "x"], "--run: got a; "),
     ],
 )
 def test_wrong_words_are_refused(
