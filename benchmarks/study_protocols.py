@@ -116,8 +116,8 @@ FIELD = Protocol(
 SMALL = Protocol(
     name="small",
     tasks=(
-        *("ant_uni", "ant_omni", "anttrap", "halfcheetah_uni"),
-        *("hopper_uni", "walker2d_uni", "humanoid_uni"),
+        *("ant_uni", "ant_omni", "anttrap", "antmaze"),
+        *("halfcheetah_uni", "hopper_uni", "walker2d_uni", "humanoid_uni"),
     ),
     algorithms=("me", "ascii-me", *OURS),
     settings={**FIELD.settings, "batch_size": 256, "reevaluations": 4},

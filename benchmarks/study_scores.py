@@ -199,7 +199,7 @@ def table(results: Results, stop: str) -> str:
 def verdict(results: Results, stop: str) -> str:
     """Markdown table: our best algorithm and the best other one of each task."""
     rows = [
-        "| task | ours: corrected QD score | others | ratio | intervals |",
+        "| task | our best: corrected QD score | best other | ratio | intervals |",
         "|---|---|---|---|---|",
     ]
     for task in sorted({key[0] for key in results}):

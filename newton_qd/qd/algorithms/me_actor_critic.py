@@ -43,8 +43,9 @@ class ActorCriticOptions(LearningOptions):
 
 
 # The reward of these mazes is negative, and a fall ends the episode. So an actor that
-# maximizes the reward learns to fall at once.
+# maximizes the reward learns to fall at once. To walk far takes many updates.
 _MAZES = ("antmaze", "antmaze_u", "antmaze_big", "antmaze_hardest", "humanoid_maze")
+_STEERED = {"steered": 1.0, "fitness": 0.0, "lifetime": 60}
 
 
 def _make(context: EmitterContext, options: ActorCriticOptions) -> Any:
@@ -91,7 +92,7 @@ ME_ACTOR_CRITIC = AlgorithmSpec(
     "descriptor; a part of the offspring lies between actors and elites",
     make=_make,
     options=ActorCriticOptions,
-    tuned=dict.fromkeys(_MAZES, {"steered": 1.0, "fitness": 0.0}),
+    tuned=dict.fromkeys(_MAZES, _STEERED),
     evaluations=_evaluations,
     gradients=_gradients,
     initial_scale=initial_scale,
