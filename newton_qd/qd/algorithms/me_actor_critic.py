@@ -42,10 +42,12 @@ class ActorCriticOptions(LearningOptions):
         return -(-updates * self.worlds * self.window // config.episode_length)
 
 
+# To walk far in any direction takes many updates.
+_LONG = {"lifetime": 60}
 # The reward of these mazes is negative, and a fall ends the episode. So an actor that
-# maximizes the reward learns to fall at once. To walk far takes many updates.
+# maximizes the reward learns to fall at once.
 _MAZES = ("antmaze", "antmaze_u", "antmaze_big", "antmaze_hardest", "humanoid_maze")
-_STEERED = {"steered": 1.0, "fitness": 0.0, "lifetime": 60}
+_STEERED = {"steered": 1.0, "fitness": 0.0, **_LONG}
 
 
 def _make(context: EmitterContext, options: ActorCriticOptions) -> Any:
@@ -92,7 +94,7 @@ ME_ACTOR_CRITIC = AlgorithmSpec(
     "descriptor; a part of the offspring lies between actors and elites",
     make=_make,
     options=ActorCriticOptions,
-    tuned=dict.fromkeys(_MAZES, _STEERED),
+    tuned={"ant_omni": _LONG, **dict.fromkeys(_MAZES, _STEERED)},
     evaluations=_evaluations,
     gradients=_gradients,
     initial_scale=initial_scale,
