@@ -29,7 +29,8 @@ continued, see ``study_execution.py``; variants are in ``study/field.toml``:
     python benchmarks/study.py --protocol small --out small
     python benchmarks/study_scores.py small
 
-``--until S`` leaves later stops for another command, which continues the runs.
+``--until S`` leaves later stops for another command, which continues the runs. With
+``--reach-evaluations``, runs go on after that until they have a million evaluations.
 ``--stop-after S`` ends the command in time for a machine that is lent for so long.
 """
 
@@ -63,6 +64,11 @@ def arguments() -> argparse.Namespace:
     )
     parser.add_argument(
         "--until", type=float, help="field, small: longest time of a run [s]"
+    )
+    parser.add_argument(
+        "--reach-evaluations",
+        action="store_true",
+        help="field, small: go on after --until to the number of evaluations",
     )
     parser.add_argument(
         "--stop-after",
@@ -156,6 +162,7 @@ def left(args: argparse.Namespace) -> list[tuple[str, ...]]:
         algorithms=args.algorithms,
         seeds=args.seeds,
         until=args.until,
+        reach=args.reach_evaluations,
         tune=args.tune,
         tuned=args.tuned,
         variants=args.variants,
@@ -175,9 +182,10 @@ def one(args: argparse.Namespace, begin: float) -> None:
         PROTOCOLS[args.protocol],
         study_runs.Run(task, variant, int(seed)),
         Path(out),
-        until=args.until,
-        device=args.device,
-        deadline=begin + args.stop_after,
+        study_execution.Limits(
+            args.until, args.reach_evaluations, begin + args.stop_after
+        ),
+        args.device,
     )
 
 
@@ -204,6 +212,7 @@ def main() -> None:
         if args.protocol != "core":
             more = ["--until", str(args.until)]
             more += ["--stop-after", str(args.stop_after - spent)]
+            more += ["--reach-evaluations"] * args.reach_evaluations
         pool.start(slot, *more, "--run", *what)
     pool.drain()
 

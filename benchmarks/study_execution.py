@@ -46,6 +46,21 @@ class Spent:
         self.processor_s += processor - begin[1]
 
 
+@dataclasses.dataclass(frozen=True)
+class Limits:
+    """When a run ends.
+
+    Attributes:
+        until: Longest time of the run [s].
+        reach: Whether it goes on after that until it has its number of evaluations.
+        deadline: ``time.monotonic()`` after which the run saves its state and ends.
+    """
+
+    until: float
+    reach: bool = False
+    deadline: float = math.inf
+
+
 def now() -> tuple[float, float]:
     """Returns wall-clock and processor time [s]."""
     return time.perf_counter(), time.process_time()
@@ -153,10 +168,8 @@ def execute(
     protocol: Protocol,
     run: Run,
     out: Path,
-    *,
-    until: float,
+    limits: Limits,
     device: str,
-    deadline: float = math.inf,
 ) -> bool:
     """Carries a run out, or a part of it.
 
@@ -164,9 +177,8 @@ def execute(
         protocol: The protocol.
         run: The run.
         out: Folder of the runs.
-        until: Longest time of a run [s].
+        limits: When the run ends.
         device: ``cpu``: times are those of the processor; ``cuda``: wall-clock times.
-        deadline: ``time.monotonic()`` after which the run saves its state and ends.
 
     Returns:
         Whether the run has reached its last stop.
@@ -179,9 +191,9 @@ def execute(
     }
     wall = device == "cuda"
     with _gpu(out, fcntl.LOCK_SH) if wall else contextlib.nullcontext():
-        here = Progress(protocol, run, out, until)
+        here = Progress(protocol, run, out, limits.until)
     with _gpu(out, fcntl.LOCK_EX) if wall else contextlib.nullcontext():
-        return _to_the_end(protocol, here, done, out, until, device, deadline)
+        return _to_the_end(protocol, here, done, out, limits, device)
 
 
 @contextlib.contextmanager
@@ -202,9 +214,8 @@ def _to_the_end(
     here: Progress,
     done: set[str],
     out: Path,
-    until: float,
+    limits: Limits,
     device: str,
-    deadline: float,
 ) -> bool:
     """Advances a run past its stops that are not done, and writes a line at each."""
     wall = device == "cuda"
@@ -220,13 +231,14 @@ def _to_the_end(
             left.remove(stop)
             _write(protocol, here, stop, device, out)
             here.save()
-        if time.monotonic() > deadline and left:
+        if time.monotonic() > limits.deadline and left:
             here.save()
             return False
         if seconds - saved > _SAVED_EVERY:
             here.save()
             saved = seconds
-        if not any(x.unit == "s" for x in left) and seconds > until:
+        late = seconds > limits.until and not any(x.unit == "s" for x in left)
+        if late and not limits.reach:
             break  # it will not reach the number of evaluations in time
     # a longer run may follow
     if len(here.stops) == len(protocol.stops):

@@ -115,6 +115,7 @@ class Choice:
         algorithms: Names of the algorithms.
         seeds: Largest number of seeds.
         until: Longest time of a run [s].
+        reach: Whether runs go on after that until they have their evaluations.
         tune: Whether to run every variant with the seed of the tuning.
         tuned: Folder of the tuning; ``None``: the variants of the report, or for a
             protocol with defaults those.
@@ -125,6 +126,7 @@ class Choice:
     algorithms: list[str]
     seeds: int
     until: float
+    reach: bool = False
     tune: bool = False
     tuned: Path | None = None
     variants: list[str] | None = None
@@ -184,8 +186,9 @@ def missing(protocol: Protocol, out: Path, choice: Choice) -> list[Run]:
         if line["protocol"] == protocol.name
     }
     within = protocol.stops_until(choice.until)
+    stops = [str(stop) for stop in within if stop.unit == "s" or choice.reach]
     # slow algorithms may not reach a number of evaluations
-    stops = [str(stop) for stop in within if stop.unit == "s"] or [*map(str, within)]
+    stops = stops or [*map(str, within)]
     return [
         run
         for run in planned(protocol, choice)

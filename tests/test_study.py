@@ -129,7 +129,10 @@ def test_finished_runs_are_left_out(tmp_path: Path) -> None:
     assert left(tmp_path, until=20) == [f"{TASK}.me@0.1"]
     study_runs.add_line(tmp_path / "runs.csv", line("me", 0, "60 s"))
     assert left(tmp_path) == [f"{TASK}.me@0.1"]
-    assert len(study_runs.lines(tmp_path)) == 2
+    assert len(left(tmp_path, reach=True)) == 2
+    study_runs.add_line(tmp_path / "runs.csv", line("me", 0, "20000 evaluations"))
+    assert left(tmp_path, reach=True) == [f"{TASK}.me@0.1"]
+    assert len(study_runs.lines(tmp_path)) == 3
 
 
 def test_tuning_chooses_the_corrected_score(tmp_path: Path) -> None:

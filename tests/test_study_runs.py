@@ -6,6 +6,7 @@ import fcntl
 import sys
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -41,9 +42,8 @@ RUN = Run("hopper_uni", "me-actor-critic@1", 3)
 
 def execute(out: Path, deadline: float = np.inf) -> bool:
     out.mkdir(exist_ok=True)
-    return study_execution.execute(
-        PROTOCOL, RUN, out, until=60.0, device="cpu", deadline=deadline
-    )
+    limits = study_execution.Limits(60.0, deadline=deadline)
+    return study_execution.execute(PROTOCOL, RUN, out, limits, "cpu")
 
 
 def test_a_clock_starts_when_no_other_run_uses_the_gpu(tmp_path: Path) -> None:
@@ -63,6 +63,41 @@ def test_a_clock_starts_when_no_other_run_uses_the_gpu(tmp_path: Path) -> None:
         order.append("compiled")
     waiting.join(timeout=10)
     assert order == ["compiled", "clock"]
+
+
+class Clockwork:
+    """A run whose generations take a second and have ten evaluations."""
+
+    def __init__(self) -> None:
+        self.stops = [Stop("evaluations", 50), Stop("s", 2)]
+        self.search, self.state = self, SimpleNamespace(metrics=np.zeros((1, 2)))
+        self.spent = study_execution.Spent()
+
+    def advance(self, state: SimpleNamespace) -> SimpleNamespace:
+        return SimpleNamespace(metrics=np.add(state.metrics, (1, 10)))
+
+    def seconds(self, wall: bool) -> float:
+        return float(self.state.metrics[-1, 0])
+
+    def save(self) -> None:
+        pass
+
+    forget = save
+
+
+@pytest.mark.parametrize("reach", [False, True])
+def test_a_run_can_go_on_to_its_evaluations(
+    tmp_path: Path, monkeypatch: Any, reach: bool
+) -> None:
+    written = []
+    monkeypatch.setattr(
+        study_execution, "_write", lambda _, run, stop, *rest: written.append(str(stop))
+    )
+    run: Any = Clockwork()
+    limits = study_execution.Limits(2.0, reach)
+    study_execution._to_the_end(PROTOCOL, run, set(), tmp_path, limits, "cpu")
+    assert written == ["2 s", "50 evaluations"][: 1 + reach]
+    assert run.seconds(False) == (5.0 if reach else 3.0)
 
 
 @pytest.mark.slow
