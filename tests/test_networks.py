@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from newton_qd.qd import (
     make_task,
     policy_of,
 )
+from newton_qd.qd.run.search import Search
 
 CONFIG = EvolveConfig(
     env_name="pointmaze", iterations=1, batch_size=4, episode_length=5, reevaluations=0
@@ -95,6 +97,18 @@ def test_episodes_scores_and_runs(name: str, tmp_path: Path) -> None:
     assert np.array_equal(
         np.ravel(run.evaluate(run.cells).fitnesses), run.archive.fitnesses[run.cells]
     )
+
+
+def test_initial_weights_are_drawn_one_by_one() -> None:
+    """On a CPU, two batches of QR decompositions can wait for each other forever."""
+    nn = pytest.importorskip("flax.linen")
+    start = nn.initializers.orthogonal()
+    layers = [nn.Dense(HIDDEN, kernel_init=start), nn.Dense(2, kernel_init=start)]
+    task = dataclasses.replace(make_task(CONFIG), network=nn.Sequential(layers))
+    search = Search(CONFIG.resolve(task.descriptor_length), task)
+    text = search._population.lower(jax.random.split(jax.random.key(0), 4)).as_text()
+    shapes = re.findall(r"@lapack_sgeqrf_ffi.*: \(tensor<([\dx]+)xf32>\)", text)
+    assert set(shapes) == {"3x2"}  # Flax draws the transpose of 2 x 3
 
 
 def test_errors() -> None:

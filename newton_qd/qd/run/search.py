@@ -122,7 +122,12 @@ class Search:
         self._enter = jax.jit(self._generation.enter)
         self._begin = self._compiled(parts.begin, learns_on_mesh)
         self._tell = self._compiled(parts.tell, learns_on_mesh)
-        self._population = jax.jit(jax.vmap(self._initial))
+        # one after the other if the network is the user's: on a CPU, two batches of QR
+        # decompositions, as of orthogonal initializers, can wait for each other forever
+        many = jax.vmap(self._initial)
+        if task.network is not None:
+            many = functools.partial(jax.lax.map, self._initial)
+        self._population = jax.jit(many)
 
     def empty(self, start: np.ndarray | None = None) -> SearchState:
         """State before the initial population, which may be given (N, size)."""
