@@ -8,6 +8,7 @@ import numpy as np
 
 from newton_qd.envs.base import PhysicsEnv
 from newton_qd.envs.contacts import angular_changes, linear_changes
+from newton_qd.envs.limits import within
 from newton_qd.envs.options import checked_options
 from newton_qd.envs.vectors import length, ordered_sum, rounded
 from newton_qd.physics.explicit_mesh import split_as
@@ -121,8 +122,7 @@ class Ant(PhysicsEnv):
         """Returns reward, done and metrics of a step."""
         position = after.q[:3]
         velocity = rounded((position[:2] - before.q[:2]) / self.dt)
-        low, high = self._healthy_z_range
-        healthy = ((position[2] >= low) & (position[2] <= high)).astype(self.dtype)
+        healthy = within(position[2], self._healthy_z_range, self.termination_width)
         if self._terminate_when_unhealthy:
             bonus, done = jnp.full_like(healthy, self._healthy_reward), 1 - healthy
         else:

@@ -49,6 +49,8 @@ class PhysicsEnv(Env):
     """Metric with the forward part of the reward; ``None``: no forward part."""
     rollout_order: RolloutOrder = RolloutOrder.AT_ONCE
     """How ``rollout`` runs the steps of a plan."""
+    termination_width: float | None = None
+    """Distance from a limit over which done has a gradient [m or rad], or ``None``."""
     reads_bodies: bool = False
     """Whether a step returns the poses of bodies too; ``kinematics`` is then faster."""
 

@@ -9,6 +9,7 @@ import numpy as np
 from newton_qd import physics
 from newton_qd.envs.base import PhysicsEnv
 from newton_qd.envs.contacts import isotropic_inertia
+from newton_qd.envs.limits import within
 from newton_qd.envs.options import checked_options
 from newton_qd.envs.vectors import cross, length, ordered_sum, rounded
 from newton_qd.physics.system import Kinematics, PhysicsState
@@ -159,9 +160,7 @@ class Humanoid(PhysicsEnv):
             for state in (before, after)
         )
         velocity = (position[:2] - start[:2]) / self.dt
-        low, high = self._healthy_z_range
-        height = after.q[2]
-        healthy = ((height >= low) & (height <= high)).astype(self.dtype)
+        healthy = within(after.q[2], self._healthy_z_range, self.termination_width)
         if self._terminate_when_unhealthy:
             bonus, done = jnp.full_like(healthy, self._healthy_reward), 1 - healthy
         else:

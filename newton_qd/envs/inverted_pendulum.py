@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import jax
 import jax.numpy as jnp
 
 from newton_qd import physics
 from newton_qd.envs.base import PhysicsEnv
+from newton_qd.envs.limits import within
 from newton_qd.envs.options import checked_options
 from newton_qd.envs.points import point
 from newton_qd.envs.vectors import ordered_sum, wrapped
@@ -62,7 +65,7 @@ class InvertedPendulum(PhysicsEnv):
     ) -> tuple[jax.Array, jax.Array, Metrics]:
         """Returns reward, done and metrics of a step."""
         del before, action
-        done = (jnp.abs(wrapped(after.q[1])) > 0.2).astype(self.dtype)
+        done = 1 - within(wrapped(after.q[1]), (-0.2, 0.2), self.termination_width)
         return jnp.ones_like(done), done, {}
 
 
@@ -114,4 +117,5 @@ class InvertedDoublePendulum(PhysicsEnv):
         x, _, height = point(seen, self.system.body_names.index("pole2"), _TIP)[0]
         off = jnp.stack([x, height - 2, after.v[1], after.v[2]])
         penalty = ordered_sum(jnp.asarray(_WEIGHTS, self.dtype) * jnp.square(off))
-        return 10 - penalty, (height <= 1).astype(self.dtype), {}
+        done = within(height, (-math.inf, 1.0), self.termination_width)
+        return 10 - penalty, done, {}

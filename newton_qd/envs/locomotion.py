@@ -7,6 +7,7 @@ import jax.numpy as jnp
 
 from newton_qd.checks import Fact, message
 from newton_qd.envs.base import PhysicsEnv
+from newton_qd.envs.limits import within
 from newton_qd.envs.options import checked_options
 from newton_qd.envs.vectors import ordered_sum, rounded
 from newton_qd.physics.system import JointKind, PhysicsState
@@ -87,9 +88,7 @@ class Locomotion(PhysicsEnv):
     ) -> tuple[jax.Array, jax.Array, Metrics]:
         """Returns reward, done and metrics of a step."""
         x_velocity = (after.q[0] - before.q[0]) / self.dt
-        low, high = self._healthy_z_range
-        height = after.q[2]
-        healthy = ((height >= low) & (height <= high)).astype(self.dtype)
+        healthy = within(after.q[2], self._healthy_z_range, self.termination_width)
         forward = rounded(self._forward_reward_weight * x_velocity)
         bonus = jnp.full_like(forward, self._healthy_reward)
         control = rounded(self._ctrl_cost_weight * ordered_sum(jnp.square(action)))

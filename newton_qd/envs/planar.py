@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from newton_qd.envs.limits import within
 from newton_qd.envs.vectors import ordered_sum, rounded, wrapped
 from newton_qd.physics.system import PhysicsState
 from newton_qd.types import Action, Metrics
@@ -81,11 +82,24 @@ class UprightRun:
     healthy_angle_range: tuple[float, float]
 
     def outcome(
-        self, before: PhysicsState, after: PhysicsState, action: Action, dt: float
+        self,
+        before: PhysicsState,
+        after: PhysicsState,
+        action: Action,
+        dt: float,
+        width: float | None,
     ) -> tuple[jax.Array, jax.Array, Metrics]:
-        """Returns reward, done and metrics of a step of ``dt`` [s]."""
+        """Returns reward, done and metrics of a step.
+
+        Args:
+            before: State at the start of the step.
+            after: State at its end.
+            action: (nu,) the action.
+            dt: Duration of the step [s].
+            width: Width of the gradient of done [m or rad]; ``None``: no gradient.
+        """
         velocity = forward_velocity(before, after, dt)
-        healthy = self._healthy(after)
+        healthy = self._healthy(after, width)
         if self.terminate_when_unhealthy:
             bonus, done = jnp.full_like(healthy, self.healthy_reward), 1 - healthy
         else:
@@ -101,10 +115,8 @@ class UprightRun:
         }
         return forward + bonus - control, done, metrics
 
-    def _healthy(self, state: PhysicsState) -> jax.Array:
+    def _healthy(self, state: PhysicsState, width: float | None) -> jax.Array:
         """Returns 1 where height and pitch are in their ranges, else 0."""
-        height, pitch = state.q[Z], euler_pitch(state.q[PITCH])
-        low, high = self.healthy_z_range
-        back, front = self.healthy_angle_range
-        healthy = (height >= low) & (height <= high) & (pitch >= back)
-        return (healthy & (pitch <= front)).astype(state.q.dtype)
+        high_enough = within(state.q[Z], self.healthy_z_range, width)
+        pitch = euler_pitch(state.q[PITCH])
+        return high_enough * within(pitch, self.healthy_angle_range, width)

@@ -90,4 +90,6 @@ class Walker2d(PhysicsEnv):
         self, before: PhysicsState, after: PhysicsState, action: Action
     ) -> tuple[jax.Array, jax.Array, Metrics]:
         """Returns reward, done and metrics of a step."""
-        return self._task.outcome(before, after, action, self.dt)
+        return self._task.outcome(
+            before, after, action, self.dt, self.termination_width
+        )

@@ -7,6 +7,7 @@
 - ``diagnose_gradients``: the number of steps for which the gradient is useful
 - ``soft_to_stiff``, ``softened``: softer contacts, and a series back to stiff ones
 - ``with_smooth_descriptor``: an environment whose descriptor has a gradient
+- ``with_smooth_termination``: an environment whose ``done`` has a gradient
 - ``make_episode``, ``make_episode_gradient``, ``make_directional_gradient``,
   ``make_mixed_gradient``: deprecated; methods of ``Episode``
 
@@ -33,7 +34,10 @@ if TYPE_CHECKING:
     from newton_qd.gradients.mixed import MixedGradients
     from newton_qd.gradients.outcome import Outcome
     from newton_qd.gradients.report import GradientReport
-    from newton_qd.gradients.smooth import with_smooth_descriptor
+    from newton_qd.gradients.smooth import (
+        with_smooth_descriptor,
+        with_smooth_termination,
+    )
     from newton_qd.gradients.softness import soft_to_stiff, softened
 
 __all__ = [
@@ -51,6 +55,7 @@ __all__ = [
     "soft_to_stiff",
     "softened",
     "with_smooth_descriptor",
+    "with_smooth_termination",
 ]
 
 _HOME = {
@@ -68,6 +73,7 @@ _HOME = {
     "soft_to_stiff": "softness",
     "softened": "softness",
     "with_smooth_descriptor": "smooth",
+    "with_smooth_termination": "smooth",
 }
 
 

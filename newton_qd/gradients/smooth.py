@@ -1,11 +1,11 @@
-"""Descriptors with a gradient, for existing environments."""
+"""Descriptors and ends of episodes with a gradient, for existing environments."""
 
 from __future__ import annotations
 
 import copy
 
 from newton_qd import checks
-from newton_qd.envs.base import Env
+from newton_qd.envs.base import Env, PhysicsEnv
 from newton_qd.physics.system import TAILS
 from newton_qd.wrappers import FeetContactWrapper
 from newton_qd.wrappers.base import Wrapper
@@ -50,3 +50,33 @@ def with_smooth_descriptor(
     changed = copy.copy(env)
     changed.env = with_smooth_descriptor(env.env, width, straight_through, tail)
     return changed
+
+
+def with_smooth_termination(env: Env, width: float) -> Env:
+    """Returns the environment with a ``done`` that has a gradient.
+
+    Values stay the same: ``done`` is 0 or 1. Its gradient is that of a smooth step, in
+    the environments that end an episode when height or pitch leave their limits. So a
+    learning method can see from ``1 - done`` that a fall is near. In other
+    environments, this changes nothing. A robot of your own computes its limits with
+    ``newton_qd.envs.limits.within``.
+
+    Args:
+        env: The environment; it does not change.
+        width: Distance from a limit over which ``done`` has a gradient [m or rad],
+            above 0.
+
+    Raises:
+        TypeError: An argument has the wrong type.
+        ValueError: ``width`` is not finite and above 0.
+    """
+    checks.environment(env)
+    checks.number("width", width, above=0)
+
+    def change(base: Env) -> Env:
+        changed = copy.copy(base)
+        if isinstance(changed, PhysicsEnv):
+            changed.termination_width = width
+        return changed
+
+    return env.with_base(change)

@@ -129,12 +129,22 @@ def on_robots_that_fall(**defaults: object) -> dict[str, Mapping[str, object]]:
     return dict.fromkeys((*names, "humanoidtrap"), defaults)
 
 
-def differentiable(task: Task, options: DifferentiableOptions) -> Task:
-    """Returns the task with a descriptor that has the same values and a gradient."""
-    from newton_qd.gradients import with_smooth_descriptor
+def differentiable(
+    task: Task, options: DifferentiableOptions, termination_width: float = 0.0
+) -> Task:
+    """Returns the task with the same values, and with a gradient of its descriptor.
+
+    Args:
+        task: The task.
+        options: Options of the gradient.
+        termination_width: Width of the gradient of done [m or rad]; 0: no gradient.
+    """
+    from newton_qd.gradients import with_smooth_descriptor, with_smooth_termination
 
     tail = "algebraic" if options.algebraic_tail else "exponential"
     env = with_smooth_descriptor(task.env, options.smooth_width, True, tail)
+    if termination_width:
+        env = with_smooth_termination(env, termination_width)
     return dataclasses.replace(task, env=env)
 
 

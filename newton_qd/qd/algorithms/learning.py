@@ -35,7 +35,10 @@ def learning_method(
     from newton_qd.qd.emitters.actor_critic_learner import measure_of
     from newton_qd.qd.emitters.whitening import Whitening
 
-    policy, task = context.policy, differentiable(context.task, options)
+    policy, task = (
+        context.policy,
+        differentiable(context.task, options, options.termination_width),
+    )
     method = ActorCritic(
         task.env,
         policy.of_weights,

@@ -80,7 +80,7 @@ def _make(context: EmitterContext, options: ConditionedOptions) -> Any:
 
     config = context.config
     copies, between = options.numbers(config)
-    task = differentiable(context.task, options)
+    task = differentiable(context.task, options, options.termination_width)
     env = AimedEnv(task, config.episode_length)
     policy = ConditionedPolicy(context.policy, task.descriptor_length)
     white = Whitening.of(context.policy) if options.whiten else Whitening()

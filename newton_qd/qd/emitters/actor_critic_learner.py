@@ -66,7 +66,9 @@ class ActorCritic:
     over a window of h control steps, where V is the value of the last state. The next
     window continues from this state. V is fitted to TD(lambda) targets.
 
-    A fall ends an episode, and the gradient of the physics does not see it. With
+    A fall ends an episode, and the gradient of the physics does not see it, unless
+    ``done`` has a gradient (:func:`~newton_qd.gradients.with_smooth_termination`): the
+    return after a step is worth :math:`(1 - d_t) V`, also in this gradient. With
     ``actor_trace`` below 1, the policy maximizes the TD(lambda) return of the window,
     in which the value of every state counts, also that of a state shortly before a fall
     (Hafner et al. 2020, "Dream to control").
@@ -239,25 +241,25 @@ class ActorCritic:
             after = self.env.step(before, jnp.clip(action, -1, 1))
             gain = jnp.append(after.reward, self.measure(before, after)) @ learner.aim
             value = self._value(learner.target, scale, after.obs)
-            over = after.done > 0
-            return select(over, first, after), (state.obs, gain, over, value)
+            row = gain, after.done, value, jnp.where(_sound(after), value, 0)
+            return select(after.done > 0, first, after), (state.obs, row)
 
-        last, (obs, gains, overs, values) = jax.lax.scan(advance, state, noise)
+        last, (obs, rows) = jax.lax.scan(advance, state, noise)
 
         def back(sums: PyTree, row: PyTree) -> tuple[PyTree, jax.Array]:
             total, target = sums
-            gain, over, value = row
+            gain, done, value, lost = row
             mixed = (1 - settings.trace) * value + settings.trace * target
             if settings.actor_trace < 1:  # else without the value, also if it is NaN
                 part = settings.actor_trace
                 total = (1 - part) * value + part * total
-            total, target = (
-                gain + settings.discount * jnp.where(over, 0, x) for x in (total, mixed)
-            )
+            # what a fall loses is the value of going on; only done has this gradient
+            total = jnp.where(done > 0, jax.lax.stop_gradient(lost), total)
+            total = gain + settings.discount * (1 - done) * total
+            target = gain + settings.discount * jnp.where(done > 0, 0, mixed)
             return (total, target), target
 
-        rows = (gains, overs, values)
-        ends = (values[-1], values[-1])
+        ends = (rows[2][-1], rows[2][-1])
         (total, _), targets = jax.lax.scan(back, ends, rows, reverse=True)
         return total, jax.lax.stop_gradient((last, obs, targets))
 

@@ -27,6 +27,8 @@ class ActorCriticSettings:
         epochs: Number of times that the critic learns from a window.
         batches: Optimizer steps of the critic in each epoch.
         whiten: Whether an actor learns weights for whitened observations.
+        termination_width: Distance from the limits of a healthy robot over which an
+            actor sees that a fall is near [m or rad]; 0: it does not see it.
 
     Raises:
         ValueError: A value is out of its range.
@@ -45,6 +47,7 @@ class ActorCriticSettings:
     epochs: int = 2
     batches: int = 4
     whiten: bool = True
+    termination_width: float = 0.0
 
     def __post_init__(self) -> None:
         """Checks every value.
@@ -61,7 +64,8 @@ class ActorCriticSettings:
             raise ValueError(message("batches", self.batches, allowed))
         for name in ("rate", "critic_rate", "clip"):
             checks.number(name, getattr(self, name), above=0)
-        checks.number("noise", self.noise, least=0)
+        for name in ("noise", "termination_width"):
+            checks.number(name, getattr(self, name), least=0)
         checks.number("discount", self.discount, least=0, below=1)
         checks.number("trace", self.trace, least=0, most=1)
         checks.number("actor_trace", self.actor_trace, least=0, most=1)

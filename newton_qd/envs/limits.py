@@ -1,0 +1,50 @@
+"""Whether a number is within limits: 0 or 1, with or without a gradient."""
+
+from __future__ import annotations
+
+import functools
+
+import jax
+
+
+def within(
+    value: jax.Array, limits: tuple[float, float], width: float | None = None
+) -> jax.Array:
+    r"""Returns 1 where a number is within limits, else 0, in its dtype.
+
+    Without a width, the gradient is 0. With the width :math:`b`, the result stays 0 or
+    1. Its gradient is the one of
+
+    .. math:: \sigma((x - low) / b) \, \sigma((high - x) / b)
+
+    with the logistic function :math:`\sigma`, where each factor has its value of 0 or 1
+    (Bengio et al. 2013, "Estimating or propagating gradients through stochastic
+    neurons", section 5, straight-through).
+
+    Args:
+        value: () the number.
+        limits: The lowest and the highest allowed value, in the unit of ``value``.
+        width: Width of the gradient, in the unit of ``value``.
+    """
+    low, high = limits
+    if width is None:
+        return ((value >= low) & (value <= high)).astype(value.dtype)
+    return _step(value - low, width) * _step(high - value, width)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
+def _step(margin: jax.Array, width: float) -> jax.Array:
+    """Returns 1 where the margin is at least 0, else 0."""
+    del width
+    return (margin >= 0).astype(margin.dtype)
+
+
+@_step.defjvp
+def _step_jvp(
+    width: float, primals: tuple[jax.Array], tangents: tuple[jax.Array]
+) -> tuple[jax.Array, jax.Array]:
+    (margin,), (tangent,) = primals, tangents
+    smooth = jax.nn.sigmoid(margin / width)
+    return _step(margin, width), smooth * jax.nn.sigmoid(
+        -margin / width
+    ) / width * tangent

@@ -1,0 +1,155 @@
+"""The gradient of ``done``: its values stay, and a learner sees a fall ahead."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from point_runs import PointEnv
+
+import newton_qd
+from newton_qd.envs.base import Env, PhysicsEnv
+from newton_qd.envs.limits import within
+from newton_qd.gradients import with_smooth_termination
+from newton_qd.qd.emitters.actor_critic_learner import ActorCritic
+from newton_qd.qd.emitters.actor_critic_settings import ActorCriticSettings
+
+WIDTH = 0.05
+NAMES = ("hopper_uni", "walker2d_uni", "ant_uni", "humanoid_uni", "inverted_pendulum")
+
+
+def logistic(x: float) -> float:
+    return 1 / (1 + math.exp(-x))
+
+
+@pytest.mark.parametrize("limits", [(0.2, 1.0), (0.2, math.inf), (-math.inf, 1.0)])
+def test_within_is_a_step_with_the_slope_of_a_smooth_one(limits: Any) -> None:
+    """Against the derivative in closed form, in float64."""
+    low, high = limits
+    with jax.enable_x64(True):
+        for value in (-0.1, 0.15, 0.2, 0.3, 0.97, 1.0, 1.02, 3.0):
+            x = jnp.float64(value)
+            inside = low <= value <= high
+            for width in (None, WIDTH):
+                assert within(x, limits, width) == inside
+            slopes = [
+                sign * logistic(margin / WIDTH) * logistic(-margin / WIDTH) / WIDTH
+                for sign, margin in ((1, value - low), (-1, high - value))
+            ]
+            expected = slopes[0] * (value <= high) + slopes[1] * (value >= low)
+            found = jax.grad(within)(x, limits, WIDTH)
+            np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-300)
+            assert jax.grad(within)(x, limits) == 0
+
+
+def _robot(env: Env) -> PhysicsEnv:
+    robot = env.unwrapped
+    assert isinstance(robot, PhysicsEnv)
+    return robot
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_done_has_a_gradient_near_its_limit(name: str) -> None:
+    """The wrapped environment changes; the first one, and every value, do not."""
+    env = newton_qd.create(name, auto_reset=False)
+    smooth = with_smooth_termination(env, WIDTH)
+    kinds = [_robot(env), _robot(smooth)]
+    assert [kind.termination_width for kind in kinds] == [None, WIDTH]
+    rest = kinds[0].fixed_state().pipeline_state
+    action = jnp.zeros((env.action_size,))
+    seen = 0.0
+    for share in (1.0, 0.9, 0.6, 0.3):
+        # lower, and leaning more
+        q = rest.q * share if name != "inverted_pendulum" else rest.q + (1 - share) / 2
+        if name in ("hopper_uni", "walker2d_uni"):
+            q = q.at[2].add(1 - share)
+
+        def done(q: jax.Array, robot: Any) -> jax.Array:
+            state = dataclasses.replace(rest, q=q)
+            return robot.outcome(state, state, action)[1]
+
+        (plain, flat), (value, slope) = (
+            jax.value_and_grad(done)(q, kind) for kind in kinds
+        )
+        assert plain == value and value in (0, 1)
+        assert not np.any(flat) and np.all(np.isfinite(slope))
+        seen = max(seen, float(jnp.abs(slope).max()))
+    assert seen > 0.1
+
+
+def test_the_values_of_a_step_stay_the_same() -> None:
+    env = newton_qd.create("hopper_uni", auto_reset=False)
+    smooth = with_smooth_termination(env, WIDTH)
+    state = jax.jit(env.reset)(jax.random.key(0))
+    fallen = False
+    steps = [jax.jit(kind.step) for kind in (env, smooth)]
+    for action in np.ones((100, 3), np.float32):
+        first, second = (step(state, action) for step in steps)
+        for one, two in zip(*map(jax.tree.leaves, (first, second)), strict=True):
+            np.testing.assert_array_equal(one, two)
+        state, fallen = first, fallen or bool(first.done)
+    assert fallen
+
+
+class Cliff(PointEnv):
+    """A point that falls where x is above 0.5; each step is worth 1."""
+
+    def __init__(self, width: float | None) -> None:
+        self.width = width
+
+    def step(self, state: Any, action: jax.Array) -> Any:
+        after = super().step(state, action)
+        safe = within(after.pipeline_state[0], (-math.inf, 0.5), self.width)
+        one = jnp.ones_like(after.reward)
+        return dataclasses.replace(after, reward=one, done=1 - safe)
+
+
+def cliff_gradient(width: float | None, start: float) -> jax.Array:
+    """Gradient of a window's return with respect to the mean action (2,)."""
+    settings = ActorCriticSettings(
+        worlds=1, window=4, batches=1, noise=0.0, critic=(4,), discount=0.9, clip=1e6
+    )
+    env = Cliff(width)
+    way = ActorCritic(
+        env,
+        lambda weights, obs: weights,
+        lambda before, after: jnp.zeros(2),
+        9,
+        settings,
+    )
+    first = jax.tree.map(lambda x: x[None], env.reset(jax.random.key(0)))
+    begun = way.begin(jax.random.key(1), jnp.zeros(2), jnp.array([1.0, 0, 0]), first)
+    # a critic that gives 10 everywhere
+    flat = jax.tree.map(jnp.zeros_like, begun.target)
+    flat[-1] = (flat[-1][0], jnp.ones_like(flat[-1][1]))
+    begun = dataclasses.replace(begun, target=flat)
+    one = jax.tree.map(lambda x: x[0], first)
+    one = dataclasses.replace(
+        one, pipeline_state=jnp.array([start, 0.0]), obs=jnp.array([start, 0.0, 1.0])
+    )
+    scale = jnp.zeros(3), jnp.ones(3)
+
+    def total(weights: jax.Array) -> jax.Array:
+        return way._window(weights, begun, scale, one, one, jnp.zeros((4, 2)))[0]
+
+    return jax.grad(total)(jnp.zeros(2))
+
+
+@pytest.mark.parametrize("start", [0.4, 0.55])
+def test_an_actor_sees_that_a_fall_is_near(start: float) -> None:
+    """It moves away from the cliff, both shortly before it and after it fell."""
+    blind, seeing = (cliff_gradient(width, start) for width in (None, 0.1))
+    assert not np.any(blind)
+    assert seeing[0] < -0.1 and seeing[1] == 0
+
+
+@pytest.mark.parametrize("width", [0.0, -1.0, math.nan, math.inf])
+def test_a_wrong_width_is_refused(width: float) -> None:
+    env = newton_qd.create("hopper_uni")
+    with pytest.raises(ValueError, match="width: got"):
+        with_smooth_termination(env, width)
