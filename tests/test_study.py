@@ -117,7 +117,7 @@ def test_without_tuning_the_variants_of_the_report_run() -> None:
         tasks=[TASK], algorithms=["me", "me-actor-critic"], seeds=1, until=60
     )
     found = [run.variant for run in study_runs.planned(FIELD, choice)]
-    assert found == ["me@1", "me-actor-critic@4"]
+    assert found == ["me@1", "me-actor-critic@11"]
     found = [run.variant for run in study_runs.planned(SMALL, choice)]
     assert found == ["me@0", "me-actor-critic@0"]
 

@@ -1,15 +1,21 @@
-"""Measures what whitened observations change for an actor alone, without an archive.
+"""Shows how an actor alone learns, without an archive, with different settings.
 
 One actor maximizes the return with gradients of the physics over short windows. The
 table has the return of its policy, without noise, from a start state that it has not
 seen, how long the robot stays up, and how far it gets:
 
-    python benchmarks/whitening.py humanoid_uni --updates 200
+    python benchmarks/actor_alone.py humanoid_uni --updates 200
+    python benchmarks/actor_alone.py hopper_uni --settings discount=0.995 epochs=8 \
+        noise=0.3 --compare termination_width 0 0.03
+
+Without ``--compare``, it compares plain observations with whitened ones.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
+import json
 from typing import Any
 
 import jax
@@ -47,20 +53,24 @@ def walk(env: Any, act: Any, key: jax.Array) -> tuple[jax.Array, jax.Array, jax.
     return jnp.sum(rewards * up), up.sum(), last[0]
 
 
-def returns(env_name: str, whiten: bool, updates: int, every: int, seed: int) -> list:
+def returns(
+    env_name: str, settings: ActorCriticSettings, updates: int, every: int, seed: int
+) -> list:
     """What the actor's policy does after each ``every`` updates: see ``walk``."""
     config = EvolveConfig(env_name=env_name, episode_length=LENGTH, hidden=(64, 64))
-    task = differentiable(make_task(config), DifferentiableOptions())
+    task = differentiable(
+        make_task(config), DifferentiableOptions(), settings.termination_width
+    )
     policy = policy_for(task, config.hidden)
-    white = Whitening.of(policy) if whiten else Whitening()
+    white = Whitening.of(policy) if settings.whiten else Whitening()
     measure = measure_of(task)
     method = ActorCritic(
-        task.env, policy.of_weights, measure, LENGTH, SETTINGS, whitening=white
+        task.env, policy.of_weights, measure, LENGTH, settings, whitening=white
     )
     keys = jax.random.split(jax.random.key(seed), 6)
     first = task.env.reset(keys[0])
     worlds = jax.tree.map(
-        lambda leaf: jnp.broadcast_to(leaf, (SETTINGS.worlds, *jnp.shape(leaf))), first
+        lambda leaf: jnp.broadcast_to(leaf, (settings.worlds, *jnp.shape(leaf))), first
     )
     scale = jax.jit(method.scale)(keys[1], worlds)
     aim = jnp.zeros(1 + task.descriptor_length).at[0].set(1)
@@ -77,21 +87,46 @@ def returns(env_name: str, whiten: bool, updates: int, every: int, seed: int) ->
     return found
 
 
+def changed(text: str) -> tuple[str, Any]:
+    """A setting and its value, from ``name=value``."""
+    name, equals, value = text.partition("=")
+    names = [field.name for field in dataclasses.fields(ActorCriticSettings)]
+    if name not in names or not equals:
+        allowed = f"name=value with one of {', '.join(names)}"
+        raise argparse.ArgumentTypeError(f"got {text!r}; allowed: {allowed}")
+    try:
+        return name, json.loads(value)
+    except json.JSONDecodeError as error:
+        raise argparse.ArgumentTypeError(f"{text!r}: no JSON value: {error}") from error
+
+
 def main() -> None:
-    """Prints the returns with and without whitening."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    """Prints the returns with each value of a setting."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("env_name")
     parser.add_argument("--updates", type=int, default=200)
     parser.add_argument("--every", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--settings", type=changed, nargs="+", default=[])
+    parser.add_argument("--compare", nargs="+", default=["whiten", "false", "true"])
     args = parser.parse_args()
+    name, *values = args.compare
+    try:
+        pairs = [changed(f"{name}={value}") for value in values]
+    except argparse.ArgumentTypeError as error:
+        parser.error(f"--compare: {error}")
+    base = dataclasses.replace(SETTINGS, **dict(args.settings))
     given = args.updates, args.every, args.seed
-    pair = [returns(args.env_name, whiten, *given) for whiten in (False, True)]
-    print(
-        "| updates | plain: return | steps | way [m] | whitened: return | steps | way |"
-    )
-    print("|---" * 7 + "|")
-    for index, rows in enumerate(zip(*pair, strict=True)):
+    found = [
+        returns(args.env_name, dataclasses.replace(base, **{key: value}), *given)
+        for key, value in pairs
+    ]
+    heads = [f"{name}={value}: return | steps | way [m]" for value in values]
+    print(f"| updates | {' | '.join(heads)} |")
+    print("|---" * (1 + 3 * len(values)) + "|")
+    for index, rows in enumerate(zip(*found, strict=True)):
         cells = [f"{score:.0f} | {steps} | {way:.1f}" for score, steps, way in rows]
         print(f"| {index * args.every} | {' | '.join(cells)} |")
 
