@@ -32,6 +32,7 @@ continued, see ``study_execution.py``; variants are in ``study/field.toml``:
 ``--until S`` leaves later stops for another command, which continues the runs. With
 ``--reach-evaluations``, runs go on after that until they have a million evaluations.
 ``--stop-after S`` ends the command in time for a machine that is lent for so long.
+With ``--paced``, the runs of a GPU do not take turns: see ``study_clock.py``.
 """
 
 from __future__ import annotations
@@ -75,6 +76,12 @@ def arguments() -> argparse.Namespace:
         type=float,
         default=math.inf,
         help="field, small: stop all runs so many seconds after the command",
+    )
+    parser.add_argument(
+        "--paced",
+        action="store_true",
+        help="field, small: runs share a GPU; their clock is the number of "
+        "generations times the time of a generation alone",
     )
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
@@ -137,6 +144,8 @@ def checked(
     if args.until is None:
         stops = protocol.stops if protocol else ()
         args.until = max((x.amount for x in stops if x.unit == "s"), default=math.inf)
+    if args.paced and (not protocol or args.device != "cuda"):
+        parser.error("--paced: got it without --protocol field or small and a GPU")
     for name in ("seeds", "gpus", "workers"):
         value = getattr(args, name)
         if value < 1:
@@ -183,7 +192,7 @@ def one(args: argparse.Namespace, begin: float) -> None:
         study_runs.Run(task, variant, int(seed)),
         Path(out),
         study_execution.Limits(
-            args.until, args.reach_evaluations, begin + args.stop_after
+            args.until, args.reach_evaluations, begin + args.stop_after, args.paced
         ),
         args.device,
     )
@@ -213,6 +222,7 @@ def main() -> None:
             more = ["--until", str(args.until)]
             more += ["--stop-after", str(args.stop_after - spent)]
             more += ["--reach-evaluations"] * args.reach_evaluations
+            more += ["--paced"] * args.paced
         pool.start(slot, *more, "--run", *what)
     pool.drain()
 

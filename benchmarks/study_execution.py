@@ -3,47 +3,29 @@
 A run adds one line to ``runs.csv`` at each of its stops, and the fitness of each cell
 to ``cells/RUN.npz``. Scores of re-evaluated elites are part of the line; for them, the
 clock is stopped. A run that is stopped leaves ``states/RUN.bin``, from which the next
-command continues; it is removed when the run has reached its last stop.
+command continues; it is removed when the run has reached its last stop. Clocks are
+explained in ``study_clock.py``.
 """
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
-import fcntl
 import json
 import math
 import os
 import subprocess
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import study_clock
+from study_clock import Spent
 from study_protocols import Protocol, Stop
 from study_runs import HEAD, Run, add_line, lines, variants
 
 _SAVED_EVERY = 60.0  # seconds of a run between two copies of its state
-
-
-@dataclasses.dataclass
-class Spent:
-    """What a run has used so far, without compilation and re-evaluations.
-
-    Attributes:
-        wall_s: Wall-clock time [s].
-        processor_s: Time of all processor cores [s].
-    """
-
-    wall_s: float = 0.0
-    processor_s: float = 0.0
-
-    def add(self, begin: tuple[float, float]) -> None:
-        """Adds the time since ``now``."""
-        wall, processor = now()
-        self.wall_s += wall - begin[0]
-        self.processor_s += processor - begin[1]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,16 +36,13 @@ class Limits:
         until: Longest time of the run [s].
         reach: Whether it goes on after that until it has its number of evaluations.
         deadline: ``time.monotonic()`` after which the run saves its state and ends.
+        paced: Whether runs share a GPU, with generations as their clock.
     """
 
     until: float
     reach: bool = False
     deadline: float = math.inf
-
-
-def now() -> tuple[float, float]:
-    """Returns wall-clock and processor time [s]."""
-    return time.perf_counter(), time.process_time()
+    paced: bool = False
 
 
 class Progress:
@@ -72,7 +51,10 @@ class Progress:
     Attributes:
         spent: What the run has used so far.
         state: State of the search.
+        pace: Time that a generation adds to the clock [s]; ``None``: what it took.
     """
+
+    pace: float | None = None
 
     def __init__(self, protocol: Protocol, run: Run, out: Path, until: float) -> None:
         """Builds the search, compiles it, and restores the state, if there is one."""
@@ -103,12 +85,11 @@ class Progress:
         self._path = out / "states" / f"{run}.bin"
         self._clock = out / "states" / f"{run}.json"
         self.spent = Spent()
-        state = self.search.empty()
-        for _ in range(3):  # compiles, and runs what is compiled
-            state = self.search.advance(state)
-        self.state = state
-        self.scores()
         self.state = self.search.empty()
+        for _ in range(3):  # compiles, and runs what is compiled
+            self.advance()
+        self.scores()
+        self.spent, self.state = Spent(), self.search.empty()
         if self._path.is_file() and self._clock.is_file():
             from newton_qd.qd.run.checkpoint import load_checkpoint
 
@@ -118,6 +99,24 @@ class Progress:
     def seconds(self, wall: bool) -> float:
         """Time of the run [s]."""
         return self.spent.wall_s if wall else self.spent.processor_s
+
+    def advance(self) -> None:
+        """Runs one generation, and adds its time."""
+        begin = study_clock.now()
+        self.state = self.search.advance(self.state)
+        self.spent.add(begin, self.pace)
+
+    def find_pace(self, out: Path) -> None:
+        """Finds the time of a generation that has a GPU for itself.
+
+        If it must be measured, this takes some first generations, and forgets them.
+        """
+        import jax
+
+        state, spent = self.state, dataclasses.replace(self.spent)
+        gpu = jax.devices()[0].device_kind
+        self.pace = study_clock.pace(out, self.run, self.advance, gpu, commit())
+        self.state, self.spent = state, spent
 
     def save(self) -> None:
         """Writes state and clock."""
@@ -178,7 +177,8 @@ def execute(
         run: The run.
         out: Folder of the runs.
         limits: When the run ends.
-        device: ``cpu``: times are those of the processor; ``cuda``: wall-clock times.
+        device: ``cpu``: times are those of the processor; ``cuda``: wall-clock times,
+            or those of ``study_clock.pace``.
 
     Returns:
         Whether the run has reached its last stop.
@@ -189,24 +189,16 @@ def execute(
         if (line["protocol"], line["task"], line["variant"], line["seed"])
         == (protocol.name, run.task, run.variant, str(run.seed))
     }
-    wall = device == "cuda"
-    with _gpu(out, fcntl.LOCK_SH) if wall else contextlib.nullcontext():
+    if device == "cpu":
         here = Progress(protocol, run, out, limits.until)
-    with _gpu(out, fcntl.LOCK_EX) if wall else contextlib.nullcontext():
-        return _to_the_end(protocol, here, done, out, limits, device)
-
-
-@contextlib.contextmanager
-def _gpu(out: Path, kind: int) -> Iterator[None]:
-    """Waits until this process may use its GPU.
-
-    Several runs compile and warm up at once, with ``LOCK_SH``. A run whose clock is
-    running has the GPU and the cores of the machine for itself, with ``LOCK_EX``.
-    """
-    gpu = os.environ.get("CUDA_VISIBLE_DEVICES", "")
-    with (out / f"gpu{gpu}.lock").open("w", encoding="utf-8") as file:
-        fcntl.flock(file, kind)
-        yield
+        return _to_the_end(protocol, here, done, out, limits, "processor")
+    with study_clock.shared(out):
+        here = Progress(protocol, run, out, limits.until)
+    if limits.paced:
+        here.find_pace(out)
+        return _to_the_end(protocol, here, done, out, limits, "paced")
+    with study_clock.alone(out):
+        return _to_the_end(protocol, here, done, out, limits, "wall")
 
 
 def _to_the_end(
@@ -215,21 +207,20 @@ def _to_the_end(
     done: set[str],
     out: Path,
     limits: Limits,
-    device: str,
+    clock: str,
 ) -> bool:
     """Advances a run past its stops that are not done, and writes a line at each."""
-    wall = device == "cuda"
+    wall = clock != "processor"
     left = [stop for stop in here.stops if str(stop) not in done]
     saved = here.seconds(wall)
     while left:
-        begin = now()
-        here.state = here.search.advance(here.state)
-        here.spent.add(begin)
+        with study_clock.shared(out) if clock == "paced" else contextlib.nullcontext():
+            here.advance()
         evaluations = here.state.metrics[-1][1]
         seconds = here.seconds(wall)
         for stop in [x for x in left if x.reached(evaluations, seconds)]:
             left.remove(stop)
-            _write(protocol, here, stop, device, out)
+            _write(protocol, here, stop, clock, out)
             here.save()
         if time.monotonic() > limits.deadline and left:
             here.save()
@@ -247,7 +238,7 @@ def _to_the_end(
 
 
 def _write(
-    protocol: Protocol, here: Progress, stop: Stop, device: str, out: Path
+    protocol: Protocol, here: Progress, stop: Stop, clock: str, out: Path
 ) -> None:
     """Writes the scores at a stop."""
     columns, cells = here.scores()
@@ -258,7 +249,8 @@ def _write(
         "variant": here.run.variant,
         "seed": here.run.seed,
         "stop": str(stop),
-        "device": device,
+        "device": "cpu" if clock == "processor" else "cuda",
+        "clock": clock,
         "commit": commit(),
         **dataclasses.asdict(here.spent),
         **columns,

@@ -19,8 +19,8 @@ VARIANTS = Path(__file__).resolve().parent / "study" / "field.toml"
 TUNING_SEED = 1000
 SCORES = ("qd_score", "coverage", "max_fitness", "mean_fitness", "qd_gain")
 HEAD = (
-    *("protocol", "task", "algorithm", "variant", "seed", "stop", "device", "commit"),
-    *("wall_s", "processor_s", "iteration", "evaluations", "env_steps"),
+    *("protocol", "task", "algorithm", "variant", "seed", "stop", "device", "clock"),
+    *("commit", "wall_s", "processor_s", "iteration", "evaluations", "env_steps"),
     *("gradient_steps", "rejected", "initial_fitness", *SCORES),
     *(f"corrected_{name}" for name in SCORES),
 )
@@ -196,12 +196,12 @@ def missing(protocol: Protocol, out: Path, choice: Choice) -> list[Run]:
     ]
 
 
-def add_line(path: Path, line: dict[str, str]) -> None:
+def add_line(path: Path, line: dict[str, str], head: tuple[str, ...] = HEAD) -> None:
     """Adds a line to a csv file that several processes write to."""
     with path.open("a", newline="", encoding="utf-8") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         file.seek(0, 2)
-        writer = csv.DictWriter(file, HEAD, lineterminator="\n")
+        writer = csv.DictWriter(file, head, lineterminator="\n")
         if file.tell() == 0:
             writer.writeheader()
         writer.writerow(line)

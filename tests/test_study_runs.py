@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import sys
 import threading
 from pathlib import Path
@@ -15,6 +14,7 @@ import pytest
 FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
 sys.path.insert(0, str(FOLDER))
 
+import study_clock  # noqa: E402
 import study_execution  # noqa: E402
 from study_protocols import Protocol, Stop  # noqa: E402
 from study_runs import Run, lines  # noqa: E402
@@ -50,19 +50,38 @@ def test_a_clock_starts_when_no_other_run_uses_the_gpu(tmp_path: Path) -> None:
     order = []
 
     def run() -> None:
-        with study_execution._gpu(tmp_path, fcntl.LOCK_EX):
+        with study_clock.alone(tmp_path):
             order.append("clock")
 
-    waiting = threading.Thread(target=run)
-    with (
-        study_execution._gpu(tmp_path, fcntl.LOCK_SH),
-        study_execution._gpu(tmp_path, fcntl.LOCK_SH),
-    ):
-        waiting.start()
-        waiting.join(timeout=0.2)
+    def later() -> None:
+        with study_clock.shared(tmp_path):
+            order.append("another")
+
+    waiting = [threading.Thread(target=run), threading.Thread(target=later)]
+    with study_clock.shared(tmp_path), study_clock.shared(tmp_path):
+        for thread in waiting:
+            thread.start()
+            thread.join(timeout=0.2)
         order.append("compiled")
-    waiting.join(timeout=10)
-    assert order == ["compiled", "clock"]
+    for thread in waiting:
+        thread.join(timeout=10)
+    # who asks later waits, or else the clock would never start
+    assert order == ["compiled", "clock", "another"]
+
+
+def test_a_pace_is_measured_once(tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setattr(study_clock, "LEAST_SECONDS", 0.0)
+    ran = []
+
+    def pace(seed: int) -> float:
+        run = Run("hopper_uni", "me@1", seed)
+        return study_clock.pace(tmp_path, run, lambda: ran.append(1), "H200", "abc")
+
+    first = pace(0)
+    assert len(ran) == 1 + study_clock.LEAST_GENERATIONS
+    assert pace(1) == pytest.approx(first, rel=1e-6)
+    assert len(ran) == 1 + study_clock.LEAST_GENERATIONS
+    assert study_clock.known_pace(tmp_path, Run("hopper_uni", "me@2", 0)) is None
 
 
 class Clockwork:
@@ -70,11 +89,10 @@ class Clockwork:
 
     def __init__(self) -> None:
         self.stops = [Stop("evaluations", 50), Stop("s", 2)]
-        self.search, self.state = self, SimpleNamespace(metrics=np.zeros((1, 2)))
-        self.spent = study_execution.Spent()
+        self.state = SimpleNamespace(metrics=np.zeros((1, 2)))
 
-    def advance(self, state: SimpleNamespace) -> SimpleNamespace:
-        return SimpleNamespace(metrics=np.add(state.metrics, (1, 10)))
+    def advance(self) -> None:
+        self.state = SimpleNamespace(metrics=np.add(self.state.metrics, (1, 10)))
 
     def seconds(self, wall: bool) -> float:
         return float(self.state.metrics[-1, 0])
@@ -95,9 +113,23 @@ def test_a_run_can_go_on_to_its_evaluations(
     )
     run: Any = Clockwork()
     limits = study_execution.Limits(2.0, reach)
-    study_execution._to_the_end(PROTOCOL, run, set(), tmp_path, limits, "cpu")
+    study_execution._to_the_end(PROTOCOL, run, set(), tmp_path, limits, "processor")
     assert written == ["2 s", "50 evaluations"][: 1 + reach]
     assert run.seconds(False) == (5.0 if reach else 3.0)
+
+
+@pytest.mark.slow
+def test_a_paced_run_counts_its_generations(tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setattr(study_execution, "variants", lambda: SETTINGS)
+    monkeypatch.setattr(study_clock, "LEAST_SECONDS", 0.0)
+    limits = study_execution.Limits(60.0, paced=True)
+    assert study_execution.execute(PROTOCOL, RUN, tmp_path, limits, "cuda")
+    pace = study_clock.known_pace(tmp_path, RUN)
+    assert pace is not None
+    for line in lines(tmp_path):
+        assert line["clock"] == "paced"
+        generations = int(line["iteration"]) + 1  # and the initial population
+        assert float(line["wall_s"]) == pytest.approx(pace * generations, rel=1e-6)
 
 
 @pytest.mark.slow
