@@ -14,6 +14,7 @@ import csv
 import dataclasses
 import fcntl
 import os
+import statistics
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -97,7 +98,7 @@ def known_pace(out: Path, run: Run) -> float | None:
 def pace(
     out: Path, run: Run, generation: Callable[[], object], gpu: str, commit: str
 ) -> float:
-    """Returns the time [s] of a generation of a run's variant on a GPU of its own.
+    """Returns the median time [s] of a generation on a GPU of its own.
 
     Args:
         out: Folder of the runs. Its ``paces.csv`` has the time of each task and
@@ -116,11 +117,12 @@ def pace(
         if found is not None:
             return found
         generation()
-        begin, count = time.perf_counter(), 0
-        while count < LEAST_GENERATIONS or time.perf_counter() - begin < LEAST_SECONDS:
+        times: list[float] = []
+        while len(times) < LEAST_GENERATIONS or sum(times) < LEAST_SECONDS:
+            begin = time.perf_counter()
             generation()
-            count += 1
-        found = (time.perf_counter() - begin) / count
-        line = (run.task, run.variant, gpu, commit, str(count), f"{found:.7g}")
+            times.append(time.perf_counter() - begin)
+        found = statistics.median(times)
+        line = (run.task, run.variant, gpu, commit, str(len(times)), f"{found:.7g}")
         add_line(out / PACES, dict(zip(HEAD, line, strict=True)), HEAD)
     return found
