@@ -18,9 +18,13 @@ from newton_qd.envs.limits import within
 from newton_qd.gradients import with_smooth_termination
 from newton_qd.qd.emitters.actor_critic_learner import ActorCritic
 from newton_qd.qd.emitters.actor_critic_settings import ActorCriticSettings
+from newton_qd.wrappers.maze import MazeWrapper
 
 WIDTH = 0.05
-NAMES = ("hopper_uni", "walker2d_uni", "ant_uni", "humanoid_uni", "inverted_pendulum")
+NAMES = (
+    *("hopper_uni", "walker2d_uni", "ant_uni", "humanoid_uni", "quadruped_uni"),
+    *("inverted_pendulum", "inverted_double_pendulum"),
+)
 
 
 def logistic(x: float) -> float:
@@ -62,24 +66,64 @@ def test_done_has_a_gradient_near_its_limit(name: str) -> None:
     assert [kind.termination_width for kind in kinds] == [None, WIDTH]
     rest = kinds[0].fixed_state().pipeline_state
     action = jnp.zeros((env.action_size,))
-    seen = 0.0
-    for share in (1.0, 0.9, 0.6, 0.3):
-        # lower, and leaning more
-        q = rest.q * share if name != "inverted_pendulum" else rest.q + (1 - share) / 2
-        if name in ("hopper_uni", "walker2d_uni"):
-            q = q.at[2].add(1 - share)
+    fallen = rest.q * 0.3  # lower
+    if "pendulum" in name:
+        fallen = rest.q.at[1].add(1.5)
+    elif name in ("hopper_uni", "walker2d_uni"):
+        fallen = fallen.at[2].add(0.7)  # and leaning
 
-        def done(q: jax.Array, robot: Any) -> jax.Array:
-            state = dataclasses.replace(rest, q=q)
-            return robot.outcome(state, state, action)[1]
+    def done(share: jax.Array, robot: Any) -> jax.Array:
+        state = dataclasses.replace(rest, q=rest.q + share * (fallen - rest.q))
+        return robot.outcome(state, state, action)[1]
 
+    slopes = []
+    for share in np.linspace(0, 1, 41):
         (plain, flat), (value, slope) = (
-            jax.value_and_grad(done)(q, kind) for kind in kinds
+            jax.value_and_grad(done)(share, kind) for kind in kinds
         )
         assert plain == value and value in (0, 1)
-        assert not np.any(flat) and np.all(np.isfinite(slope))
-        seen = max(seen, float(jnp.abs(slope).max()))
-    assert seen > 0.1
+        assert flat == 0 and np.isfinite(slope)
+        slopes.append(slope)
+    # who falls further is nearer to the end
+    assert max(slopes) > 0.1 and min(slopes) > -1e-6
+
+
+@pytest.mark.parametrize("name", ["antmaze", "humanoid_maze"])
+def test_a_maze_has_a_gradient_of_done(name: str) -> None:
+    """A maze has limits of its own."""
+    env = newton_qd.create(name, auto_reset=False)
+    smooth = with_smooth_termination(env, WIDTH)
+    state = env.reset(jax.random.key(0))
+    wrapper: Any = smooth
+    while not isinstance(wrapper, MazeWrapper):
+        wrapper = wrapper.env
+
+    def done(height: jax.Array) -> jax.Array:
+        moved = state.pipeline_state
+        moved = dataclasses.replace(moved, q=moved.q.at[2].set(height))
+        return wrapper._outcome(state.replace(pipeline_state=moved)).done
+
+    low, _ = wrapper.heights
+    for height, ended in ((low + WIDTH, 0), (low - WIDTH, 1)):
+        value, slope = jax.value_and_grad(done)(jnp.float32(height))
+        side = logistic(1.0) * logistic(-1.0) / WIDTH
+        assert value == ended
+        np.testing.assert_allclose(slope, -side, rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["hopper_uni", "ant_uni", "humanoid_uni"])
+def test_the_reward_keeps_its_gradient(name: str) -> None:
+    """Also where an unhealthy robot does not end an episode, but loses a bonus."""
+    env = newton_qd.create(name, auto_reset=False, terminate_when_unhealthy=False)
+    kinds = [_robot(env), _robot(with_smooth_termination(env, WIDTH))]
+    rest = kinds[0].fixed_state().pipeline_state
+
+    def reward(q: jax.Array, robot: Any) -> jax.Array:
+        state = dataclasses.replace(rest, q=q)
+        return robot.outcome(rest, state, jnp.zeros((env.action_size,)))[0]
+
+    one, two = (jax.grad(reward)(rest.q, kind) for kind in kinds)
+    np.testing.assert_array_equal(one, two)
 
 
 def test_the_values_of_a_step_stay_the_same() -> None:
@@ -148,8 +192,19 @@ def test_an_actor_sees_that_a_fall_is_near(start: float) -> None:
     assert seeing[0] < -0.1 and seeing[1] == 0
 
 
-@pytest.mark.parametrize("width", [0.0, -1.0, math.nan, math.inf])
-def test_a_wrong_width_is_refused(width: float) -> None:
+@pytest.mark.parametrize("width", [0.0, -1.0, 1e-39, math.nan, math.inf, True, "0.05"])
+def test_a_wrong_width_is_refused(width: Any) -> None:
     env = newton_qd.create("hopper_uni")
-    with pytest.raises(ValueError, match="width: got"):
+    error = ValueError if type(width) is float else TypeError
+    with pytest.raises(error, match="width: got"):
         with_smooth_termination(env, width)
+    with pytest.raises(error, match="width: got"):
+        within(jnp.zeros(()), (0.0, 1.0), width)
+
+
+def test_the_type_of_the_width_does_not_matter() -> None:
+    with jax.enable_x64(True):
+        one = jnp.ones((), jnp.float32)
+        assert within(one, (np.float64(0), 2), np.float64(WIDTH)).dtype == jnp.float32
+        slope = jax.grad(within)(one, (np.float64(1), 2), np.float64(WIDTH))
+        np.testing.assert_allclose(slope, 1 / (4 * WIDTH), rtol=1e-6)

@@ -126,7 +126,9 @@ class Ant(PhysicsEnv):
         if self._terminate_when_unhealthy:
             bonus, done = jnp.full_like(healthy, self._healthy_reward), 1 - healthy
         else:
-            bonus, done = self._healthy_reward * healthy, jnp.zeros_like(healthy)
+            # only done has a gradient
+            bonus = self._healthy_reward * jax.lax.stop_gradient(healthy)
+            done = jnp.zeros_like(healthy)
         control = rounded(self._ctrl_cost_weight * ordered_sum(jnp.square(action)))
         contact = rounded(self._contact_cost_weight * self._contact_effort(after))
         reward = velocity[0] + bonus - control - contact

@@ -50,7 +50,7 @@ class PhysicsEnv(Env):
     rollout_order: RolloutOrder = RolloutOrder.AT_ONCE
     """How ``rollout`` runs the steps of a plan."""
     termination_width: float | None = None
-    """Distance from a limit over which done has a gradient [m or rad], or ``None``."""
+    """Width of the gradient of done at the limits [m or rad]; ``None``: none."""
     reads_bodies: bool = False
     """Whether a step returns the poses of bodies too; ``kinematics`` is then faster."""
 

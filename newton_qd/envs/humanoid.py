@@ -164,7 +164,9 @@ class Humanoid(PhysicsEnv):
         if self._terminate_when_unhealthy:
             bonus, done = jnp.full_like(healthy, self._healthy_reward), 1 - healthy
         else:
-            bonus, done = self._healthy_reward * healthy, jnp.zeros_like(healthy)
+            # only done has a gradient
+            bonus = self._healthy_reward * jax.lax.stop_gradient(healthy)
+            done = jnp.zeros_like(healthy)
         forward = rounded(self._forward_reward_weight * velocity[0])
         control = rounded(self._ctrl_cost_weight * ordered_sum(jnp.square(action)))
         metrics = {

@@ -5,6 +5,11 @@ from __future__ import annotations
 import functools
 
 import jax
+import numpy as np
+
+from newton_qd import checks
+
+_NARROWEST = 1e-6  # the slope of a narrower step is no number in float32
 
 
 def within(
@@ -17,19 +22,35 @@ def within(
 
     .. math:: \sigma((x - low) / b) \, \sigma((high - x) / b)
 
-    with the logistic function :math:`\sigma`, where each factor has its value of 0 or 1
-    (Bengio et al. 2013, "Estimating or propagating gradients through stochastic
-    neurons", section 5, straight-through).
+    with the logistic function :math:`\sigma` (Bengio et al. 2013, "Estimating or
+    propagating gradients through stochastic neurons", section 5, straight-through). In
+    the derivative of a factor, the other factor has its value, 0 or 1. So the slope at
+    a limit is 1/(4 b).
 
     Args:
         value: () the number.
         limits: The lowest and the highest allowed value, in the unit of ``value``.
         width: Width of the gradient, in the unit of ``value``.
+
+    Raises:
+        TypeError: ``width`` is not a number.
+        ValueError: ``width`` is not finite or below 1e-6.
     """
-    low, high = limits
+    low, high = (np.asarray(limit, value.dtype) for limit in limits)
     if width is None:
         return ((value >= low) & (value <= high)).astype(value.dtype)
-    return _step(value - low, width) * _step(high - value, width)
+    check_width("width", width)
+    return _step(value - low, float(width)) * _step(high - value, float(width))
+
+
+def check_width(name: str, width: object) -> None:
+    """Checks the width of a gradient.
+
+    Raises:
+        TypeError: It is not a number.
+        ValueError: It is not finite or below 1e-6.
+    """
+    checks.number(name, width, least=_NARROWEST)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(1,))

@@ -103,7 +103,9 @@ class UprightRun:
         if self.terminate_when_unhealthy:
             bonus, done = jnp.full_like(healthy, self.healthy_reward), 1 - healthy
         else:
-            bonus, done = self.healthy_reward * healthy, jnp.zeros_like(healthy)
+            # only done has a gradient
+            bonus = self.healthy_reward * jax.lax.stop_gradient(healthy)
+            done = jnp.zeros_like(healthy)
         forward = rounded(self.forward_reward_weight * velocity)
         control = rounded(self.ctrl_cost_weight * ordered_sum(jnp.square(action)))
         metrics = {

@@ -6,6 +6,7 @@ import copy
 
 from newton_qd import checks
 from newton_qd.envs.base import Env, PhysicsEnv
+from newton_qd.envs.limits import check_width
 from newton_qd.physics.system import TAILS
 from newton_qd.wrappers import FeetContactWrapper
 from newton_qd.wrappers.base import Wrapper
@@ -63,20 +64,20 @@ def with_smooth_termination(env: Env, width: float) -> Env:
 
     Args:
         env: The environment; it does not change.
-        width: Distance from a limit over which ``done`` has a gradient [m or rad],
-            above 0.
+        width: Width of the smooth step, a logistic function [m or rad]. The slope of
+            ``done`` at a limit is 1/(4 width).
 
     Raises:
         TypeError: An argument has the wrong type.
-        ValueError: ``width`` is not finite and above 0.
+        ValueError: ``width`` is not finite or below 1e-6.
     """
     checks.environment(env)
-    checks.number("width", width, above=0)
+    check_width("width", width)
 
     def change(base: Env) -> Env:
         changed = copy.copy(base)
         if isinstance(changed, PhysicsEnv):
-            changed.termination_width = width
+            changed.termination_width = float(width)
         return changed
 
     return env.with_base(change)

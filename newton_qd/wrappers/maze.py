@@ -7,7 +7,8 @@ import numpy as np
 
 from newton_qd import checks
 from newton_qd.checks import Fact, listed, message
-from newton_qd.envs.base import Env
+from newton_qd.envs.base import Env, PhysicsEnv
+from newton_qd.envs.limits import within
 from newton_qd.envs.state import State
 from newton_qd.envs.vectors import length
 from newton_qd.scenes import MAZE, Scene
@@ -77,15 +78,16 @@ class MazeWrapper(SceneTaskWrapper):
         """Returns the state with the reward and the end of the task."""
         position = self._position(state)
         away = position[:2] - np.asarray(self._target, self.dtype)
-        low, high = (np.asarray(x, self.dtype) for x in self.heights)
-        outside = (position[2] < low) | (position[2] > high)
+        base = self.unwrapped
+        assert isinstance(base, PhysicsEnv)
+        safe = within(position[2], self.heights, base.termination_width)
         # a world that has a fault is frozen: reward 0 and done 1, as without this
         # wrapper
         faulty = state.info["fault"] != 0
         reward = -length(away)
         return state.replace(
             reward=jnp.where(faulty, jnp.zeros_like(reward), reward),
-            done=(outside | faulty).astype(self.dtype),
+            done=jnp.where(faulty, jnp.ones_like(safe), 1 - safe),
         )
 
 
