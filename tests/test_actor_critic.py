@@ -254,18 +254,6 @@ def test_steered_actors_begin_again() -> None:
     assert not (changed[:, 1] & changed[:, 2]).any()
 
 
-@pytest.mark.parametrize(
-    ("lifetime", "expected"), [(None, [0, 0, 0, 0, 0, 0]), (3, [1, 0, 0, 1, 0, 0])]
-)
-def test_actors_that_climb_may_begin_again(
-    lifetime: int | None, expected: list[int]
-) -> None:
-    due = jax.vmap(emitter(fitness_lifetime=lifetime)._due)(jnp.arange(6))
-    np.testing.assert_array_equal(due[:, 0], expected)
-    np.testing.assert_array_equal(due[:, 1], [1, 0, 1, 0, 1, 0])
-    np.testing.assert_array_equal(due[:, 2], [0, 1, 0, 1, 0, 1])
-
-
 def test_equal_keys_give_equal_bits() -> None:
     one, two = (generations(3)[-1] for _ in range(2))
     np.testing.assert_array_equal(one[1], two[1])
@@ -283,7 +271,6 @@ def test_lost_gradients_are_told() -> None:
         ({"actors": 0}, "actors: got 0; allowed: .* from 1"),
         ({"copies": 0}, "copies: got 0; allowed: .* from 1"),
         ({"lifetime": 0}, "lifetime: got 0; allowed: .* from 1"),
-        ({"fitness_lifetime": 0}, "fitness_lifetime: got 0; allowed: .* from 1"),
         ({"spread": (0.1, 0.01)}, r"spread: got \(0.1, .*; .*0 < smallest <= largest"),
         ({"steered": -0.1}, "steered: got -0.1; .* from 0 to 1"),
     ],

@@ -58,8 +58,7 @@ class ActorCriticEmitter(Emitter):
 
     where :math:`m_t` is the measure that a control step adds to the descriptor. So they
     move in this direction, to the border of the archive. After a number of generations,
-    they restart from a random elite with another direction. The others learn on, or
-    restart as well.
+    they restart from a random elite with another direction.
 
     An actor a emits several individuals at several times. One of them is a copy of its
     weights. The others lie between the actor and elites e,
@@ -82,7 +81,6 @@ class ActorCriticEmitter(Emitter):
         steered: float = 0.5,
         fitness: float = 0.1,
         lifetime: int = 10,
-        fitness_lifetime: int | None = None,
         measures: int,
     ) -> None:
         """Sets the actors and how much they learn.
@@ -99,18 +97,14 @@ class ActorCriticEmitter(Emitter):
             steered: Share of the actors that follow directions of the descriptor [-].
             fitness: Weight of the reward for steered actors [-].
             lifetime: Generations after which a steered actor restarts.
-            fitness_lifetime: Generations after which an actor that maximizes the
-                fitness restarts; ``None``: never.
             measures: Length of the descriptor.
 
         Raises:
             ValueError: A number is out of its range.
         """
         counts = {"actors": actors, "branches": branches, "copies": copies}
-        counts = {**counts, "updates": updates, "lifetime": lifetime}
-        if fitness_lifetime is not None:
-            counts["fitness_lifetime"] = fitness_lifetime
-        for name, value in counts.items():
+        counts = {**counts, "updates": updates}
+        for name, value in {**counts, "lifetime": lifetime}.items():
             checks.integer(name, value, most=None)
         if not 0 < spread[0] <= spread[1]:
             raise ValueError(message("spread", spread, "0 < smallest <= largest"))
@@ -125,7 +119,6 @@ class ActorCriticEmitter(Emitter):
         self._steered = round(steered * actors)
         self._fitness = fitness
         self._lifetime = lifetime
-        self._fitness_lifetime = fitness_lifetime
         self._measures = measures
 
     @property
@@ -262,20 +255,10 @@ class ActorCriticEmitter(Emitter):
         weights = repertoire.genotypes[cells]
         weights = self._method.whitening.whitened(weights, state.scale)
         new = self._begun(critic_key, weights, self._aims(aim_key))
-        due = self._due(state.generation) & (state.generation > 0)
-        return select(due, new, state.learners)
-
-    def _due(self, generation: jax.Array) -> jax.Array:
-        """Returns which actors (K,) have come to the end of their lifetime."""
         number = jnp.arange(self._actors)
+        # one after the other, so that there are actors of all ages
+        turn = number * self._lifetime // max(self._actors, 1)
+        due = (state.generation + turn) % self._lifetime == 0
         steered = number >= self._actors - self._steered
-
-        def over(lifetime: int) -> jax.Array:
-            # one after the other, so that there are actors of all ages
-            turn = number * lifetime // self._actors
-            return (generation + turn) % lifetime == 0
-
-        due = steered & over(self._lifetime)
-        if self._fitness_lifetime is not None:
-            due |= ~steered & over(self._fitness_lifetime)
-        return due
+        begun = state.generation > 0
+        return select(due & steered & begun, new, state.learners)
