@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from study_protocols import OURS, PROTOCOLS
 from study_report import interval
-from study_runs import TUNING_SEED, lines
+from study_runs import TUNING_SEED, chosen, lines
 
 from newton_qd.qd.run import quality
 
@@ -61,8 +61,8 @@ Results = dict[Key, list[Scored]]
 def load(folder: Path) -> Results:
     """Reads the runs of a folder; the seed of the tuning is left out.
 
-    The variant of an algorithm with the most runs on a task has the algorithm's name.
-    Others have their own, as if they were algorithms of their own.
+    The variant of an algorithm that ``field.toml`` chooses for a task has the
+    algorithm's name. Others have their own, as if they were algorithms of their own.
     """
     kept = [line for line in lines(folder) if int(line["seed"]) != TUNING_SEED]
     main = _main_variants(kept)
@@ -77,15 +77,22 @@ def load(folder: Path) -> Results:
 
 
 def _main_variants(kept: list[dict[str, str]]) -> dict[tuple[str, str], str]:
-    """Returns the variant with the most lines, by task and algorithm; no ablations."""
+    """Returns the chosen variant, by task and algorithm; no ablations.
+
+    A variant without a line is not chosen. Then the one with the most lines is taken.
+    """
     counts = Counter(
         (line["task"], line["algorithm"], line["variant"])
         for line in kept
         if line["variant"].split("@")[1].isdigit()
     )
+    found = {}
     # later keys replace earlier ones
-    ordered = sorted(counts, key=lambda key: counts[key])
-    return {key[:2]: key[2] for key in ordered}
+    for task, algorithm, variant in sorted(counts, key=lambda key: counts[key]):
+        wanted = chosen(algorithm, task)
+        there = (task, algorithm, wanted) in counts
+        found[task, algorithm] = wanted if there else variant
+    return found
 
 
 def best_known() -> dict[str, float]:
@@ -229,20 +236,21 @@ def verdict(results: Results, stop: str) -> str:
 def published(results: Results) -> str:
     """Markdown table: ratios to MAP-Elites with a million evaluations, and published.
 
-    The published scores have no offset, and neither have these.
+    The published scores have no offset, and neither have these. They are of a single
+    evaluation of each individual, as in the first variant of each algorithm.
     """
     rows = ["| task | algorithm | ratio here | published |", "|---|---|---|---|"]
     for task, scores in PUBLISHED.items():
-        sums = {
-            name: [np.sum(run.raw[np.isfinite(run.raw)]) for run in runs]
-            for name in scores
-            if (runs := results.get((task, name, "1000000 evaluations")))
-        }
+        sums: dict[str, list[float]] = {}
+        for (own, _, stop), runs in results.items():
+            name, number = runs[0].line["variant"].split("@")
+            if (own, stop, number) == (task, "1000000 evaluations", "1"):
+                sums[name] = [run.raw[np.isfinite(run.raw)].sum() for run in runs]
         if "me" not in sums:
             continue
         base = np.median(sums["me"])
-        for name, found in sums.items():
-            ratio, other = np.median(found) / base, scores[name] / scores["me"]
+        for name in [name for name in scores if name in sums]:
+            ratio, other = np.median(sums[name]) / base, scores[name] / scores["me"]
             rows.append(f"| {task} | {name} | {ratio:.2f} | {other:.2f} |")
     return "\n".join(rows) if len(rows) > 2 else ""
 

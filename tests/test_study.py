@@ -66,7 +66,7 @@ def test_every_variant_is_a_setting(protocol: Any) -> None:
 def test_baselines_get_as_many_variants(task: str) -> None:
     ours = [len(study_runs.numbered(name, task)) for name in study_scores.OURS]
     others = [len(study_runs.numbered(name, task)) for name in BASELINES]
-    assert 1 <= min(ours) and max(ours) <= min(others) == 4
+    assert 1 <= min(ours) and max(ours) <= min(others) == 5
 
 
 def test_variants_name_tasks_of_the_protocol() -> None:
@@ -117,7 +117,7 @@ def test_without_tuning_the_variants_of_the_report_run() -> None:
         tasks=[TASK], algorithms=["me", "me-actor-critic"], seeds=1, until=60
     )
     found = [run.variant for run in study_runs.planned(FIELD, choice)]
-    assert found == ["me@1", "me-actor-critic@11"]
+    assert found == ["me@5", "me-actor-critic@13"]
     found = [run.variant for run in study_runs.planned(SMALL, choice)]
     assert found == ["me@0", "me-actor-critic@0"]
 
@@ -136,7 +136,7 @@ def test_finished_runs_are_left_out(tmp_path: Path) -> None:
 
 
 def test_tuning_chooses_the_corrected_score(tmp_path: Path) -> None:
-    assert len(left(tmp_path, tune=True)) == 4
+    assert len(left(tmp_path, tune=True)) == 5
     for variant, gain in (("me@1", 3.0), ("me@2", 5.0), ("me@3", 4.0)):
         row = line("me", 1000, "20 s", corrected_qd_gain=gain) | {"variant": variant}
         study_runs.add_line(tmp_path / "runs.csv", row)
@@ -146,20 +146,43 @@ def test_tuning_chooses_the_corrected_score(tmp_path: Path) -> None:
         study_runs.best_variant(tmp_path, TASK, "pga-me")
 
 
-def test_the_variant_with_most_runs_has_the_name(tmp_path: Path) -> None:
-    (tmp_path / "cells").mkdir()
-    runs = (("me@1", 0), ("me@3", 0), ("me@3", 1), ("me@3", 1000), ("me@cut", 0))
+def names(folder: Path, runs: tuple[tuple[str, int], ...]) -> dict[str, list[int]]:
+    """Seeds of each algorithm of the report, if these variants ran with these seeds."""
+    (folder / "cells").mkdir(parents=True)
     for variant, seed in runs:
         cells: dict[str, Any] = {"20 s": np.ones((2, CELLS))}
-        np.savez(tmp_path / "cells" / f"{TASK}.{variant}.{seed}.npz", **cells)
+        np.savez(folder / "cells" / f"{TASK}.{variant}.{seed}.npz", **cells)
         row = line("me", seed, "20 s") | {"variant": variant}
-        study_runs.add_line(tmp_path / "runs.csv", row)
-    found = study_scores.load(tmp_path)
-    assert {key[1]: [run.seed for run in runs] for key, runs in found.items()} == {
-        "me": [0, 1],
-        "me@1": [0],
-        "me@cut": [0],
-    }
+        study_runs.add_line(folder / "runs.csv", row)
+    found = study_scores.load(folder)
+    return {key[1]: [run.seed for run in runs] for key, runs in found.items()}
+
+
+def test_the_chosen_variant_has_the_name(tmp_path: Path) -> None:
+    runs = (("me@1", 0), ("me@3", 0), ("me@3", 1), ("me@3", 1000), ("me@cut", 0))
+    expected = {"me": [0, 1], "me@1": [0], "me@cut": [0]}
+    assert names(tmp_path / "most", runs) == expected  # the chosen one did not run
+    chosen = study_runs.chosen("me", TASK)
+    expected = {"me": [0], "me@1": [0], "me@3": [0, 1], "me@cut": [0]}
+    assert names(tmp_path / "chosen", ((chosen, 0), *runs)) == expected
+
+
+def test_published_ratios_are_of_single_evaluations() -> None:
+    stop = "1000000 evaluations"
+    results = {}
+    for name, variant, value in (
+        ("me", "me@5", 9.0),
+        ("me@1", "me@1", 1.0),
+        ("dcrl-me", "dcrl-me@1", 1.5),
+    ):
+        row = line(variant.split("@")[0], 0, stop) | {"variant": variant}
+        raw = np.array([value, value, -np.inf])
+        results[TASK, name, stop] = [study_scores.Scored(0, row, raw, raw)]
+    rows = study_scores.published(results).splitlines()[2:]
+    assert rows == [
+        f"| {TASK} | me | 1.00 | 1.00 |",
+        f"| {TASK} | dcrl-me | 1.50 | 1.31 |",
+    ]
 
 
 def test_the_best_known_fitness_only_rises(tmp_path: Path, monkeypatch: Any) -> None:
