@@ -294,3 +294,8 @@ def test_bad_numbers_are_refused(changes: dict[str, Any], message: str) -> None:
 def test_bad_settings_are_refused(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         method(**changes)
+
+
+def test_settings_of_a_wrong_type_are_refused() -> None:
+    with pytest.raises(TypeError, match="whiten: got 'no'; allowed: True, False"):
+        method(whiten="no")

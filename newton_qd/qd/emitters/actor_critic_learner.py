@@ -253,7 +253,7 @@ class ActorCritic:
             if settings.actor_trace < 1:  # else without the value, also if it is NaN
                 part = settings.actor_trace
                 total = (1 - part) * value + part * total
-            # what a fall loses is the value of going on; only done has this gradient
+            # after a fall, the value has no gradient; only done has one
             total = jnp.where(done > 0, jax.lax.stop_gradient(lost), total)
             total = gain + settings.discount * (1 - done) * total
             target = gain + settings.discount * jnp.where(done > 0, 0, mixed)

@@ -27,10 +27,11 @@ class ActorCriticSettings:
         epochs: Number of times that the critic learns from a window.
         batches: Optimizer steps of the critic in each epoch.
         whiten: Whether an actor learns weights for whitened observations.
-        termination_width: Distance from the limits of a healthy robot over which an
-            actor sees that a fall is near [m or rad]; 0: it does not see it.
+        termination_width: Width of the gradient of ``done`` at the limits of a healthy
+            robot [m or rad]; with 0, an actor does not see that a fall is near.
 
     Raises:
+        TypeError: A value has a wrong type.
         ValueError: A value is out of its range.
     """
 
@@ -53,8 +54,10 @@ class ActorCriticSettings:
         """Checks every value.
 
         Raises:
+            TypeError: A value has a wrong type.
             ValueError: A value is out of its range.
         """
+        checks.flag("whiten", self.whiten)
         object.__setattr__(self, "critic", tuple(self.critic))
         for name in ("worlds", "window", "epochs", "batches"):
             checks.integer(name, getattr(self, name), most=None)
