@@ -5,10 +5,8 @@ of one world and supports ``jit``, ``vmap`` and ``grad``. A batch is one launch,
 with nested ``vmap``.
 """
 
-import atexit
 import contextlib
 import functools
-import time
 from collections.abc import Callable, Iterator
 from typing import Protocol
 
@@ -17,6 +15,7 @@ import numpy as np
 import warp as wp
 
 from newton_qd.physics import interrupts
+from newton_qd.physics.ending import stop_at_exit
 from newton_qd.physics.explicit_mesh import over_devices, row_like
 from newton_qd.physics.native import Plan
 from newton_qd.physics.native.library import library
@@ -43,29 +42,17 @@ class _Callbacks:
     """The calls from XLA into Python.
 
     Attributes:
-        begun: Number of calls until now.
-        refused: Whether calls end with an error, because Python ends.
+        ended: Whether calls end with an error, because Python ends.
+        refused: Number of calls that ended with this error.
     """
 
-    def __init__(self) -> None:
-        self.begun = 0
-        self.refused = False
+    ended: bool = False
+    refused: int = 0
 
-    def refuse(self) -> None:
-        """Ends the programs of other threads at their next call.
-
-        Python stops a daemon thread that is inside XLA with an exception that C++
-        cannot handle. The thread has to leave XLA before.
-        """
-        self.refused = True
-        seen, self.begun = -1, 0
-        while seen != self.begun:
-            seen = self.begun
-            time.sleep(_LEAVING_SECONDS)
-
-
-_LEAVING_SECONDS = 0.05
-_callbacks = _Callbacks()
+    @classmethod
+    def end(cls) -> None:
+        """Ends the programs of other threads at their next call."""
+        cls.ended = True
 
 
 @contextlib.contextmanager
@@ -81,8 +68,8 @@ def _errors_contained() -> Iterator[None]:
     """
     # Notebooks restore Python's SIGINT handler before each cell.
     interrupts.install()
-    _callbacks.begun += 1
-    if _callbacks.refused:
+    if _Callbacks.ended:
+        _Callbacks.refused += 1
         raise RuntimeError("the physics was stopped, because Python ends")
     try:
         yield
@@ -158,26 +145,13 @@ def _register() -> None:
     for name, address in library().handlers.items():
         capsule = jax.ffi.pycapsule(address)
         jax.ffi.register_ffi_target(name, capsule, platform="cpu")
-    atexit.register(_cut_off, library().stop)
+    stop_at_exit(library().stop, library().stopped, in_python=False)
 
 
 @functools.cache
 def _end_callbacks() -> None:
     """Ends calls into Python before Python ends."""
-    atexit.register(_cut_off, _callbacks.refuse)
-
-
-def _cut_off(stop: Callable[[], None]) -> None:
-    """Stops the physics that is still in flight when the program ends.
-
-    XLA would wait for it, and its results are lost anyway. Programs with effects, such
-    as ``jax.debug.print``, run to their end.
-
-    Args:
-        stop: Lets physics in flight, and all later physics, end with an error.
-    """
-    jax.effects_barrier()
-    stop()
+    stop_at_exit(_Callbacks.end, lambda: _Callbacks.refused, in_python=True)
 
 
 def native_row_call(plan: Plan, target: str = "newton_qd_rows") -> RowCall:

@@ -86,6 +86,7 @@ struct Plan {  // a kernel of a system
 static System os;
 static Plan* plans[BUCKETS];
 static int stopping;
+static int64 stopped;  // calls that ended because of it
 
 // ---- Memory
 
@@ -392,7 +393,10 @@ static void* error_of(const Call* call, int code) {
     if (!code) return nullptr;
     ErrorArguments given = {sizeof(ErrorArguments), nullptr, "the physics ran out of memory", code};
     if (code == INVALID_ARGUMENT) given.message = "NEWTON_QD_THREADS: allowed: integers from 1";
-    if (code == CANCELLED) given.message = "the physics was stopped, because Python ends";
+    if (code == CANCELLED) {
+        given.message = "the physics was stopped, because Python ends";
+        __atomic_fetch_add(&stopped, 1, __ATOMIC_RELAXED);
+    }
     if (code == NOT_FOUND) given.message = "the physics does not know this kernel";
     return call->api->create_error(&given);
 }
@@ -472,5 +476,8 @@ void newton_qd_free(Plan* plan) {
 
 // All kernels that run return an error soon, and so does every later call.
 void newton_qd_stop() { __atomic_store_n(&stopping, 1, __ATOMIC_RELAXED); }
+
+// Number of calls from XLA that ended with this error.
+int64 newton_qd_stopped() { return __atomic_load_n(&stopped, __ATOMIC_RELAXED); }
 
 }  // extern "C"

@@ -63,6 +63,7 @@ class Library:
         self._add = ctypes.CFUNCTYPE(None, pointer)(find("newton_qd_add"))
         self._free = ctypes.CFUNCTYPE(None, pointer)(find("newton_qd_free"))
         self._stop = ctypes.CFUNCTYPE(None)(find("newton_qd_stop"))
+        self._stopped = ctypes.CFUNCTYPE(integer)(find("newton_qd_stopped"))
         functions, initializers = _threading_functions()
         system = _System(*functions, usable_cores())
         begin = ctypes.CFUNCTYPE(None, pointer, pointer, pointer)
@@ -93,6 +94,10 @@ class Library:
     def stop(self) -> None:
         """Lets all kernels that run, and all later calls, end soon with an error."""
         self._stop()
+
+    def stopped(self) -> int:
+        """Returns the number of calls from XLA that ended with this error."""
+        return self._stopped()
 
 
 def _threading_functions() -> tuple[list[int | None], list[int | None]]:
