@@ -69,7 +69,10 @@ def test_results_are_joined(starts: int, statistic: str) -> None:
     assert np.allclose(found[:2], expected[:, 1:], atol=1e-6)
     steps = extra["transitions"]["obs"]
     assert steps.shape == (3, 2 * starts, 3)
-    assert np.array_equal(steps[:, 2:4], each[1][2]["transitions"]["obs"])
+    second = each[1][2]["transitions"]["obs"]
+    # compiled, some processors round differently; other starts are far away
+    assert np.allclose(steps[:, 2:4], second, atol=1e-6)
+    assert not np.allclose(steps[:, :2], second, atol=1e-2)
     # the gradient is that of the mean or median, by central differences
     for axis in range(2):
         moved = genotypes.at[:, axis].add(1e-2), genotypes.at[:, axis].add(-1e-2)
