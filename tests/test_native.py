@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import dataclasses
 import gc
 import subprocess
@@ -20,7 +21,7 @@ from newton_qd import physics
 from newton_qd.physics import bridge, ending, layout
 from newton_qd.physics.launch import Launcher
 from newton_qd.physics.native import all_plans
-from newton_qd.physics.native.plans import _parts
+from newton_qd.physics.native.plans import _parts, _Plan
 from newton_qd.robots import HOPPER
 
 # Work of hours is in flight when the program ends. XLA runs programs with matrix
@@ -147,6 +148,21 @@ def test_a_plan_that_nobody_holds_gives_its_memory_back() -> None:
     del plan, launcher
     gc.collect()
     assert held() is None and not struct.pool
+
+
+def test_a_plan_can_be_registered_again() -> None:
+    """As for a system that makes steps and rollouts. No list of plans has a ring."""
+    system = physics.load_system(dataclasses.replace(HOPPER, gravity=8.0))
+    plan = bridge.launcher(system, wp.get_device("cpu")).plan("step_forward")
+    plan.register()
+    known = len(all_plans())
+    plan.register()
+    assert plan in all_plans() and len(all_plans()) == known
+    place, seen = ctypes.addressof(plan._struct), []
+    while place:
+        assert place not in seen
+        seen.append(place)
+        place = _Plan.from_address(place).next
 
 
 def test_parts_tell_contents_apart() -> None:

@@ -132,10 +132,12 @@ class Plan:
     def register(self) -> None:
         """Lets compiled programs find the plan by its key, from now on.
 
-        The first plan of equal contents stays.
+        The first plan of equal contents stays. A plan may be registered again: the
+        native code has it once, because its lists would have no end otherwise.
         """
         with _lock:
-            if _plans.setdefault(self.key, self) is self:
+            if self.key not in _plans:
+                _plans[self.key] = self
                 library().add(self._struct)
 
     @property
