@@ -30,6 +30,7 @@ compiled = functools.partial(
     jax.jit, compiler_options={"xla_backend_optimization_level": 0}
 )
 SIZE, LENGTH = 6, 20
+LIMITS = (np.full(2, -2.0, np.float32), np.full(2, 2.0, np.float32))
 SETTINGS = ActorCriticSettings(
     worlds=4, window=5, rate=0.05, clip=1e6, noise=0.1, critic=(8,), batches=2
 )
@@ -146,6 +147,34 @@ def test_values_inside_of_a_window_count() -> None:
         np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-3)
 
 
+@pytest.mark.parametrize("kept", [0, 0.9])
+def test_noise_has_its_deviation_and_its_correlation(kept: float) -> None:
+    way = method(worlds=20_000, window=4, noise=0.5, noise_correlation=kept)
+    noise = np.asarray(way._noise(jax.random.key(0), jnp.float32))
+    assert noise.shape == (20_000, 4, 2) and noise.dtype == np.float32
+    # the standard error of both is below 1 / sqrt(20,000) = 0.007
+    np.testing.assert_allclose(noise.std(axis=0), 0.5, rtol=0.03)
+    for lag in (1, 2, 3):
+        found = (noise[:, lag:] * noise[:, :-lag]).mean(axis=0) / 0.25
+        np.testing.assert_allclose(found, kept**lag, atol=0.03)
+    assert abs((noise[..., 0] * noise[..., 1]).mean() / 0.25) < 0.03
+
+
+def test_the_age_of_a_world_begins_again_after_a_fall() -> None:
+    right = jnp.array([1.0, 0.0])
+    settings = dataclasses.replace(SETTINGS, window=10, noise=0.0)
+    way = ActorCritic(PointEnv(), lambda *_: right, reading, LENGTH, settings)
+    first = jax.vmap(PointEnv().reset)(jax.random.split(jax.random.key(0), 4))
+    start = way.begin(jax.random.key(1), jnp.zeros(SIZE), jnp.ones(3), first)
+    assert start.age.tolist() == [0, 5, 10, 15]
+    scale = jnp.zeros(3), jnp.ones(3)
+    after, failed = compiled(way.update)(start, scale, jax.random.key(2))
+    # a step is 0.3 long, and the point falls 2 away from the middle: in step 7
+    assert not failed and after.age.tolist() == [3, 3, 3, 3]
+    place = first.pipeline_state + 3 * 0.3 * right
+    np.testing.assert_allclose(after.worlds.pipeline_state, place, atol=1e-5)
+
+
 @pytest.mark.slow
 def test_actors_reach_what_they_aim_at() -> None:
     best, lost = learned(method(), (1.0, 0.0, 0.0))
@@ -190,7 +219,7 @@ def test_measures_are_those_of_the_descriptor() -> None:
 def emitter(measure: Any = reading, **changes: Any) -> ActorCriticEmitter:
     given = {"actors": 3, "branches": 2, "copies": 4, "updates": 2, "lifetime": 2}
     first = PointEnv().reset(jax.random.key(0))
-    options: Any = {**given, "steered": 0.7, "measures": 2, **changes}
+    options: Any = {**given, "steered": 0.7, "limits": LIMITS, **changes}
     return ActorCriticEmitter(method(measure), first, **options)
 
 
@@ -287,6 +316,7 @@ def test_bad_numbers_are_refused(changes: dict[str, Any], message: str) -> None:
         ({"batches": 21}, r"batches: got 21; .*at most worlds \* window = 20"),
         ({"clip": 0.0}, "clip: got 0.0; allowed: finite .*above 0"),
         ({"noise": -1.0}, "noise: got -1.0; allowed: .* from 0"),
+        ({"noise_correlation": 1.0}, "noise_correlation: got 1.0; allowed: .* below 1"),
         ({"trace": 2.0}, "trace: got 2.0; allowed: .* from 0 to 1"),
         ({"actor_trace": 2.0}, "actor_trace: got 2.0; allowed: .* from 0 to 1"),
     ],

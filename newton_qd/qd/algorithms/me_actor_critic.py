@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+from newton_qd import checks
 from newton_qd.checks import message
 from newton_qd.qd.algorithms.gradient_options import initial_scale
 from newton_qd.qd.algorithms.learning import LearningOptions, learning_method
@@ -26,6 +27,8 @@ class ActorCriticOptions(LearningOptions):
         steered: Share of the actors that follow directions of the descriptor [-].
         fitness: Weight of the reward of steered actors [-].
         lifetime: Generations after which a steered actor restarts from a random elite.
+        shared: Whether all actors learn one critic together. It is told what an actor
+            aims at, and the descriptor from which it began.
     """
 
     actors: int = 2
@@ -35,6 +38,17 @@ class ActorCriticOptions(LearningOptions):
     steered: float = 0.5
     fitness: float = 0.1
     lifetime: int = 10
+    shared: bool = False
+
+    def __post_init__(self) -> None:
+        """Checks every value.
+
+        Raises:
+            TypeError: A value has a wrong type.
+            ValueError: A value is out of its range.
+        """
+        super().__post_init__()
+        checks.flag("shared", self.shared)
 
     def episodes(self, config: EvolveConfig) -> int:
         """Returns the control steps of a generation's updates, counted in episodes."""
@@ -58,7 +72,10 @@ def _make(context: EmitterContext, options: ActorCriticOptions) -> Any:
     """
     from newton_qd.qd.emitters import ActorCriticEmitter
 
-    config, (task, method) = context.config, learning_method(context, options)
+    config, (task, method) = (
+        context.config,
+        learning_method(context, options, shared=options.shared),
+    )
     emitter = ActorCriticEmitter(
         method,
         task.env.reset(context.reset_key),
@@ -69,7 +86,7 @@ def _make(context: EmitterContext, options: ActorCriticOptions) -> Any:
         steered=options.steered,
         fitness=options.fitness,
         lifetime=options.lifetime,
-        measures=task.descriptor_length,
+        limits=task.limits,
     )
     if emitter.batch_size > config.batch_size:
         given = options.actors, options.branches, options.copies

@@ -6,12 +6,13 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from qdax.core.emitters.emitter import Emitter
 
 from newton_qd import checks
 from newton_qd.checks import message
 from newton_qd.envs.state import select
-from newton_qd.qd.emitters.actor_critic_learner import ActorCritic, Learner
+from newton_qd.qd.emitters.actor_critic_learner import ACTORS, ActorCritic, Learner
 from newton_qd.qd.emitters.cells import draw_cells
 from newton_qd.types import (
     ExtraScores,
@@ -66,6 +67,11 @@ class ActorCriticEmitter(Emitter):
     .. math:: a + s (e - a) + \sigma \epsilon, \qquad s \sim U(0, 1),
 
     with a standard deviation that is drawn log-uniformly from a range.
+
+    Actors may share one critic. Then it is told what an actor aims at, and the
+    descriptor of the elite from which the actor began. So it does not have to learn
+    anew when an actor restarts, and actors can be many, with few worlds each. As in
+    DCRL-ME (Faldor et al. 2024), one critic knows the policies of the whole archive.
     """
 
     def __init__(
@@ -81,7 +87,7 @@ class ActorCriticEmitter(Emitter):
         steered: float = 0.5,
         fitness: float = 0.1,
         lifetime: int = 10,
-        measures: int,
+        limits: tuple[np.ndarray, np.ndarray],
     ) -> None:
         """Sets the actors and how much they learn.
 
@@ -97,7 +103,7 @@ class ActorCriticEmitter(Emitter):
             steered: Share of the actors that follow directions of the descriptor [-].
             fitness: Weight of the reward for steered actors [-].
             lifetime: Generations after which a steered actor restarts.
-            measures: Length of the descriptor.
+            limits: Lowest and highest descriptor, (D,) each.
 
         Raises:
             ValueError: A number is out of its range.
@@ -119,7 +125,7 @@ class ActorCriticEmitter(Emitter):
         self._steered = round(steered * actors)
         self._fitness = fitness
         self._lifetime = lifetime
-        self._measures = measures
+        self._limits = limits
 
     @property
     def batch_size(self) -> int:
@@ -140,12 +146,13 @@ class ActorCriticEmitter(Emitter):
         With whitening, they are read as weights for whitened observations, which makes
         them other policies.
         """
-        del repertoire, descriptors, extra_scores
+        del repertoire, extra_scores
         key, scale_key, aim_key, critic_key = jax.random.split(key, 4)
         # repeats the best if there are more actors than individuals
         order = jnp.resize(jnp.argsort(-fitnesses.reshape(-1)), (self._actors,))
         weights = genotypes[order]
-        learners = self._begun(critic_key, weights, self._aims(aim_key))
+        places = descriptors[order]
+        learners = self._begun(critic_key, weights, self._aims(aim_key), places)
         return ActorCriticState(
             learners=learners,
             scale=self._method.scale(scale_key, self._worlds()),
@@ -198,7 +205,7 @@ class ActorCriticEmitter(Emitter):
         state = emitter_state
         key, renewal_key, learn_key = jax.random.split(state.key, 3)
         learners = self._renewed(state, repertoire, renewal_key)
-        update = jax.vmap(self._method.update, in_axes=(0, None, 0))
+        update = jax.vmap(self._method.update, (0, None, 0), axis_name=ACTORS)
 
         def learn(carry: tuple, key: jax.Array) -> tuple[tuple, None]:
             learners, failed = carry
@@ -225,15 +232,29 @@ class ActorCriticEmitter(Emitter):
             lambda leaf: jnp.broadcast_to(leaf, (number, *jnp.shape(leaf))), self._first
         )
 
-    def _begun(self, key: jax.Array, weights: jax.Array, aims: jax.Array) -> Learner:
-        """Returns K new actors with weights (K, size)."""
-        keys = jax.random.split(key, self._actors)
-        begin = jax.vmap(self._method.begin, in_axes=(0, 0, 0, None))
-        return begin(keys, weights, aims, self._worlds())
+    def _begun(
+        self, key: jax.Array, weights: jax.Array, aims: jax.Array, places: jax.Array
+    ) -> Learner:
+        """Returns K new actors.
+
+        Args:
+            key: Key of the critics.
+            weights: (K, size) weights.
+            aims: (K, 1 + D) aims.
+            places: (K, D) descriptors of the elites from which they begin.
+        """
+        keys, told = jax.random.split(key, self._actors), aims[:, :0]
+        if self._method.shared:
+            low, high = self._limits
+            middle, half = (low + high) / 2, (high - low) / 2
+            told = jnp.concatenate([(places - middle) / half, aims], axis=1)
+            keys = jnp.broadcast_to(key, keys.shape)
+        begin = jax.vmap(self._method.begin, in_axes=(0, 0, 0, None, 0))
+        return begin(keys, weights, aims, self._worlds(), told)
 
     def _aims(self, key: jax.Array) -> jax.Array:
         """Returns the aims (K, 1 + D) of the actors; steered actors are last."""
-        shape = (self._actors, self._measures)
+        shape = (self._actors, len(self._limits[0]))
         ways = jax.random.normal(key, shape, jnp.float32)
         ways = ways / jnp.linalg.norm(ways, axis=1, keepdims=True)
         steered = jnp.arange(self._actors) >= self._actors - self._steered
@@ -254,11 +275,17 @@ class ActorCriticEmitter(Emitter):
         cells = draw_cells(cell_key, filled, self._actors)
         weights = repertoire.genotypes[cells]
         weights = self._method.whitening.whitened(weights, state.scale)
-        new = self._begun(critic_key, weights, self._aims(aim_key))
+        places, old = repertoire.descriptors[cells], state.learners
+        new = self._begun(critic_key, weights, self._aims(aim_key), places)
+        if self._method.shared:
+            moments = new.moments[0], old.moments[1]
+            new = dataclasses.replace(
+                new, critic=old.critic, target=old.target, moments=moments
+            )
         number = jnp.arange(self._actors)
         # one after the other, so that there are actors of all ages
         turn = number * self._lifetime // max(self._actors, 1)
         due = (state.generation + turn) % self._lifetime == 0
         steered = number >= self._actors - self._steered
         begun = state.generation > 0
-        return select(due & steered & begun, new, state.learners)
+        return select(due & steered & begun, new, old)

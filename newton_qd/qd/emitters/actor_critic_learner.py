@@ -10,6 +10,7 @@ from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 
 from newton_qd.envs.state import select
@@ -25,6 +26,8 @@ Layers: TypeAlias = list[tuple[jax.Array, jax.Array]]
 
 _SETTLING = 100  # random steps to measure the scale of observations
 _LEAST = 0.1  # smallest deviation of an entry of an observation
+ACTORS = "actors"
+"""Name of the axis of actors that share a critic, for ``jax.vmap``."""
 
 
 @jax.tree_util.register_dataclass
@@ -35,7 +38,8 @@ class Learner:
     Attributes:
         weights: (size,) weights of the policy, for whitened observations.
         aim: (1 + D,) weights of the reward and of each component of the measure.
-        critic: The critic.
+        told: What the critic is told besides observations, (0,) if it is not shared.
+        critic: The critic; equal for all actors that share it.
         target: A slower copy of the critic, from which the actor learns.
         moments: States of the optimizers of actor and critic.
         first: Initial states of the W worlds, leaves (W, ...).
@@ -45,6 +49,7 @@ class Learner:
 
     weights: jax.Array
     aim: jax.Array
+    told: jax.Array
     critic: Layers
     target: Layers
     moments: tuple[PyTree, PyTree]
@@ -82,6 +87,7 @@ class ActorCritic:
         settings: Settings of the learning.
         whitening: Converts the weights of an actor, which are for whitened
             observations, to those of ``policy``; the default changes nothing.
+        shared: Whether all actors learn one critic together. Each has a copy of it.
     """
 
     env: Environment
@@ -90,6 +96,7 @@ class ActorCritic:
     episode_length: int
     settings: ActorCriticSettings
     whitening: Whitening = dataclasses.field(default_factory=Whitening)
+    shared: bool = False
 
     @property
     def steps(self) -> int:
@@ -126,22 +133,31 @@ class ActorCritic:
         return obs.mean(axis=0), jnp.maximum(obs.std(axis=0), _LEAST)
 
     def begin(
-        self, key: jax.Array, weights: jax.Array, aim: jax.Array, first: PyTree
+        self,
+        key: jax.Array,
+        weights: jax.Array,
+        aim: jax.Array,
+        first: PyTree,
+        told: jax.Array | None = None,
     ) -> Learner:
         """Returns a new actor with a new critic.
 
         Args:
-            key: Key of the weights of the critic.
+            key: Key of the weights of the critic; the same for actors that share it.
             weights: (size,) weights of the actor, for whitened observations.
             aim: (1 + D,) weights of the reward and of each measure.
             first: Initial states of its worlds, leaves (W, ...).
+            told: What the critic is told besides observations; ``None``: nothing.
         """
         number = self.settings.worlds
-        critic = _network(key, (first.obs.shape[-1], *self.settings.critic, 1))
+        told = aim[:0] if told is None else told
+        inputs = first.obs.shape[-1] + len(told)
+        critic = _network(key, (inputs, *self.settings.critic, 1))
         actor_optimizer, critic_optimizer = self._optimizers
         return Learner(
             weights=weights,
             aim=aim,
+            told=told,
             critic=critic,
             target=critic,
             moments=(actor_optimizer.init(weights), critic_optimizer.init(critic)),
@@ -166,6 +182,8 @@ class ActorCritic:
     ) -> tuple[Learner, jax.Array]:
         """Runs one window: one step of the actor, several steps of the critic.
 
+        If actors share a critic, this runs under ``jax.vmap`` with the axis ``ACTORS``.
+
         Args:
             learner: The actor.
             scale: Mean and deviation of observations.
@@ -177,19 +195,16 @@ class ActorCritic:
         """
         settings = self.settings
         noise_key, order_key = jax.random.split(key)
-        shape = (settings.worlds, settings.window, self.env.action_size)
-        noise = jax.random.normal(noise_key, shape, learner.weights.dtype)
+        noise = self._noise(noise_key, learner.weights.dtype)
 
         def loss(weights: jax.Array) -> tuple[jax.Array, PyTree]:
             plain = self.whitening.plain(weights, scale)
             run = functools.partial(self._window, plain, learner, scale)
-            returns, found = jax.vmap(run)(
-                learner.first, learner.worlds, settings.noise * noise
-            )
+            returns, found = jax.vmap(run)(learner.first, learner.worlds, noise)
             return -returns.sum(), found
 
         slope, found = jax.grad(loss, has_aux=True)(learner.weights)
-        last, obs, targets = found
+        last, obs, targets, dones = found
         failed = ~jnp.all(jnp.isfinite(slope)) | ~jnp.all(jnp.isfinite(targets))
         change, moments = self._optimizers[0].update(
             slope / self.steps, learner.moments[0]
@@ -198,11 +213,15 @@ class ActorCritic:
         target = jax.tree.map(
             lambda new, old: 0.8 * new + 0.2 * old, critic, learner.target
         )
+        # an episode that a fall has ended began again within the window
+        since = jnp.argmax(dones[:, ::-1] > 0, axis=1).astype(jnp.int32)
         age = learner.age + settings.window
+        age = jnp.where(jnp.any(dones > 0, axis=1), since, age)
         over = (age >= self.episode_length) | ~_sound(last) | failed
         learned = Learner(
             weights=learner.weights + change,
             aim=learner.aim,
+            told=learner.told,
             critic=critic,
             target=target,
             moments=(moments, critic_moments),
@@ -211,13 +230,43 @@ class ActorCritic:
             age=jnp.where(over, 0, age),
         )
         kept = dataclasses.replace(learner, worlds=learned.worlds, age=learned.age)
+        if self.shared:  # what the others have learned, too
+            kept = dataclasses.replace(
+                kept,
+                critic=critic,
+                target=target,
+                moments=(learner.moments[0], critic_moments),
+            )
         return select(failed, kept, learned), failed
 
-    def _value(self, critic: Layers, scale: PyTree, obs: jax.Array) -> jax.Array:
+    def _noise(self, key: jax.Array, dtype: Any) -> jax.Array:
+        """Returns the noise of the actions of a window, (worlds, window, nu).
+
+        It is an autoregressive process: with a correlation, it pushes the robot away
+        from the states that the policy alone would see.
+        """
+        settings = self.settings
+        shape = (settings.worlds, settings.window, self.env.action_size)
+        white = settings.noise * jax.random.normal(key, shape, dtype)
+        kept, step = float(settings.noise_correlation), np.arange(settings.window)
+        ages = step[:, None] - step
+        parts = np.where(ages >= 0, kept ** np.maximum(ages, 0), 0)
+        parts[:, 1:] *= (1 - kept**2) ** 0.5
+        return jnp.einsum("ts,wsa->wta", parts.astype(dtype), white)
+
+    def _value(
+        self,
+        critic: Layers,
+        scale: PyTree,
+        obs: jax.Array,
+        told: jax.Array | None = None,
+    ) -> jax.Array:
         mean, deviation = scale
+        obs = (obs - mean) / deviation
+        if told is not None:
+            obs = jnp.concatenate([obs, told])
         for weights, bias in critic[:-1]:
-            obs = jnp.tanh(((obs - mean) / deviation) @ weights + bias)
-            mean, deviation = 0.0, 1.0
+            obs = jnp.tanh(obs @ weights + bias)
         weights, bias = critic[-1]
         # the output of the network has the scale of the reward of one step
         return (obs @ weights + bias)[0] / (1 - self.settings.discount)
@@ -231,7 +280,11 @@ class ActorCritic:
         state: PyTree,
         noise: jax.Array,
     ) -> tuple[jax.Array, PyTree]:
-        """Runs one world's window; gives return, last state, observations, targets."""
+        """Runs one world's window.
+
+        Returns:
+            The return, and the last state, observations, targets and ends of episodes.
+        """
         settings = self.settings
 
         def advance(state: PyTree, noise: jax.Array) -> tuple[PyTree, PyTree]:
@@ -240,7 +293,7 @@ class ActorCritic:
             action = self.policy(weights, before.obs) + noise
             after = self.env.step(before, jnp.clip(action, -1, 1))
             gain = jnp.append(after.reward, self.measure(before, after)) @ learner.aim
-            value = self._value(learner.target, scale, after.obs)
+            value = self._value(learner.target, scale, after.obs, learner.told)
             row = gain, after.done, value, jnp.where(_sound(after), value, 0)
             return select(after.done > 0, first, after), (state.obs, row)
 
@@ -261,7 +314,7 @@ class ActorCritic:
 
         ends = (rows[2][-1], rows[2][-1])
         (total, _), targets = jax.lax.scan(back, ends, rows, reverse=True)
-        return total, jax.lax.stop_gradient((last, obs, targets))
+        return total, jax.lax.stop_gradient((last, obs, targets, rows[1]))
 
     def _fit(
         self,
@@ -275,15 +328,26 @@ class ActorCritic:
         optimizer = self._optimizers[1]
         obs, targets = obs.reshape(self.steps, -1), targets.reshape(self.steps)
         factor = 1 - self.settings.discount
+        sound = jnp.all(jnp.isfinite(targets)) & jnp.all(jnp.isfinite(obs))
 
         def error(critic: Layers, rows: jax.Array) -> jax.Array:
-            value = functools.partial(self._value, critic, scale)
+            value = functools.partial(self._value, critic, scale, told=learner.told)
             values = jax.vmap(value)(obs[rows])
             return jnp.square(factor * (values - targets[rows])).mean()
 
+        def slopes(critic: Layers, rows: jax.Array) -> Layers:
+            if not self.shared:
+                return jax.grad(error)(critic, rows)
+            # the mean over all actors whose window is finite
+            own = jax.tree.map(
+                lambda x: jnp.where(sound, x, 0), jax.grad(error)(critic, rows)
+            )
+            count = jnp.maximum(jax.lax.psum(sound.astype(targets.dtype), ACTORS), 1)
+            return jax.tree.map(lambda x: jax.lax.psum(x, ACTORS) / count, own)
+
         def fit(carry: PyTree, rows: jax.Array) -> tuple[PyTree, None]:
             critic, moments = carry
-            change, moments = optimizer.update(jax.grad(error)(critic, rows), moments)
+            change, moments = optimizer.update(slopes(critic, rows), moments)
             return (optax.apply_updates(critic, change), moments), None
 
         number, batches = self.steps, self.settings.batches
