@@ -243,7 +243,7 @@ class ActorCriticEmitter(Emitter):
             aims: (K, 1 + D) aims.
             places: (K, D) descriptors of the elites from which they begin.
         """
-        keys, told = jax.random.split(key, self._actors), aims[:, :0]
+        keys, told = jax.random.split(key, self._actors), None
         if self._method.shared:
             low, high = self._limits
             middle, half = (low + high) / 2, (high - low) / 2

@@ -38,7 +38,7 @@ class Learner:
     Attributes:
         weights: (size,) weights of the policy, for whitened observations.
         aim: (1 + D,) weights of the reward and of each component of the measure.
-        told: What the critic is told besides observations, (0,) if it is not shared.
+        told: What the critic is told besides observations; ``None``: nothing.
         critic: The critic; equal for all actors that share it.
         target: A slower copy of the critic, from which the actor learns.
         moments: States of the optimizers of actor and critic.
@@ -49,7 +49,7 @@ class Learner:
 
     weights: jax.Array
     aim: jax.Array
-    told: jax.Array
+    told: jax.Array | None
     critic: Layers
     target: Layers
     moments: tuple[PyTree, PyTree]
@@ -150,8 +150,7 @@ class ActorCritic:
             told: What the critic is told besides observations; ``None``: nothing.
         """
         number = self.settings.worlds
-        told = aim[:0] if told is None else told
-        inputs = first.obs.shape[-1] + len(told)
+        inputs = first.obs.shape[-1] + (0 if told is None else len(told))
         critic = _network(key, (inputs, *self.settings.critic, 1))
         actor_optimizer, critic_optimizer = self._optimizers
         return Learner(
