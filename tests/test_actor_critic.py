@@ -94,7 +94,7 @@ def test_the_gradient_is_that_of_the_window() -> None:
             state = env.step(state, policy(weights, state.obs))
             gain = jnp.append(state.reward, state.pipeline_state) @ aim
             total += discount**step * gain
-        value = way._value(start.target, scale, state.obs)
+        value = way._value(start.target, _inputs(scale, state.obs, None))
         return total + discount**SETTINGS.window * value
 
     def by_window(weights: jax.Array) -> jax.Array:
@@ -132,7 +132,7 @@ def test_values_inside_of_a_window_count() -> None:
         for step in range(SETTINGS.window):
             state = env.step(state, policy(weights, state.obs))
             total += discount**step * state.reward
-            value = way._value(start.target, scale, state.obs)
+            value = way._value(start.target, _inputs(scale, state.obs, None))
             returns.append(total + discount ** (step + 1) * value)
         last = len(returns) - 1
         mean = sum((1 - part) * part**i * x for i, x in enumerate(returns[:last]))

@@ -39,6 +39,8 @@ class ActorCriticOptions(LearningOptions):
     fitness: float = 0.1
     lifetime: int = 10
     shared: bool = False
+    exchange: float = 0.0
+    many: bool = False
 
     def __post_init__(self) -> None:
         """Checks every value.
@@ -64,21 +66,18 @@ _MAZES = ("antmaze", "antmaze_u", "antmaze_big", "antmaze_hardest", "humanoid_ma
 _STEERED = {"steered": 1.0, "fitness": 0.0, **_LONG}
 
 
-def _make(context: EmitterContext, options: ActorCriticOptions) -> Any:
-    """MAP-Elites with the policies of actors that learn over short horizons.
+def actors_of(context: EmitterContext, options: ActorCriticOptions) -> Any:
+    """Returns the emitter of the actors."""
+    import jax
 
-    Raises:
-        ConfigError: The actors have more offspring than a generation can contain.
-    """
     from newton_qd.qd.emitters import ActorCriticEmitter
 
-    config, (task, method) = (
-        context.config,
-        learning_method(context, options, shared=options.shared),
-    )
-    emitter = ActorCriticEmitter(
+    task, method = learning_method(context, options, shared=options.shared)
+    return ActorCriticEmitter(
         method,
-        task.env.reset(context.reset_key),
+        jax.vmap(task.env.reset)(jax.random.split(context.reset_key, options.worlds))
+        if options.many
+        else task.env.reset(context.reset_key),
         actors=options.actors,
         branches=options.branches,
         copies=options.copies,
@@ -86,21 +85,49 @@ def _make(context: EmitterContext, options: ActorCriticOptions) -> Any:
         steered=options.steered,
         fitness=options.fitness,
         lifetime=options.lifetime,
+        exchange=options.exchange,
         limits=task.limits,
     )
-    if emitter.batch_size > config.batch_size:
+
+
+def require_room(config: EvolveConfig, options: ActorCriticOptions, own: int) -> int:
+    """Returns the individuals of a generation that are neither of actors nor others.
+
+    Args:
+        config: Settings of the run.
+        options: Options of the actors.
+        own: Individuals of the actors and of other emitters.
+
+    Raises:
+        ConfigError: A generation is smaller.
+    """
+    if own > config.batch_size:
         given = options.actors, options.branches, options.copies
-        allowed = f"at most batch_size = {config.batch_size} as their product"
+        others = own - options.actors * options.branches * options.copies
+        allowed = f"at most batch_size = {config.batch_size - others} as their product"
         name = "options: actors, branches, copies"
         raise ConfigError(message(name, given, allowed))
-    return with_isoline(emitter, config)
+    return config.batch_size - own
 
 
-def _gradients(config: EvolveConfig, options: ActorCriticOptions) -> int:
+def _make(context: EmitterContext, options: ActorCriticOptions) -> Any:
+    """MAP-Elites with the policies of actors that learn over short horizons.
+
+    Raises:
+        ConfigError: The actors have more offspring than a generation can contain.
+    """
+    emitter = actors_of(context, options)
+    require_room(context.config, options, emitter.batch_size)
+    return with_isoline(emitter, context.config)
+
+
+def gradients(config: EvolveConfig, options: ActorCriticOptions) -> int:
+    """Returns the differentiated episodes of a generation."""
     return options.episodes(config)
 
 
-def _evaluations(config: EvolveConfig, options: ActorCriticOptions) -> int:
+def evaluations(config: EvolveConfig, options: ActorCriticOptions) -> int:
+    """Returns the episodes of a generation, with those that are differentiated."""
     return config.batch_size + options.episodes(config)
 
 
@@ -112,7 +139,7 @@ ME_ACTOR_CRITIC = AlgorithmSpec(
     make=_make,
     options=ActorCriticOptions,
     tuned={"ant_omni": _LONG, **dict.fromkeys(_MAZES, _STEERED)},
-    evaluations=_evaluations,
-    gradients=_gradients,
+    evaluations=evaluations,
+    gradients=gradients,
     initial_scale=initial_scale,
 )

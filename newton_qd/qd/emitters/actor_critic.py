@@ -12,7 +12,7 @@ from qdax.core.emitters.emitter import Emitter
 from newton_qd import checks
 from newton_qd.checks import message
 from newton_qd.envs.state import select
-from newton_qd.qd.emitters.actor_critic_learner import ACTORS, ActorCritic, Learner
+from newton_qd.qd.emitters.actor_critic_learner import SHARED, ActorCritic, Learner
 from newton_qd.qd.emitters.cells import draw_cells
 from newton_qd.types import (
     ExtraScores,
@@ -87,6 +87,7 @@ class ActorCriticEmitter(Emitter):
         steered: float = 0.5,
         fitness: float = 0.1,
         lifetime: int = 10,
+        exchange: float = 0.0,
         limits: tuple[np.ndarray, np.ndarray],
     ) -> None:
         """Sets the actors and how much they learn.
@@ -103,6 +104,8 @@ class ActorCriticEmitter(Emitter):
             steered: Share of the actors that follow directions of the descriptor [-].
             fitness: Weight of the reward for steered actors [-].
             lifetime: Generations after which a steered actor restarts.
+            exchange: Share of the worlds that go on from the state of another world of
+                any actor after an update [-].
             limits: Lowest and highest descriptor, (D,) each.
 
         Raises:
@@ -117,6 +120,7 @@ class ActorCriticEmitter(Emitter):
         checks.number("steered", steered, least=0, most=1)
         self._method = method
         self._first = first
+        self._many = jnp.ndim(first.done) > 0
         self._actors = actors
         self._branches = branches
         self._copies = copies
@@ -125,6 +129,8 @@ class ActorCriticEmitter(Emitter):
         self._steered = round(steered * actors)
         self._fitness = fitness
         self._lifetime = lifetime
+        checks.number("exchange", exchange, least=0, most=1)
+        self._exchange = exchange
         self._limits = limits
 
     @property
@@ -205,13 +211,14 @@ class ActorCriticEmitter(Emitter):
         state = emitter_state
         key, renewal_key, learn_key = jax.random.split(state.key, 3)
         learners = self._renewed(state, repertoire, renewal_key)
-        update = jax.vmap(self._method.update, (0, None, 0), axis_name=ACTORS)
 
         def learn(carry: tuple, key: jax.Array) -> tuple[tuple, None]:
             learners, failed = carry
-            keys = jax.random.split(key, self._actors)
-            learners, lost = update(learners, state.scale, keys)
-            return (learners, failed + lost), None
+            update_key, place_key = jax.random.split(key)
+            learners, lost = self._method.update_together(
+                learners, state.scale, update_key
+            )
+            return (self._exchanged(place_key, learners), failed + lost), None
 
         def branch(carry: tuple, key: jax.Array) -> tuple[tuple, jax.Array]:
             keys = jax.random.split(key, self._updates)
@@ -225,9 +232,29 @@ class ActorCriticEmitter(Emitter):
             learners, state.scale, snapshots, failed, state.generation + 1, key
         )
 
+    def _exchanged(self, key: jax.Array, learners: Learner) -> Learner:
+        """Lets a share of the worlds go on from states of other worlds."""
+        if not self._exchange:
+            return learners
+        shape = learners.age.shape
+        share_key, place_key = jax.random.split(key)
+        own = jnp.arange(shape[0] * shape[1])
+        places = jax.random.randint(place_key, own.shape, 0, len(own))
+        moved = jax.random.uniform(share_key, own.shape) < self._exchange
+        places = jnp.where(moved, places, own)
+
+        def taken(leaf: jax.Array) -> jax.Array:
+            rows = leaf.reshape(len(own), *leaf.shape[2:])
+            return rows[places].reshape(leaf.shape)
+
+        worlds, age = jax.tree.map(taken, (learners.worlds, learners.age))
+        return dataclasses.replace(learners, worlds=worlds, age=age)
+
     def _worlds(self) -> PyTree:
         """Returns the initial states of the worlds of an actor."""
         number = self._method.settings.worlds
+        if self._many:
+            return self._first
         return jax.tree.map(
             lambda leaf: jnp.broadcast_to(leaf, (number, *jnp.shape(leaf))), self._first
         )
@@ -243,14 +270,18 @@ class ActorCriticEmitter(Emitter):
             aims: (K, 1 + D) aims.
             places: (K, D) descriptors of the elites from which they begin.
         """
-        keys, told = jax.random.split(key, self._actors), None
-        if self._method.shared:
-            low, high = self._limits
-            middle, half = (low + high) / 2, (high - low) / 2
-            told = jnp.concatenate([(places - middle) / half, aims], axis=1)
-            keys = jnp.broadcast_to(key, keys.shape)
-        begin = jax.vmap(self._method.begin, in_axes=(0, 0, 0, None, 0))
-        return begin(keys, weights, aims, self._worlds(), told)
+        worlds = self._worlds()
+        if not self._method.shared:
+            begin = jax.vmap(self._method.begin, in_axes=(0, 0, 0, None))
+            keys = jax.random.split(key, self._actors)
+            return begin(keys, weights, aims, worlds)
+        low, high = self._limits
+        middle, half = (low + high) / 2, (high - low) / 2
+        told = jnp.concatenate([(places - middle) / half, aims], axis=1)
+        begin = jax.vmap(
+            self._method.begin, in_axes=(None, 0, 0, None, 0), out_axes=SHARED
+        )
+        return begin(key, weights, aims, worlds, told)
 
     def _aims(self, key: jax.Array) -> jax.Array:
         """Returns the aims (K, 1 + D) of the actors; steered actors are last."""
@@ -277,15 +308,26 @@ class ActorCriticEmitter(Emitter):
         weights = self._method.whitening.whitened(weights, state.scale)
         places, old = repertoire.descriptors[cells], state.learners
         new = self._begun(critic_key, weights, self._aims(aim_key), places)
-        if self._method.shared:
-            moments = new.moments[0], old.moments[1]
-            new = dataclasses.replace(
-                new, critic=old.critic, target=old.target, moments=moments
-            )
+        if self._exchange:
+            new = dataclasses.replace(new, worlds=old.worlds, age=old.age)
         number = jnp.arange(self._actors)
         # one after the other, so that there are actors of all ages
         turn = number * self._lifetime // max(self._actors, 1)
         due = (state.generation + turn) % self._lifetime == 0
         steered = number >= self._actors - self._steered
         begun = state.generation > 0
-        return select(due & steered & begun, new, old)
+        restarts = due & steered & begun
+        if not self._method.shared:
+            return select(restarts, new, old)
+        def own(learners: Learner) -> Learner:
+            moments = learners.moments[0], None
+            return dataclasses.replace(
+                learners, critic=None, target=None, moments=moments
+            )
+
+        chosen = select(restarts, own(new), own(old))
+        # the critic goes on to learn
+        moments = chosen.moments[0], old.moments[1]
+        return dataclasses.replace(
+            chosen, critic=old.critic, target=old.target, moments=moments
+        )
