@@ -79,7 +79,6 @@ class Protocol:
 
 BASELINES = ("me", "ascii-me", "cma-me", "pga-me", "dcrl-me")
 OURS = (
-    "dcrl-actor-critic",
     "me-actor-critic",
     "ascii-me-exact",
     "me-conditioned",

@@ -30,7 +30,6 @@ compiled = functools.partial(
     jax.jit, compiler_options={"xla_backend_optimization_level": 0}
 )
 SIZE, LENGTH = 6, 20
-LIMITS = (np.full(2, -2.0, np.float32), np.full(2, 2.0, np.float32))
 SETTINGS = ActorCriticSettings(
     worlds=4, window=5, rate=0.05, clip=1e6, noise=0.1, critic=(8,), batches=2
 )
@@ -94,7 +93,7 @@ def test_the_gradient_is_that_of_the_window() -> None:
             state = env.step(state, policy(weights, state.obs))
             gain = jnp.append(state.reward, state.pipeline_state) @ aim
             total += discount**step * gain
-        value = way._value(start.target, _inputs(scale, state.obs, None))
+        value = way._value(start.target, scale, state.obs)
         return total + discount**SETTINGS.window * value
 
     def by_window(weights: jax.Array) -> jax.Array:
@@ -132,7 +131,7 @@ def test_values_inside_of_a_window_count() -> None:
         for step in range(SETTINGS.window):
             state = env.step(state, policy(weights, state.obs))
             total += discount**step * state.reward
-            value = way._value(start.target, _inputs(scale, state.obs, None))
+            value = way._value(start.target, scale, state.obs)
             returns.append(total + discount ** (step + 1) * value)
         last = len(returns) - 1
         mean = sum((1 - part) * part**i * x for i, x in enumerate(returns[:last]))
@@ -145,19 +144,6 @@ def test_values_inside_of_a_window_count() -> None:
     pairs = (compiled(jax.value_and_grad(x))(weights) for x in (by_window, by_hand))
     for found, expected in zip(*pairs, strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-3)
-
-
-@pytest.mark.parametrize("kept", [0, 0.9])
-def test_noise_has_its_deviation_and_its_correlation(kept: float) -> None:
-    way = method(worlds=20_000, window=4, noise=0.5, noise_correlation=kept)
-    noise = np.asarray(way._noise(jax.random.key(0), jnp.float32))
-    assert noise.shape == (20_000, 4, 2) and noise.dtype == np.float32
-    # the standard error of both is below 1 / sqrt(20,000) = 0.007
-    np.testing.assert_allclose(noise.std(axis=0), 0.5, rtol=0.03)
-    for lag in (1, 2, 3):
-        found = (noise[:, lag:] * noise[:, :-lag]).mean(axis=0) / 0.25
-        np.testing.assert_allclose(found, kept**lag, atol=0.03)
-    assert abs((noise[..., 0] * noise[..., 1]).mean() / 0.25) < 0.03
 
 
 def test_the_age_of_a_world_begins_again_after_a_fall() -> None:
@@ -219,7 +205,7 @@ def test_measures_are_those_of_the_descriptor() -> None:
 def emitter(measure: Any = reading, **changes: Any) -> ActorCriticEmitter:
     given = {"actors": 3, "branches": 2, "copies": 4, "updates": 2, "lifetime": 2}
     first = PointEnv().reset(jax.random.key(0))
-    options: Any = {**given, "steered": 0.7, "limits": LIMITS, **changes}
+    options: Any = {**given, "steered": 0.7, "measures": 2, **changes}
     return ActorCriticEmitter(method(measure), first, **options)
 
 
@@ -316,7 +302,6 @@ def test_bad_numbers_are_refused(changes: dict[str, Any], message: str) -> None:
         ({"batches": 21}, r"batches: got 21; .*at most worlds \* window = 20"),
         ({"clip": 0.0}, "clip: got 0.0; allowed: finite .*above 0"),
         ({"noise": -1.0}, "noise: got -1.0; allowed: .* from 0"),
-        ({"noise_correlation": 1.0}, "noise_correlation: got 1.0; allowed: .* below 1"),
         ({"trace": 2.0}, "trace: got 2.0; allowed: .* from 0 to 1"),
         ({"actor_trace": 2.0}, "actor_trace: got 2.0; allowed: .* from 0 to 1"),
     ],

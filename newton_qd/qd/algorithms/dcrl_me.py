@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from newton_qd.checks import listed, message
@@ -14,8 +13,6 @@ from newton_qd.qd.config import ConfigError, EvolveConfig
 
 if TYPE_CHECKING:
     import jax
-
-    from newton_qd.qd.scoring.task import Task
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -62,24 +59,6 @@ class DCRLMEOptions(CriticOptions):
         return found
 
 
-def transitions_for(task: Task) -> Callable[[dict[str, jax.Array]], Any]:
-    """Returns the function that makes DCRL-ME's transitions from steps."""
-    import jax.numpy as jnp
-    from qdax.core.neuroevolution.buffers.buffer import DCRLTransition
-
-    def convert(steps: dict[str, jax.Array]) -> Any:
-        # Rewards are weighted by the distance of descriptors, so they must not be
-        # negative.
-        rewards = jnp.maximum(steps["rewards"] + task.reward_offset, 0.0)
-        shape = (*rewards.shape, task.descriptor_length)
-        unknown = jnp.full(shape, jnp.nan, rewards.dtype)  # the emitter sets it
-        return DCRLTransition(
-            **{**steps, "rewards": rewards}, desc=unknown, desc_prime=unknown
-        )
-
-    return convert
-
-
 def _make(context: EmitterContext, options: DCRLMEOptions) -> Any:
     """DCRL-ME: critic and actor depend on the descriptor (Faldor et al. 2024)."""
     import jax
@@ -89,6 +68,7 @@ def _make(context: EmitterContext, options: DCRLMEOptions) -> Any:
 
     compat.install()  # QDax's file imports environments that fail with today's JAX
     from qdax.core.emitters.dcrl_me_emitter import DCRLMEConfig, DCRLMEEmitter
+    from qdax.core.neuroevolution.buffers.buffer import DCRLTransition
     from qdax.core.neuroevolution.networks.networks import MLPDC
 
     from newton_qd.qd.algorithms.network_emitter import OfParameters
@@ -101,6 +81,16 @@ def _make(context: EmitterContext, options: DCRLMEOptions) -> Any:
         final_activation=jnp.tanh,
     )
 
+    def convert(steps: dict[str, jax.Array]) -> Any:
+        # Rewards are weighted by the distance of descriptors, so they must not be
+        # negative.
+        rewards = jnp.maximum(steps["rewards"] + task.reward_offset, 0.0)
+        shape = (*rewards.shape, task.descriptor_length)
+        unknown = jnp.full(shape, jnp.nan, rewards.dtype)  # the emitter sets it
+        return DCRLTransition(
+            **{**steps, "rewards": rewards}, desc=unknown, desc_prime=unknown
+        )
+
     emitter = DCRLMEEmitter(
         DCRLMEConfig(**settings),
         context.policy.network,
@@ -108,7 +98,7 @@ def _make(context: EmitterContext, options: DCRLMEOptions) -> Any:
         task.env,
         isoline(config),
     )
-    return OfParameters(emitter, context.policy, transitions_for(task))
+    return OfParameters(emitter, context.policy, convert)
 
 
 DCRL_ME = AlgorithmSpec(

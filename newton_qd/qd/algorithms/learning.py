@@ -23,14 +23,13 @@ class LearningOptions(DifferentiableOptions, ActorCriticSettings):
 
 
 def learning_method(
-    context: EmitterContext, options: LearningOptions, *, shared: bool = False
+    context: EmitterContext, options: LearningOptions
 ) -> tuple[Task, ActorCritic]:
     """Returns the task with a smooth descriptor, and how actors learn on it.
 
     Args:
         context: What the run gives to its algorithm.
         options: Options of the algorithm.
-        shared: Whether all actors learn one critic together.
     """
     from newton_qd.qd.emitters import ActorCritic
     from newton_qd.qd.emitters.actor_critic_learner import measure_of
@@ -47,6 +46,5 @@ def learning_method(
         context.config.episode_length,
         options,
         Whitening.of(policy) if options.whiten else Whitening(),
-        shared,
     )
     return task, method

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from newton_qd import checks
 from newton_qd.checks import message
 from newton_qd.qd.algorithms.gradient_options import initial_scale
 from newton_qd.qd.algorithms.learning import LearningOptions, learning_method
@@ -27,8 +26,6 @@ class ActorCriticOptions(LearningOptions):
         steered: Share of the actors that follow directions of the descriptor [-].
         fitness: Weight of the reward of steered actors [-].
         lifetime: Generations after which a steered actor restarts from a random elite.
-        shared: Whether all actors learn one critic together. It is told what an actor
-            aims at, and the descriptor from which it began.
     """
 
     actors: int = 2
@@ -38,19 +35,6 @@ class ActorCriticOptions(LearningOptions):
     steered: float = 0.5
     fitness: float = 0.1
     lifetime: int = 10
-    shared: bool = False
-    exchange: float = 0.0
-    many: bool = False
-
-    def __post_init__(self) -> None:
-        """Checks every value.
-
-        Raises:
-            TypeError: A value has a wrong type.
-            ValueError: A value is out of its range.
-        """
-        super().__post_init__()
-        checks.flag("shared", self.shared)
 
     def episodes(self, config: EvolveConfig) -> int:
         """Returns the control steps of a generation's updates, counted in episodes."""
@@ -66,18 +50,18 @@ _MAZES = ("antmaze", "antmaze_u", "antmaze_big", "antmaze_hardest", "humanoid_ma
 _STEERED = {"steered": 1.0, "fitness": 0.0, **_LONG}
 
 
-def actors_of(context: EmitterContext, options: ActorCriticOptions) -> Any:
-    """Returns the emitter of the actors."""
-    import jax
+def _make(context: EmitterContext, options: ActorCriticOptions) -> Any:
+    """MAP-Elites with the policies of actors that learn over short horizons.
 
+    Raises:
+        ConfigError: The actors have more offspring than a generation can contain.
+    """
     from newton_qd.qd.emitters import ActorCriticEmitter
 
-    task, method = learning_method(context, options, shared=options.shared)
-    return ActorCriticEmitter(
+    config, (task, method) = context.config, learning_method(context, options)
+    emitter = ActorCriticEmitter(
         method,
-        jax.vmap(task.env.reset)(jax.random.split(context.reset_key, options.worlds))
-        if options.many
-        else task.env.reset(context.reset_key),
+        task.env.reset(context.reset_key),
         actors=options.actors,
         branches=options.branches,
         copies=options.copies,
@@ -85,49 +69,21 @@ def actors_of(context: EmitterContext, options: ActorCriticOptions) -> Any:
         steered=options.steered,
         fitness=options.fitness,
         lifetime=options.lifetime,
-        exchange=options.exchange,
-        limits=task.limits,
+        measures=task.descriptor_length,
     )
-
-
-def require_room(config: EvolveConfig, options: ActorCriticOptions, own: int) -> int:
-    """Returns the individuals of a generation that are neither of actors nor others.
-
-    Args:
-        config: Settings of the run.
-        options: Options of the actors.
-        own: Individuals of the actors and of other emitters.
-
-    Raises:
-        ConfigError: A generation is smaller.
-    """
-    if own > config.batch_size:
+    if emitter.batch_size > config.batch_size:
         given = options.actors, options.branches, options.copies
-        others = own - options.actors * options.branches * options.copies
-        allowed = f"at most batch_size = {config.batch_size - others} as their product"
+        allowed = f"at most batch_size = {config.batch_size} as their product"
         name = "options: actors, branches, copies"
         raise ConfigError(message(name, given, allowed))
-    return config.batch_size - own
+    return with_isoline(emitter, config)
 
 
-def _make(context: EmitterContext, options: ActorCriticOptions) -> Any:
-    """MAP-Elites with the policies of actors that learn over short horizons.
-
-    Raises:
-        ConfigError: The actors have more offspring than a generation can contain.
-    """
-    emitter = actors_of(context, options)
-    require_room(context.config, options, emitter.batch_size)
-    return with_isoline(emitter, context.config)
-
-
-def gradients(config: EvolveConfig, options: ActorCriticOptions) -> int:
-    """Returns the differentiated episodes of a generation."""
+def _gradients(config: EvolveConfig, options: ActorCriticOptions) -> int:
     return options.episodes(config)
 
 
-def evaluations(config: EvolveConfig, options: ActorCriticOptions) -> int:
-    """Returns the episodes of a generation, with those that are differentiated."""
+def _evaluations(config: EvolveConfig, options: ActorCriticOptions) -> int:
     return config.batch_size + options.episodes(config)
 
 
@@ -139,7 +95,7 @@ ME_ACTOR_CRITIC = AlgorithmSpec(
     make=_make,
     options=ActorCriticOptions,
     tuned={"ant_omni": _LONG, **dict.fromkeys(_MAZES, _STEERED)},
-    evaluations=evaluations,
-    gradients=gradients,
+    evaluations=_evaluations,
+    gradients=_gradients,
     initial_scale=initial_scale,
 )

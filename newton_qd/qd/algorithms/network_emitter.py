@@ -65,28 +65,3 @@ class OfParameters:
                 "transitions": self._convert(extra["transitions"]),
             },
         }
-
-
-class PartOfParameters(OfParameters):
-    """An emitter of network parameters as a part of QDax's ``MultiEmitter``."""
-
-    _NAMES = "repertoire", "genotypes", "fitnesses", "descriptors", "extra_scores"
-
-    @property
-    def batch_size(self) -> int:
-        """Individuals emitted in one generation."""
-        return self._emitter.batch_size
-
-    @property
-    def use_all_data(self) -> bool:
-        """Whether the emitter is told about the offspring of others."""
-        return self._emitter.use_all_data
-
-    def init(self, key: jax.Array, *told: PyTree) -> PyTree:
-        """Returns the state before the second generation."""
-        return super().init(key, **dict(zip(self._NAMES, told, strict=True)))
-
-    def state_update(self, emitter_state: PyTree, *told: PyTree) -> PyTree:
-        """Learns from a generation."""
-        named = dict(zip(self._NAMES, told, strict=True))
-        return super().state_update(emitter_state, **named)

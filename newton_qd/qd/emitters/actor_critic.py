@@ -6,13 +6,12 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from qdax.core.emitters.emitter import Emitter
 
 from newton_qd import checks
 from newton_qd.checks import message
 from newton_qd.envs.state import select
-from newton_qd.qd.emitters.actor_critic_learner import SHARED, ActorCritic, Learner
+from newton_qd.qd.emitters.actor_critic_learner import ActorCritic, Learner
 from newton_qd.qd.emitters.cells import draw_cells
 from newton_qd.types import (
     ExtraScores,
@@ -67,11 +66,6 @@ class ActorCriticEmitter(Emitter):
     .. math:: a + s (e - a) + \sigma \epsilon, \qquad s \sim U(0, 1),
 
     with a standard deviation that is drawn log-uniformly from a range.
-
-    Actors may share one critic. Then it is told what an actor aims at, and the
-    descriptor of the elite from which the actor began. So it does not have to learn
-    anew when an actor restarts, and actors can be many, with few worlds each. As in
-    DCRL-ME (Faldor et al. 2024), one critic knows the policies of the whole archive.
     """
 
     def __init__(
@@ -87,8 +81,7 @@ class ActorCriticEmitter(Emitter):
         steered: float = 0.5,
         fitness: float = 0.1,
         lifetime: int = 10,
-        exchange: float = 0.0,
-        limits: tuple[np.ndarray, np.ndarray],
+        measures: int,
     ) -> None:
         """Sets the actors and how much they learn.
 
@@ -104,9 +97,7 @@ class ActorCriticEmitter(Emitter):
             steered: Share of the actors that follow directions of the descriptor [-].
             fitness: Weight of the reward for steered actors [-].
             lifetime: Generations after which a steered actor restarts.
-            exchange: Share of the worlds that go on from the state of another world of
-                any actor after an update [-].
-            limits: Lowest and highest descriptor, (D,) each.
+            measures: Length of the descriptor.
 
         Raises:
             ValueError: A number is out of its range.
@@ -120,7 +111,6 @@ class ActorCriticEmitter(Emitter):
         checks.number("steered", steered, least=0, most=1)
         self._method = method
         self._first = first
-        self._many = jnp.ndim(first.done) > 0
         self._actors = actors
         self._branches = branches
         self._copies = copies
@@ -129,9 +119,7 @@ class ActorCriticEmitter(Emitter):
         self._steered = round(steered * actors)
         self._fitness = fitness
         self._lifetime = lifetime
-        checks.number("exchange", exchange, least=0, most=1)
-        self._exchange = exchange
-        self._limits = limits
+        self._measures = measures
 
     @property
     def batch_size(self) -> int:
@@ -152,13 +140,12 @@ class ActorCriticEmitter(Emitter):
         With whitening, they are read as weights for whitened observations, which makes
         them other policies.
         """
-        del repertoire, extra_scores
+        del repertoire, descriptors, extra_scores
         key, scale_key, aim_key, critic_key = jax.random.split(key, 4)
         # repeats the best if there are more actors than individuals
         order = jnp.resize(jnp.argsort(-fitnesses.reshape(-1)), (self._actors,))
         weights = genotypes[order]
-        places = descriptors[order]
-        learners = self._begun(critic_key, weights, self._aims(aim_key), places)
+        learners = self._begun(critic_key, weights, self._aims(aim_key))
         return ActorCriticState(
             learners=learners,
             scale=self._method.scale(scale_key, self._worlds()),
@@ -211,14 +198,13 @@ class ActorCriticEmitter(Emitter):
         state = emitter_state
         key, renewal_key, learn_key = jax.random.split(state.key, 3)
         learners = self._renewed(state, repertoire, renewal_key)
+        update = jax.vmap(self._method.update, in_axes=(0, None, 0))
 
         def learn(carry: tuple, key: jax.Array) -> tuple[tuple, None]:
             learners, failed = carry
-            update_key, place_key = jax.random.split(key)
-            learners, lost = self._method.update_together(
-                learners, state.scale, update_key
-            )
-            return (self._exchanged(place_key, learners), failed + lost), None
+            keys = jax.random.split(key, self._actors)
+            learners, lost = update(learners, state.scale, keys)
+            return (learners, failed + lost), None
 
         def branch(carry: tuple, key: jax.Array) -> tuple[tuple, jax.Array]:
             keys = jax.random.split(key, self._updates)
@@ -232,60 +218,22 @@ class ActorCriticEmitter(Emitter):
             learners, state.scale, snapshots, failed, state.generation + 1, key
         )
 
-    def _exchanged(self, key: jax.Array, learners: Learner) -> Learner:
-        """Lets a share of the worlds go on from states of other worlds."""
-        if not self._exchange:
-            return learners
-        shape = learners.age.shape
-        share_key, place_key = jax.random.split(key)
-        own = jnp.arange(shape[0] * shape[1])
-        places = jax.random.randint(place_key, own.shape, 0, len(own))
-        moved = jax.random.uniform(share_key, own.shape) < self._exchange
-        places = jnp.where(moved, places, own)
-
-        def taken(leaf: jax.Array) -> jax.Array:
-            rows = leaf.reshape(len(own), *leaf.shape[2:])
-            return rows[places].reshape(leaf.shape)
-
-        worlds, age = jax.tree.map(taken, (learners.worlds, learners.age))
-        return dataclasses.replace(learners, worlds=worlds, age=age)
-
     def _worlds(self) -> PyTree:
         """Returns the initial states of the worlds of an actor."""
         number = self._method.settings.worlds
-        if self._many:
-            return self._first
         return jax.tree.map(
             lambda leaf: jnp.broadcast_to(leaf, (number, *jnp.shape(leaf))), self._first
         )
 
-    def _begun(
-        self, key: jax.Array, weights: jax.Array, aims: jax.Array, places: jax.Array
-    ) -> Learner:
-        """Returns K new actors.
-
-        Args:
-            key: Key of the critics.
-            weights: (K, size) weights.
-            aims: (K, 1 + D) aims.
-            places: (K, D) descriptors of the elites from which they begin.
-        """
-        worlds = self._worlds()
-        if not self._method.shared:
-            begin = jax.vmap(self._method.begin, in_axes=(0, 0, 0, None))
-            keys = jax.random.split(key, self._actors)
-            return begin(keys, weights, aims, worlds)
-        low, high = self._limits
-        middle, half = (low + high) / 2, (high - low) / 2
-        told = jnp.concatenate([(places - middle) / half, aims], axis=1)
-        begin = jax.vmap(
-            self._method.begin, in_axes=(None, 0, 0, None, 0), out_axes=SHARED
-        )
-        return begin(key, weights, aims, worlds, told)
+    def _begun(self, key: jax.Array, weights: jax.Array, aims: jax.Array) -> Learner:
+        """Returns K new actors with weights (K, size)."""
+        keys = jax.random.split(key, self._actors)
+        begin = jax.vmap(self._method.begin, in_axes=(0, 0, 0, None))
+        return begin(keys, weights, aims, self._worlds())
 
     def _aims(self, key: jax.Array) -> jax.Array:
         """Returns the aims (K, 1 + D) of the actors; steered actors are last."""
-        shape = (self._actors, len(self._limits[0]))
+        shape = (self._actors, self._measures)
         ways = jax.random.normal(key, shape, jnp.float32)
         ways = ways / jnp.linalg.norm(ways, axis=1, keepdims=True)
         steered = jnp.arange(self._actors) >= self._actors - self._steered
@@ -306,28 +254,11 @@ class ActorCriticEmitter(Emitter):
         cells = draw_cells(cell_key, filled, self._actors)
         weights = repertoire.genotypes[cells]
         weights = self._method.whitening.whitened(weights, state.scale)
-        places, old = repertoire.descriptors[cells], state.learners
-        new = self._begun(critic_key, weights, self._aims(aim_key), places)
-        if self._exchange:
-            new = dataclasses.replace(new, worlds=old.worlds, age=old.age)
+        new = self._begun(critic_key, weights, self._aims(aim_key))
         number = jnp.arange(self._actors)
         # one after the other, so that there are actors of all ages
         turn = number * self._lifetime // max(self._actors, 1)
         due = (state.generation + turn) % self._lifetime == 0
         steered = number >= self._actors - self._steered
         begun = state.generation > 0
-        restarts = due & steered & begun
-        if not self._method.shared:
-            return select(restarts, new, old)
-        def own(learners: Learner) -> Learner:
-            moments = learners.moments[0], None
-            return dataclasses.replace(
-                learners, critic=None, target=None, moments=moments
-            )
-
-        chosen = select(restarts, own(new), own(old))
-        # the critic goes on to learn
-        moments = chosen.moments[0], old.moments[1]
-        return dataclasses.replace(
-            chosen, critic=old.critic, target=old.target, moments=moments
-        )
+        return select(due & steered & begun, new, state.learners)

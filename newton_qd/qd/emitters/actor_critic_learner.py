@@ -10,7 +10,6 @@ from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 
 from newton_qd.envs.state import select
@@ -36,8 +35,7 @@ class Learner:
     Attributes:
         weights: (size,) weights of the policy, for whitened observations.
         aim: (1 + D,) weights of the reward and of each component of the measure.
-        told: What the critic is told besides observations; ``None``: nothing.
-        critic: The critic; equal for all actors that share it.
+        critic: The critic.
         target: A slower copy of the critic, from which the actor learns.
         moments: States of the optimizers of actor and critic.
         first: Initial states of the W worlds, leaves (W, ...).
@@ -47,43 +45,12 @@ class Learner:
 
     weights: jax.Array
     aim: jax.Array
-    told: jax.Array | None
     critic: Layers
     target: Layers
     moments: tuple[PyTree, PyTree]
     first: PyTree
     worlds: PyTree
     age: jax.Array
-
-
-SHARED: Any = Learner(
-    weights=0,
-    aim=0,
-    told=0,
-    critic=None,
-    target=None,
-    moments=(0, None),
-    first=0,
-    worlds=0,
-    age=0,
-)
-"""Axes of actors that share a critic, for ``jax.vmap``."""
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class Windows:
-    """What a critic learns from; all rows of a window are finite.
-
-    Attributes:
-        inputs: (..., no + told) inputs of the critic.
-        targets: (...) values to learn.
-        counts: (...) 1 for rows that count, 0 for those of a window that is not finite.
-    """
-
-    inputs: jax.Array
-    targets: jax.Array
-    counts: jax.Array
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -115,7 +82,6 @@ class ActorCritic:
         settings: Settings of the learning.
         whitening: Converts the weights of an actor, which are for whitened
             observations, to those of ``policy``; the default changes nothing.
-        shared: Whether all actors learn one critic together.
     """
 
     env: Environment
@@ -124,7 +90,6 @@ class ActorCritic:
     episode_length: int
     settings: ActorCriticSettings
     whitening: Whitening = dataclasses.field(default_factory=Whitening)
-    shared: bool = False
 
     @property
     def steps(self) -> int:
@@ -161,30 +126,22 @@ class ActorCritic:
         return obs.mean(axis=0), jnp.maximum(obs.std(axis=0), _LEAST)
 
     def begin(
-        self,
-        key: jax.Array,
-        weights: jax.Array,
-        aim: jax.Array,
-        first: PyTree,
-        told: jax.Array | None = None,
+        self, key: jax.Array, weights: jax.Array, aim: jax.Array, first: PyTree
     ) -> Learner:
         """Returns a new actor with a new critic.
 
         Args:
-            key: Key of the weights of the critic; the same for actors that share it.
+            key: Key of the weights of the critic.
             weights: (size,) weights of the actor, for whitened observations.
             aim: (1 + D,) weights of the reward and of each measure.
             first: Initial states of its worlds, leaves (W, ...).
-            told: What the critic is told besides observations; ``None``: nothing.
         """
         number = self.settings.worlds
-        inputs = first.obs.shape[-1] + (0 if told is None else len(told))
-        critic = _network(key, (inputs, *self.settings.critic, 1))
+        critic = _network(key, (first.obs.shape[-1], *self.settings.critic, 1))
         actor_optimizer, critic_optimizer = self._optimizers
         return Learner(
             weights=weights,
             aim=aim,
-            told=told,
             critic=critic,
             target=critic,
             moments=(actor_optimizer.init(weights), critic_optimizer.init(critic)),
@@ -207,7 +164,7 @@ class ActorCritic:
     def update(
         self, learner: Learner, scale: tuple[jax.Array, jax.Array], key: jax.Array
     ) -> tuple[Learner, jax.Array]:
-        """Runs one window: one step of the actor, several steps of its critic.
+        """Runs one window: one step of the actor, several steps of the critic.
 
         Args:
             learner: The actor.
@@ -218,60 +175,17 @@ class ActorCritic:
             The actor after the window, and whether the gradient was not finite (). If
             it was not finite, the actor does not change, and its worlds restart.
         """
-        noise_key, order_key = jax.random.split(key)
-        moved, windows, failed = self._improved(learner, scale, noise_key)
-        learned = self._fit(moved, windows, order_key)
-        kept = dataclasses.replace(
-            learned,
-            critic=learner.critic,
-            target=learner.target,
-            moments=(moved.moments[0], learner.moments[1]),
-        )
-        return select(failed, kept, learned), failed
-
-    def update_together(
-        self, learners: Learner, scale: tuple[jax.Array, jax.Array], key: jax.Array
-    ) -> tuple[Learner, jax.Array]:
-        """Runs one window of K actors, which share a critic or have one each.
-
-        A shared critic learns from all windows that are finite.
-
-        Args:
-            learners: The actors; a shared critic has no axis of the actors.
-            scale: Mean and deviation of observations.
-            key: Key of the noise and of the order of the critic's batches.
-
-        Returns:
-            The actors, and which gradients were not finite (K,).
-        """
-        count = len(learners.age)
-        if not self.shared:
-            keys = jax.random.split(key, count)
-            return jax.vmap(self.update, (0, None, 0))(learners, scale, keys)
-        noise_key, order_key = jax.random.split(key)
-        keys = jax.random.split(noise_key, count)
-        improved = jax.vmap(
-            self._improved, (SHARED, None, 0), out_axes=(SHARED, 0, 0)
-        )
-        learners, windows, failed = improved(learners, scale, keys)
-        return self._fit(learners, windows, order_key), failed
-
-    def _improved(
-        self, learner: Learner, scale: tuple[jax.Array, jax.Array], key: jax.Array
-    ) -> tuple[Learner, Windows, jax.Array]:
-        """Runs one window, and makes one step of the actor.
-
-        Returns:
-            The actor with the same critic, what the critic can learn from, and whether
-            the gradient was not finite.
-        """
         settings = self.settings
-        noise = self._noise(key, learner.weights.dtype)
+        noise_key, order_key = jax.random.split(key)
+        shape = (settings.worlds, settings.window, self.env.action_size)
+        noise = jax.random.normal(noise_key, shape, learner.weights.dtype)
 
         def loss(weights: jax.Array) -> tuple[jax.Array, PyTree]:
             plain = self.whitening.plain(weights, scale)
             run = functools.partial(self._window, plain, learner, scale)
-            returns, found = jax.vmap(run)(learner.first, learner.worlds, noise)
+            returns, found = jax.vmap(run)(
+                learner.first, learner.worlds, settings.noise * noise
+            )
             return -returns.sum(), found
 
         slope, found = jax.grad(loss, has_aux=True)(learner.weights)
@@ -280,53 +194,36 @@ class ActorCritic:
         change, moments = self._optimizers[0].update(
             slope / self.steps, learner.moments[0]
         )
-        weights = learner.weights + change
-        weights, moments = select(
-            failed, (learner.weights, learner.moments[0]), (weights, moments)
+        critic, critic_moments = self._fit(learner, scale, order_key, obs, targets)
+        target = jax.tree.map(
+            lambda new, old: 0.8 * new + 0.2 * old, critic, learner.target
         )
         # an episode that a fall has ended began again within the window
         since = jnp.argmax(dones[:, ::-1] > 0, axis=1).astype(jnp.int32)
         age = learner.age + settings.window
         age = jnp.where(jnp.any(dones > 0, axis=1), since, age)
         over = (age >= self.episode_length) | ~_sound(last) | failed
-        moved = dataclasses.replace(
-            learner,
-            weights=weights,
-            moments=(moments, learner.moments[1]),
+        learned = Learner(
+            weights=learner.weights + change,
+            aim=learner.aim,
+            critic=critic,
+            target=target,
+            moments=(moments, critic_moments),
+            first=learner.first,
             worlds=select(over, learner.first, last),
             age=jnp.where(over, 0, age),
         )
-        inputs = jax.vmap(jax.vmap(lambda x: _inputs(scale, x, learner.told)))(obs)
-        usable = jnp.all(jnp.isfinite(targets)) & jnp.all(jnp.isfinite(inputs))
-        windows = Windows(
-            inputs=jnp.where(usable, inputs, 0).reshape(self.steps, -1),
-            targets=jnp.where(usable, targets, 0).reshape(self.steps),
-            counts=jnp.broadcast_to(usable, (self.steps,)).astype(targets.dtype),
-        )
-        return moved, windows, failed
+        kept = dataclasses.replace(learner, worlds=learned.worlds, age=learned.age)
+        return select(failed, kept, learned), failed
 
-    def _noise(self, key: jax.Array, dtype: Any) -> jax.Array:
-        """Returns the noise of the actions of a window, (worlds, window, nu).
-
-        It is an autoregressive process: with a correlation, it pushes the robot away
-        from the states that the policy alone would see.
-        """
-        settings = self.settings
-        shape = (settings.worlds, settings.window, self.env.action_size)
-        white = settings.noise * jax.random.normal(key, shape, dtype)
-        kept, step = float(settings.noise_correlation), np.arange(settings.window)
-        ages = step[:, None] - step
-        parts = np.where(ages >= 0, kept ** np.maximum(ages, 0), 0)
-        parts[:, 1:] *= (1 - kept**2) ** 0.5
-        return jnp.einsum("ts,wsa->wta", parts.astype(dtype), white)
-
-    def _value(self, critic: Layers, inputs: jax.Array) -> jax.Array:
-        """Returns the value () of a state, from the inputs of the critic."""
+    def _value(self, critic: Layers, scale: PyTree, obs: jax.Array) -> jax.Array:
+        mean, deviation = scale
         for weights, bias in critic[:-1]:
-            inputs = jnp.tanh(inputs @ weights + bias)
+            obs = jnp.tanh(((obs - mean) / deviation) @ weights + bias)
+            mean, deviation = 0.0, 1.0
         weights, bias = critic[-1]
         # the output of the network has the scale of the reward of one step
-        return (inputs @ weights + bias)[0] / (1 - self.settings.discount)
+        return (obs @ weights + bias)[0] / (1 - self.settings.discount)
 
     def _window(
         self,
@@ -350,8 +247,7 @@ class ActorCritic:
             action = self.policy(weights, before.obs) + noise
             after = self.env.step(before, jnp.clip(action, -1, 1))
             gain = jnp.append(after.reward, self.measure(before, after)) @ learner.aim
-            inputs = _inputs(scale, after.obs, learner.told)
-            value = self._value(learner.target, inputs)
+            value = self._value(learner.target, scale, after.obs)
             row = gain, after.done, value, jnp.where(_sound(after), value, 0)
             return select(after.done > 0, first, after), (state.obs, row)
 
@@ -374,42 +270,36 @@ class ActorCritic:
         (total, _), targets = jax.lax.scan(back, ends, rows, reverse=True)
         return total, jax.lax.stop_gradient((last, obs, targets, rows[1]))
 
-    def _fit(self, learner: Learner, windows: Windows, key: jax.Array) -> Learner:
-        """Fits the critic to the targets of all rows, in several steps."""
+    def _fit(
+        self,
+        learner: Learner,
+        scale: PyTree,
+        key: jax.Array,
+        obs: PyTree,
+        targets: PyTree,
+    ) -> tuple[Layers, PyTree]:
+        """Fits the critic to its targets (worlds, window) in several steps."""
         optimizer = self._optimizers[1]
-        rows = jax.tree.map(
-            lambda x: x.reshape(-1, *x.shape[windows.targets.ndim :]), windows
-        )
+        obs, targets = obs.reshape(self.steps, -1), targets.reshape(self.steps)
         factor = 1 - self.settings.discount
 
-        def error(critic: Layers, some: jax.Array) -> jax.Array:
-            values = jax.vmap(functools.partial(self._value, critic))(rows.inputs[some])
-            gaps = jnp.square(factor * (values - rows.targets[some]))
-            counts = rows.counts[some]
-            return jnp.sum(counts * gaps) / jnp.maximum(counts.sum(), 1)
+        def error(critic: Layers, rows: jax.Array) -> jax.Array:
+            value = functools.partial(self._value, critic, scale)
+            values = jax.vmap(value)(obs[rows])
+            return jnp.square(factor * (values - targets[rows])).mean()
 
-        def fit(carry: PyTree, some: jax.Array) -> tuple[PyTree, None]:
+        def fit(carry: PyTree, rows: jax.Array) -> tuple[PyTree, None]:
             critic, moments = carry
-            change, moments = optimizer.update(jax.grad(error)(critic, some), moments)
+            change, moments = optimizer.update(jax.grad(error)(critic, rows), moments)
             return (optax.apply_updates(critic, change), moments), None
 
-        number, batches = len(rows.targets), self.settings.batches
+        number, batches = self.steps, self.settings.batches
         keys = jax.random.split(key, self.settings.epochs)
         order = jax.vmap(lambda k: jax.random.permutation(k, number))(keys)
         order = order[:, : number // batches * batches].reshape(
             self.settings.epochs * batches, -1
         )
-        begin = learner.critic, learner.moments[1]
-        (critic, moments), _ = jax.lax.scan(fit, begin, order)
-        target = jax.tree.map(
-            lambda new, old: 0.8 * new + 0.2 * old, critic, learner.target
-        )
-        return dataclasses.replace(
-            learner,
-            critic=critic,
-            target=target,
-            moments=(learner.moments[0], moments),
-        )
+        return jax.lax.scan(fit, (learner.critic, learner.moments[1]), order)[0]
 
 
 def measure_of(task: Task) -> Callable[[StateLike, StateLike], jax.Array]:
@@ -427,15 +317,6 @@ def measure_of(task: Task) -> Callable[[StateLike, StateLike], jax.Array]:
         return (after.info[names] - before.info[names]) / task.env.dt
 
     return velocity
-
-
-def _inputs(
-    scale: tuple[jax.Array, jax.Array], obs: jax.Array, told: jax.Array | None
-) -> jax.Array:
-    """Returns the inputs of a critic for an observation."""
-    mean, deviation = scale
-    inputs = (obs - mean) / deviation
-    return inputs if told is None else jnp.concatenate([inputs, told])
 
 
 def _sound(state: PyTree) -> jax.Array:

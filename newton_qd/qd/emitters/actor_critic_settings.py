@@ -19,8 +19,6 @@ class ActorCriticSettings:
         critic_rate: Learning rate of the critic [-].
         clip: Largest norm of the adjoint of the state of a world.
         noise: Standard deviation of the noise of actions [-].
-        noise_correlation: Correlation of the noise of two control steps [-]; 0: white
-            noise. Noise that lasts moves a robot further away.
         critic: Widths of the critic's hidden layers.
         discount: Discount of a control step [-].
         trace: Lambda of the critic's TD(lambda) targets [-].
@@ -43,7 +41,6 @@ class ActorCriticSettings:
     critic_rate: float = 2e-3
     clip: float = 100.0
     noise: float = 0.1
-    noise_correlation: float = 0.0
     critic: tuple[int, ...] = (64, 64)
     discount: float = 0.97
     trace: float = 0.95
@@ -72,7 +69,6 @@ class ActorCriticSettings:
             checks.number(name, getattr(self, name), above=0)
         for name in ("noise", "termination_width"):
             checks.number(name, getattr(self, name), least=0)
-        checks.number("noise_correlation", self.noise_correlation, least=0, below=1)
         checks.number("discount", self.discount, least=0, below=1)
         checks.number("trace", self.trace, least=0, most=1)
         checks.number("actor_trace", self.actor_trace, least=0, most=1)
