@@ -62,7 +62,8 @@ def load(folder: Path) -> Results:
     """Reads the runs of a folder; the seed of the tuning is left out.
 
     The variant of an algorithm that ``field.toml`` chooses for a task has the
-    algorithm's name. Others have their own, as if they were algorithms of their own.
+    algorithm's name, at each stop to which it came. Others have their own, as if they
+    were algorithms of their own.
     """
     kept = [line for line in lines(folder) if int(line["seed"]) != TUNING_SEED]
     main = _main_variants(kept)
@@ -70,29 +71,36 @@ def load(folder: Path) -> Results:
     for line in kept:
         name = f"{line['task']}.{line['variant']}.{line['seed']}.npz"
         cells = np.load(folder / "cells" / name)[line["stop"]].astype(np.float64)
-        own = main.get((line["task"], line["algorithm"])) == line["variant"]
+        place = line["task"], line["algorithm"], line["stop"]
+        own = main.get(place) == line["variant"]
         key = line["task"], line["algorithm" if own else "variant"], line["stop"]
         found.setdefault(key, []).append(Scored(int(line["seed"]), line, *cells))
     return found
 
 
-def _main_variants(kept: list[dict[str, str]]) -> dict[tuple[str, str], str]:
-    """Returns the chosen variant, by task and algorithm; no ablations.
+def _main_variants(kept: list[dict[str, str]]) -> dict[tuple[str, str, str], str]:
+    """Returns the chosen variant, by task, algorithm and stop; no ablations.
 
     A variant without a line is not chosen. Then the one with the most lines is taken.
     """
     counts = Counter(
-        (line["task"], line["algorithm"], line["variant"])
+        (line["task"], line["algorithm"], line["stop"], line["variant"])
         for line in kept
-        if line["variant"].split("@")[1].isdigit()
+        if _numbered(line["variant"])
     )
     found = {}
     # later keys replace earlier ones
-    for task, algorithm, variant in sorted(counts, key=lambda key: counts[key]):
+    for *place, variant in sorted(counts, key=lambda key: counts[key]):
+        task, algorithm, stop = place
         wanted = chosen(algorithm, task)
-        there = (task, algorithm, wanted) in counts
-        found[task, algorithm] = wanted if there else variant
+        there = (task, algorithm, stop, wanted) in counts
+        found[task, algorithm, stop] = wanted if there else variant
     return found
+
+
+def _numbered(name: str) -> bool:
+    """Whether this is an algorithm or a variant of it, and no ablation."""
+    return name.partition("@")[2].isdigit() or "@" not in name
 
 
 def best_known() -> dict[str, float]:
@@ -204,7 +212,10 @@ def table(results: Results, stop: str) -> str:
 
 
 def verdict(results: Results, stop: str) -> str:
-    """Markdown table: our best algorithm and the best other one of each task."""
+    """Markdown table: our best algorithm and the best other one of each task.
+
+    Ours has the chosen variant. Others have the one that is best here.
+    """
     rows = [
         "| task | our best: corrected QD score | best other | ratio | intervals |",
         "|---|---|---|---|---|",
@@ -212,19 +223,21 @@ def verdict(results: Results, stop: str) -> str:
     for task in sorted({key[0] for key in results}):
         sides: list[list[tuple[float, float, float, str, int]]] = [[], []]
         for (own, algorithm, at), runs in results.items():
-            if (own, at) == (task, stop) and "@" not in algorithm:
+            other = algorithm.split("@")[0] not in OURS
+            counts = _numbered(algorithm) if other else "@" not in algorithm
+            if (own, at) == (task, stop) and counts:
                 found = [float(run.line["corrected_qd_score"]) for run in runs]
                 scores = interval([np.asarray(found)])
-                sides[algorithm not in OURS].append((*scores, algorithm, len(runs)))
+                sides[other].append((*scores, algorithm, len(runs)))
         if not all(sides):
             continue
-        ours, other = (max(side) for side in sides)
-        few = min(ours[4], other[4]) < LEAST_SEEDS
-        apart = ours[1] > other[2] or ours[2] < other[1]
-        ratio = ours[0] / other[0] if other[0] > 0 else np.inf
-        cells = [f"{x[3]} {x[0]:,.0f}" for x in (ours, other)]
+        ours, best = (max(side) for side in sides)
+        few = min(ours[4], best[4]) < LEAST_SEEDS
+        apart = ours[1] > best[2] or ours[2] < best[1]
+        ratio = ours[0] / best[0] if best[0] > 0 else np.inf
+        cells = [f"{x[3]} {x[0]:,.0f}" for x in (ours, best)]
         if not few:
-            pairs = zip(cells, (ours, other), strict=True)
+            pairs = zip(cells, (ours, best), strict=True)
             cells = [f"{cell} ({x[1]:,.0f} to {x[2]:,.0f})" for cell, x in pairs]
         rows.append(
             f"| {task} | {' | '.join(cells)} | {ratio:.2f} | "
