@@ -189,9 +189,7 @@ def test_the_best_variant_of_others_is_compared(tmp_path: Path) -> None:
         archive = np.full(CELLS, score)
         results[TASK, name, "20 s"] = [study_scores.Scored(0, row, archive, archive)]
     rows = study_scores.verdict(results, "20 s").splitlines()[2:]
-    assert rows == [
-        f"| {TASK} | me-actor-critic 4 | me@1 3 | 1.33 | too few seeds |"
-    ]
+    assert rows == [f"| {TASK} | me-actor-critic 4 | me@1 3 | 1.33 | too few seeds |"]
 
 
 def test_published_ratios_are_of_single_evaluations() -> None:
