@@ -109,7 +109,7 @@ def left(out: Path, until: float = 60, **given: Any) -> list[str]:
     return [str(run) for run in found]
 
 
-def test_without_tuning_the_variants_of_the_report_run() -> None:
+def test_without_tuning_chosen_variants_run_and_are_reported() -> None:
     reported = study_runs.lines(FOLDER / "results" / "field")
     named: dict[tuple[str, str], set[str]] = {}
     for key, variant in study_scores._main_variants(reported).items():
@@ -170,7 +170,7 @@ def test_the_chosen_variant_has_the_name(tmp_path: Path) -> None:
     assert names(tmp_path / "chosen", ((chosen, 0), *runs)) == expected
 
 
-def test_a_chosen_variant_has_the_name_where_it_came_so_far(tmp_path: Path) -> None:
+def test_a_chosen_variant_has_the_name_where_it_came_so_far() -> None:
     main = study_runs.chosen("me", TASK)
     rows = [line("me", 0, stop) | {"variant": main} for stop in ("20 s", "60 s")]
     more = [line("me", 0, stop) | {"variant": "me@1"} for stop in ("60 s", "250 s")]
@@ -181,7 +181,7 @@ def test_a_chosen_variant_has_the_name_where_it_came_so_far(tmp_path: Path) -> N
     }
 
 
-def test_the_best_variant_of_others_is_compared(tmp_path: Path) -> None:
+def test_the_best_variant_of_others_is_compared() -> None:
     results = {}
     scores = {"me": 2.0, "me@1": 3.0, "me@cut": 9.0, "me-actor-critic": 4.0}
     for name, score in {**scores, "me-actor-critic@4": 9.0}.items():
