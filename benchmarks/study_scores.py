@@ -224,8 +224,8 @@ def verdict(results: Results, stop: str) -> str:
         sides: list[list[tuple[float, float, float, str, int]]] = [[], []]
         for (own, algorithm, at), runs in results.items():
             other = algorithm.split("@")[0] not in OURS
-            counts = _numbered(algorithm) if other else "@" not in algorithm
-            if (own, at) == (task, stop) and counts:
+            compared = _numbered(algorithm) if other else "@" not in algorithm
+            if (own, at) == (task, stop) and compared:
                 found = [float(run.line["corrected_qd_score"]) for run in runs]
                 scores = interval([np.asarray(found)])
                 sides[other].append((*scores, algorithm, len(runs)))

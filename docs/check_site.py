@@ -1,4 +1,4 @@
-"""Check the built site: every link leads somewhere, and nothing asks another host.
+"""Check the built site: links lead somewhere, nothing asks another host, lists are lists.
 
 python docs/check_site.py FOLDER
 
@@ -33,6 +33,7 @@ class Page(HTMLParser):
         links: Addresses that a reader can follow.
         loaded: Addresses that the browser asks for by itself.
         places: Names of the places in the page.
+        lost: Items of lists that have become text of a paragraph.
     """
 
     def __init__(self, text: str) -> None:
@@ -40,16 +41,32 @@ class Page(HTMLParser):
         self.links: set[str] = set()
         self.loaded: set[str] = set()
         self.places: set[str] = set()
+        self.lost: list[str] = []
+        self._paragraph: list[str] | None = None
         self.feed(text)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         """Notes the addresses and the name of an element."""
         values = {name: value or "" for name, value in attrs}
         self.places |= {values[name] for name in ("id", "name") if name in values}
+        if tag == "p":
+            self._paragraph = []
         if tag == "a" and "href" in values:
             self.links.add(values["href"])
         if tag in LOADED and values.get("rel") not in NAMED:
             self.loaded.add(values.get(LOADED[tag], ""))
+
+    def handle_data(self, data: str) -> None:
+        """Notes the text of a paragraph."""
+        if self._paragraph is not None:
+            self._paragraph.append(data)
+
+    def handle_endtag(self, tag: str) -> None:
+        """Looks for items of lists in a paragraph."""
+        if tag == "p" and self._paragraph is not None:
+            text = "".join(self._paragraph)
+            self.lost += re.findall(r"^ *[-*] +\S.{0,40}", text, flags=re.MULTILINE)
+            self._paragraph = None
 
 
 def faults(folder: Path) -> list[str]:
@@ -65,6 +82,7 @@ def faults(folder: Path) -> list[str]:
     found = [] if pages else [f"{folder} has no pages"]
     for path, page in pages.items():
         name = path.relative_to(folder.resolve())
+        found += [f"{name}: no item of a list: {text}" for text in page.lost]
         for address in sorted(page.loaded):
             if urlsplit(address).netloc:
                 found.append(f"{name}: loads {address}")
@@ -106,7 +124,7 @@ def dead(folder: Path, path: Path, address: str, pages: dict[Path, Page]) -> lis
 def main() -> int:
     """Prints what is wrong."""
     found = faults(Path(sys.argv[1]))
-    print("\n".join(found[:50]) or "every link is good")
+    print("\n".join(found[:50]) or "every link and list is good")
     return bool(found)
 
 

@@ -213,6 +213,15 @@ def test_dead_links_and_other_hosts_are_found(tmp_path: Path) -> None:
     ]
 
 
+def test_an_item_that_has_left_its_list_is_found(tmp_path: Path) -> None:
+    (tmp_path / "index.html").write_text(
+        "<ul><li><p>good - one</p></li></ul><p>some text\n- <b>lost</b> item</p>"
+    )
+    assert load("check_site").faults(tmp_path) == [
+        "index.html: no item of a list: - lost item"
+    ]
+
+
 @pytest.mark.parametrize("name", ["README", "CONTRIBUTING", "CHANGELOG"])
 def test_links_of_the_first_pages_lead_to_files(name: str) -> None:
     text = (ROOT / f"{name}.md").read_text(encoding="utf-8")
