@@ -1,4 +1,4 @@
-"""Check the built site: links lead somewhere, nothing asks another host, lists are lists.
+"""Check the built site: links lead somewhere, no other host is asked, lists are lists.
 
 python docs/check_site.py FOLDER
 
