@@ -29,7 +29,8 @@ class ActorCriticOptions(LearningOptions):
         lifetime: Generations after which a steered actor restarts from a random elite.
         goals: 0: steered actors follow directions; 1 or 2: they pursue the descriptor
             of their first elite, or of another one.
-        gains: Proportional and integral gain of the weights of the measures.
+        gain: Proportional gain of the weights of the measures.
+        integral_gain: Integral gain of these weights, for each update.
     """
 
     actors: int = 2
@@ -41,7 +42,8 @@ class ActorCriticOptions(LearningOptions):
     fitness_factor: float = 1.0
     lifetime: int = 10
     goals: int = 0
-    gains: tuple[float, float] = (1.0, 0.05)
+    gain: float = 1.0
+    integral_gain: float = 0.05
 
     def episodes(self, config: EvolveConfig) -> int:
         """Returns the control steps of a generation's updates, counted in episodes."""
@@ -79,7 +81,8 @@ def _make(context: EmitterContext, options: ActorCriticOptions) -> Any:
         lifetime=options.lifetime,
         measures=task.descriptor_length,
         goals=options.goals,
-        gains=tuple(options.gains),
+        gain=options.gain,
+        integral_gain=options.integral_gain,
     )
     if emitter.batch_size > config.batch_size:
         given = options.actors, options.branches, options.copies

@@ -88,7 +88,8 @@ class ActorCriticEmitter(Emitter):
         lifetime: int = 10,
         measures: int,
         goals: int = 0,
-        gains: tuple[float, float] = (1.0, 0.05),
+        gain: float = 1.0,
+        integral_gain: float = 0.05,
     ) -> None:
         """Sets the actors and how much they learn.
 
@@ -110,7 +111,8 @@ class ActorCriticEmitter(Emitter):
             measures: Length of the descriptor.
             goals: 0: steered actors follow directions; 1 or 2: they pursue the
                 descriptor of their first elite, or of another one.
-            gains: Proportional and integral gain of the weights of the measures.
+            gain: Proportional gain of the weights of the measures.
+            integral_gain: Integral gain of these weights, for each update.
 
         Raises:
             ValueError: A number is out of its range.
@@ -136,7 +138,7 @@ class ActorCriticEmitter(Emitter):
         self._lifetime = lifetime
         self._measures = measures
         self._goals = goals
-        self._gains = gains
+        self._gains = gain, integral_gain
 
     @property
     def batch_size(self) -> int:
