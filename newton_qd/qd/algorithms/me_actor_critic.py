@@ -25,12 +25,7 @@ class ActorCriticOptions(LearningOptions):
         updates: Updates of an actor before each production of offspring.
         steered: Share of the actors that follow directions of the descriptor [-].
         fitness: Weight of the reward of steered actors [-].
-        fitness_factor: Largest factor between this weight and that of an actor [-].
         lifetime: Generations after which a steered actor restarts from a random elite.
-        goals: 0: steered actors follow directions; 1 or 2: they pursue the descriptor
-            of their first elite, or of another one.
-        gain: Proportional gain of the weights of the measures.
-        integral_gain: Integral gain of these weights, for each update.
     """
 
     actors: int = 2
@@ -39,11 +34,7 @@ class ActorCriticOptions(LearningOptions):
     updates: int = 1
     steered: float = 0.5
     fitness: float = 0.1
-    fitness_factor: float = 1.0
     lifetime: int = 10
-    goals: int = 0
-    gain: float = 1.0
-    integral_gain: float = 0.05
 
     def episodes(self, config: EvolveConfig) -> int:
         """Returns the control steps of a generation's updates, counted in episodes."""
@@ -77,12 +68,8 @@ def _make(context: EmitterContext, options: ActorCriticOptions) -> Any:
         updates=options.updates,
         steered=options.steered,
         fitness=options.fitness,
-        fitness_factor=options.fitness_factor,
         lifetime=options.lifetime,
         measures=task.descriptor_length,
-        goals=options.goals,
-        gain=options.gain,
-        integral_gain=options.integral_gain,
     )
     if emitter.batch_size > config.batch_size:
         given = options.actors, options.branches, options.copies

@@ -32,8 +32,6 @@ class ActorCriticState:
         scale: Mean and standard deviation of observations, (no,) each.
         snapshots: (branches, K, size) weights of the actors during the generation, for
             whitened observations.
-        goals: (K, D) descriptors that steered actors pursue.
-        pressure: (K, D) integral of what is missing to them.
         failed: (K,) number of updates of the generation without a finite gradient.
         generation: () number of generations of the actors.
         key: Key of the next generation.
@@ -42,8 +40,6 @@ class ActorCriticState:
     learners: Learner
     scale: tuple[jax.Array, jax.Array]
     snapshots: jax.Array
-    goals: jax.Array
-    pressure: jax.Array
     failed: jax.Array
     generation: jax.Array
     key: jax.Array
@@ -84,12 +80,8 @@ class ActorCriticEmitter(Emitter):
         spread: tuple[float, float] = (0.005, 0.1),
         steered: float = 0.5,
         fitness: float = 0.1,
-        fitness_factor: float = 1.0,
         lifetime: int = 10,
         measures: int,
-        goals: int = 0,
-        gain: float = 1.0,
-        integral_gain: float = 0.05,
     ) -> None:
         """Sets the actors and how much they learn.
 
@@ -104,15 +96,8 @@ class ActorCriticEmitter(Emitter):
                 genotype.
             steered: Share of the actors that follow directions of the descriptor [-].
             fitness: Weight of the reward for steered actors [-].
-            fitness_factor: Each steered actor has a weight of its own, drawn
-                log-uniformly from ``fitness`` divided by this to ``fitness`` times
-                this [-], at least 1.
             lifetime: Generations after which a steered actor restarts.
             measures: Length of the descriptor.
-            goals: 0: steered actors follow directions; 1 or 2: they pursue the
-                descriptor of their first elite, or of another one.
-            gain: Proportional gain of the weights of the measures.
-            integral_gain: Integral gain of these weights, for each update.
 
         Raises:
             ValueError: A number is out of its range.
@@ -124,7 +109,6 @@ class ActorCriticEmitter(Emitter):
         if not 0 < spread[0] <= spread[1]:
             raise ValueError(message("spread", spread, "0 < smallest <= largest"))
         checks.number("steered", steered, least=0, most=1)
-        checks.number("fitness_factor", fitness_factor, least=1)
         self._method = method
         self._first = first
         self._actors = actors
@@ -134,11 +118,8 @@ class ActorCriticEmitter(Emitter):
         self._updates = updates
         self._steered = round(steered * actors)
         self._fitness = fitness
-        self._fitness_factor = fitness_factor
         self._lifetime = lifetime
         self._measures = measures
-        self._goals = goals
-        self._gains = gain, integral_gain
 
     @property
     def batch_size(self) -> int:
@@ -159,7 +140,7 @@ class ActorCriticEmitter(Emitter):
         With whitening, they are read as weights for whitened observations, which makes
         them other policies.
         """
-        del repertoire, extra_scores
+        del repertoire, descriptors, extra_scores
         key, scale_key, aim_key, critic_key = jax.random.split(key, 4)
         # repeats the best if there are more actors than individuals
         order = jnp.resize(jnp.argsort(-fitnesses.reshape(-1)), (self._actors,))
@@ -169,8 +150,6 @@ class ActorCriticEmitter(Emitter):
             learners=learners,
             scale=self._method.scale(scale_key, self._worlds()),
             snapshots=jnp.tile(weights, (self._branches, 1, 1)),
-            goals=descriptors[order],
-            pressure=jnp.zeros((self._actors, self._measures), jnp.float32),
             failed=jnp.zeros((self._actors,), jnp.int32),
             generation=jnp.zeros((), jnp.int32),
             key=key,
@@ -218,47 +197,26 @@ class ActorCriticEmitter(Emitter):
         del genotypes, fitnesses, descriptors, extra_scores
         state = emitter_state
         key, renewal_key, learn_key = jax.random.split(state.key, 3)
-        learners, goals, pressure = self._renewed(state, repertoire, renewal_key)
+        learners = self._renewed(state, repertoire, renewal_key)
         update = jax.vmap(self._method.update, in_axes=(0, None, 0))
 
         def learn(carry: tuple, key: jax.Array) -> tuple[tuple, None]:
-            learners, failed, pressure = carry
+            learners, failed = carry
             keys = jax.random.split(key, self._actors)
             learners, lost = update(learners, state.scale, keys)
-            if self._goals > 0:
-                learners, pressure = self._pursue(learners, goals, pressure)
-            return (learners, failed + lost, pressure), None
+            return (learners, failed + lost), None
 
         def branch(carry: tuple, key: jax.Array) -> tuple[tuple, jax.Array]:
             keys = jax.random.split(key, self._updates)
             carry, _ = jax.lax.scan(learn, carry, keys)
             return carry, carry[0].weights
 
-        begin = (learners, jnp.zeros_like(state.failed), pressure)
+        begin = (learners, jnp.zeros_like(state.failed))
         keys = jax.random.split(learn_key, self._branches)
-        (learners, failed, pressure), snapshots = jax.lax.scan(branch, begin, keys)
+        (learners, failed), snapshots = jax.lax.scan(branch, begin, keys)
         return ActorCriticState(
-            learners,
-            state.scale,
-            snapshots,
-            goals,
-            pressure,
-            failed,
-            state.generation + 1,
-            key,
+            learners, state.scale, snapshots, failed, state.generation + 1, key
         )
-
-    def _pursue(
-        self, learners: Learner, goals: jax.Array, pressure: jax.Array
-    ) -> tuple[Learner, jax.Array]:
-        error = goals - learners.measures
-        pressure = jnp.clip(pressure + self._gains[1] * error, -10, 10)
-        ways = jnp.clip(self._gains[0] * error + pressure, -10, 10)
-        size = jnp.sqrt(1 + jnp.sum(ways * ways, axis=1, keepdims=True))
-        aims = jnp.concatenate([jnp.ones_like(size), ways], axis=1) / size
-        steered = jnp.arange(self._actors) >= self._actors - self._steered
-        aims = jnp.where(steered[:, None], aims, learners.aim)
-        return dataclasses.replace(learners, aim=aims), pressure
 
     def _worlds(self) -> PyTree:
         """Returns the initial states of the worlds of an actor."""
@@ -275,16 +233,13 @@ class ActorCriticEmitter(Emitter):
 
     def _aims(self, key: jax.Array) -> jax.Array:
         """Returns the aims (K, 1 + D) of the actors; steered actors are last."""
-        way_key, weight_key = jax.random.split(key)
         shape = (self._actors, self._measures)
-        ways = jax.random.normal(way_key, shape, jnp.float32)
+        ways = jax.random.normal(key, shape, jnp.float32)
         ways = ways / jnp.linalg.norm(ways, axis=1, keepdims=True)
         steered = jnp.arange(self._actors) >= self._actors - self._steered
-        power = jax.random.uniform(weight_key, shape[:1], jnp.float32, -1, 1)
-        weights = self._fitness * self._fitness_factor**power
         return jnp.concatenate(
             [
-                jnp.where(steered, weights, 1)[:, None],
+                jnp.where(steered, jnp.float32(self._fitness), 1)[:, None],
                 jnp.where(steered[:, None], ways, 0),
             ],
             axis=1,
@@ -299,23 +254,11 @@ class ActorCriticEmitter(Emitter):
         cells = draw_cells(cell_key, filled, self._actors)
         weights = repertoire.genotypes[cells]
         weights = self._method.whitening.whitened(weights, state.scale)
-        aims = self._aims(aim_key)
-        goals = repertoire.descriptors[cells]
-        if self._goals == 2:
-            goals = repertoire.descriptors[
-                draw_cells(jax.random.fold_in(cell_key, 1), filled, self._actors)
-            ]
-        if self._goals > 0:
-            aims = jnp.zeros_like(aims).at[:, 0].set(1)
-        new = self._begun(critic_key, weights, aims)
+        new = self._begun(critic_key, weights, self._aims(aim_key))
         number = jnp.arange(self._actors)
         # one after the other, so that there are actors of all ages
         turn = number * self._lifetime // max(self._actors, 1)
         due = (state.generation + turn) % self._lifetime == 0
         steered = number >= self._actors - self._steered
         begun = state.generation > 0
-        renewed = due & steered & begun
-        learners = select(renewed, new, state.learners)
-        goals = jnp.where(renewed[:, None], goals, state.goals)
-        pressure = jnp.where(renewed[:, None], 0, state.pressure)
-        return learners, goals, pressure
+        return select(due & steered & begun, new, state.learners)

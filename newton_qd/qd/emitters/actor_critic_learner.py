@@ -41,7 +41,6 @@ class Learner:
         first: Initial states of the W worlds, leaves (W, ...).
         worlds: Current states of the worlds, leaves (W, ...).
         age: (W,) control steps since the start of each world's episode.
-        measures: (D,) running mean of the measures of a control step.
     """
 
     weights: jax.Array
@@ -52,7 +51,6 @@ class Learner:
     first: PyTree
     worlds: PyTree
     age: jax.Array
-    measures: jax.Array
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -151,7 +149,6 @@ class ActorCritic:
             worlds=first,
             # worlds of all ages, so that they do not restart at the same time
             age=jnp.arange(number, dtype=jnp.int32) * self.episode_length // number,
-            measures=jnp.full_like(aim[1:], jnp.nan),
         )
 
     def moved(self, learner: Learner, weights: jax.Array) -> Learner:
@@ -192,7 +189,7 @@ class ActorCritic:
             return -returns.sum(), found
 
         slope, found = jax.grad(loss, has_aux=True)(learner.weights)
-        last, obs, targets, dones, measures = found
+        last, obs, targets, dones = found
         failed = ~jnp.all(jnp.isfinite(slope)) | ~jnp.all(jnp.isfinite(targets))
         change, moments = self._optimizers[0].update(
             slope / self.steps, learner.moments[0]
@@ -215,17 +212,9 @@ class ActorCritic:
             first=learner.first,
             worlds=select(over, learner.first, last),
             age=jnp.where(over, 0, age),
-            measures=self._mean(learner.measures, measures),
         )
         kept = dataclasses.replace(learner, worlds=learned.worlds, age=learned.age)
         return select(failed, kept, learned), failed
-
-    def _mean(self, mean: jax.Array, measures: jax.Array) -> jax.Array:
-        """Returns the running mean (D,) after a window with measures (W, h, D)."""
-        new = measures.mean(axis=(0, 1))
-        share = self.settings.window / self.episode_length
-        mixed = mean + share * (new - mean)
-        return jnp.where(jnp.isfinite(mean), mixed, new)
 
     def _value(self, critic: Layers, scale: PyTree, obs: jax.Array) -> jax.Array:
         mean, deviation = scale
@@ -257,13 +246,12 @@ class ActorCritic:
             before = passed_back(state, one, settings.clip)
             action = self.policy(weights, before.obs) + noise
             after = self.env.step(before, jnp.clip(action, -1, 1))
-            measure = self.measure(before, after)
-            gain = jnp.append(after.reward, measure) @ learner.aim
+            gain = jnp.append(after.reward, self.measure(before, after)) @ learner.aim
             value = self._value(learner.target, scale, after.obs)
             row = gain, after.done, value, jnp.where(_sound(after), value, 0)
-            return select(after.done > 0, first, after), (state.obs, row, measure)
+            return select(after.done > 0, first, after), (state.obs, row)
 
-        last, (obs, rows, measures) = jax.lax.scan(advance, state, noise)
+        last, (obs, rows) = jax.lax.scan(advance, state, noise)
 
         def back(sums: PyTree, row: PyTree) -> tuple[PyTree, jax.Array]:
             total, target = sums
@@ -280,8 +268,7 @@ class ActorCritic:
 
         ends = (rows[2][-1], rows[2][-1])
         (total, _), targets = jax.lax.scan(back, ends, rows, reverse=True)
-        found = last, obs, targets, rows[1], measures
-        return total, jax.lax.stop_gradient(found)
+        return total, jax.lax.stop_gradient((last, obs, targets, rows[1]))
 
     def _fit(
         self,
