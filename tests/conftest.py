@@ -129,11 +129,17 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.skip(reason="no NVIDIA GPU on this machine"))
 
 
+def pytest_collection() -> None:
+    """Leaves garbage alone: each look at it makes JAX look as well."""
+    gc.disable()
+
+
 def pytest_collection_finish() -> None:
     """Looks for garbage less often: modules and what JAX traced are never garbage."""
     gc.collect()
     gc.freeze()
     gc.set_threshold(50_000, 20, 50)
+    gc.enable()
 
 
 @pytest.fixture(scope="session", autouse=True)
