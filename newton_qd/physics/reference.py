@@ -11,9 +11,16 @@ import numpy as np
 from newton_qd.physics.system import JointKind, System
 
 
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Returns what ``np.cross`` does of two vectors (3,), in a tenth of its time."""
+    ax, ay, az = a
+    bx, by, bz = b
+    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+
+
 def quaternion_product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Returns the rotation ``b`` followed by ``a``, both (4,)."""
-    vector = a[3] * b[:3] + b[3] * a[:3] + np.cross(a[:3], b[:3])
+    vector = a[3] * b[:3] + b[3] * a[:3] + _cross(a[:3], b[:3])
     return np.append(vector, a[3] * b[3] - a[:3] @ b[:3])
 
 
@@ -105,21 +112,24 @@ def jacobians(system: System, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     frames = body_frames(system, q)
     linear = np.zeros((system.nb, 3, system.nv))
     angular = np.zeros((system.nb, 3, system.nv))
+    sides = [compose(*pair) for pair in zip(frames, system.child_frame, strict=True)]
+    axes = [
+        rotation_matrix(side[3:]) @ axis
+        for side, axis in zip(sides, system.joint_axis, strict=True)
+    ]
     for body in range(system.nb):
         com = compose(frames[body], np.append(system.com[body], [0, 0, 0, 1.0]))[:3]
         joint = body
         while joint >= 0:
             dof = system.v_start[joint]
-            side = compose(frames[joint], system.child_frame[joint])
-            arm = com - side[:3]
-            axis = rotation_matrix(side[3:]) @ system.joint_axis[joint]
+            arm, axis = com - sides[joint][:3], axes[joint]
             if system.joint_kind[joint] == JointKind.FREE:
                 linear[body, :, dof : dof + 3] = np.eye(3)
                 # Column i of -[arm]x is e_i x arm.
                 linear[body, :, dof + 3 : dof + 6] = np.cross(np.eye(3), arm).T
                 angular[body, :, dof + 3 : dof + 6] = np.eye(3)
             elif system.joint_kind[joint] == JointKind.REVOLUTE:
-                linear[body, :, dof] = np.cross(axis, arm)
+                linear[body, :, dof] = _cross(axis, arm)
                 angular[body, :, dof] = axis
             else:
                 linear[body, :, dof] = axis
