@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from contract import row
 from control_tasks import STEPS, WORLDS, agree, bodies, make, metrics_are, moving, play
 
 from newton_qd import physics
@@ -44,7 +45,8 @@ def asked(bend: float, curl: float, swing: float, height: float) -> np.ndarray:
 def played(stages: list[tuple[int, np.ndarray]]) -> tuple[State, State]:
     """States before and after each step of a world that carries out stages."""
     actions = np.concatenate([np.tile(action, (n, 1, 1)) for n, action in stages])
-    state = jax.vmap(make("grasp").reset)(jax.random.split(jax.random.key(0), 1))
+    keys = jax.random.split(jax.random.key(0), 1)
+    state = jax.jit(jax.vmap(make("grasp").reset))(keys)
     return jax.tree.map(np.asarray, play(make("grasp"))(state, actions))
 
 
@@ -173,7 +175,8 @@ def test_the_largest_actions_are_no_fault() -> None:
     env, rng, worlds = make("grasp"), np.random.default_rng(0), 27
     actions = rng.choice([-1.0, 1.0], (40, worlds, 19)).astype(np.float32)
     actions[..., 16:] = list(itertools.product((-1, 0, 1), repeat=3))
-    state = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), worlds))
+    keys = jax.random.split(jax.random.key(0), worlds)
+    state = jax.jit(jax.vmap(env.reset))(keys)
     _, after = play(env)(state, actions)
     assert not np.any(after.info["fault"])
     assert np.abs(after.pipeline_state.v).max() < 50
@@ -197,11 +200,12 @@ def test_reset() -> None:
             ("distal", 4.06066, 1.0),
         ):
             places[f"finger_{finger}_{part}"] = (x * radius, y * radius, z)
-    seen = env.kinematics(jax.tree.map(lambda x: x[0], state.pipeline_state))
+    seen = jax.jit(env.kinematics)(row(state.pipeline_state, 0))
+    centres = np.asarray(seen.com)
     for link, place in places.items():
-        agree(seen.com[env.system.body_names.index(link)], place)
+        agree(centres[env.system.body_names.index(link)], place)
     viewed: Any = brax_envs.create("grasp")
-    positions = jax.jit(viewed.reset)(keys[0]).qp.pos
+    positions = np.asarray(jax.jit(lambda key: viewed.reset(key).qp.pos)(keys[0]))
     for name, link in (
         ("Object", "object"),
         ("HandPalm", "palm"),
