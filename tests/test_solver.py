@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -58,6 +59,10 @@ def replicated(robot: RobotSpec, worlds: int) -> newton.ModelBuilder:
 def one_world(robot: RobotSpec) -> newton.ModelBuilder:
     path = find_urdf(robot.urdf)
     return newton_builder(str(path), read_description(path).floating, robot.gravity)
+
+
+# Nothing here goes backwards through Newton's own kernels.
+wp.set_module_options({"enable_backward": False}, inspect.getmodule(newton.eval_fk))
 
 
 def finalized(builder: newton.ModelBuilder, device: jax.Device) -> newton.Model:
