@@ -150,8 +150,9 @@ def test_gradient_and_vmap_commute() -> None:
     alone = [jax.jit(gradient)(*(x[i] for x in states)) for i in range(2)]
     same([jnp.stack(rows) for rows in zip(*alone, strict=True)], [x[:2] for x in inner])
     # one control for all worlds: its gradient is the sum
-    shared = jax.grad(lambda u: jax.vmap(value, (0, 0, None))(*states[:2], u).sum())
-    each = jax.vmap(jax.grad(value, argnums=2), (0, 0, None))
+    several = jax.vmap(value, (0, 0, None))
+    shared = jax.jit(jax.grad(lambda u: several(*states[:2], u).sum()))
+    each = jax.jit(jax.vmap(jax.grad(value, argnums=2), (0, 0, None)))
     control = states[2][0]
     same(shared(control), each(*states[:2], control).sum(axis=0))
 

@@ -50,7 +50,8 @@ def test_bad_options_are_named(
 def test_ranges_may_be_lists_and_numbers_of_numpy() -> None:
     options = {"healthy_z_range": [0.2, np.float32(1)], "healthy_reward": np.float64(2)}
     env = newton_qd.create("ant", **options)  # pyright: ignore[reportArgumentType]
-    state = env.step(env.reset(jax.random.key(0)), jnp.zeros(8))
+    first = jax.jit(lambda key: env.step(env.reset(key), jnp.zeros(8)))
+    state = first(jax.random.key(0))
     assert state.metrics["reward_survive"] == 2 and state.done == 0
 
 

@@ -25,16 +25,17 @@ def test_plain_weights_do_what_the_whitened_ones_do() -> None:
     weights = jax.vmap(policy.init)(jax.random.split(keys[2], 3))
     obs = mean + deviation * jax.random.normal(keys[3], (size,))
 
-    plain = white.plain(weights, scale)
-    act = jax.vmap(policy.of_weights, (0, None))
+    to_plain, to_white = jax.jit(white.plain), jax.jit(white.whitened)
+    plain = to_plain(weights, scale)
+    act = jax.jit(jax.vmap(policy.of_weights, (0, None)))
     expected = act(weights, (obs - mean) / deviation)
     np.testing.assert_allclose(act(plain, obs), expected, atol=1e-5)
-    np.testing.assert_allclose(white.whitened(plain, scale), weights, atol=1e-5)
+    np.testing.assert_allclose(to_white(plain, scale), weights, atol=1e-5)
     assert float(jnp.abs(plain - weights).max()) > 0.1
     # it is linear, so it converts steps too
-    step = white.plain(weights[1], scale)
+    step = to_plain(weights[1], scale)
     np.testing.assert_allclose(
-        white.plain(weights[0] + weights[1], scale),
+        to_plain(weights[0] + weights[1], scale),
         plain[0] + step,
         rtol=1e-5,
         atol=1e-5,
