@@ -153,6 +153,7 @@ def test_arrays_are_typed_and_read_only(ant: System) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("newton_without_adjoints")
 def test_reference_agrees_with_newton(ant: System) -> None:
     path = str(find_urdf("ant.urdf"))
     built = build.newton_builder(path, True, 9.8).finalize()

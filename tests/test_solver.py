@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,8 @@ from newton_qd.physics.model.description import read_description
 from newton_qd.physics.reference import rotation_matrix
 from newton_qd.physics.solver import NewtonQDSolver
 from newton_qd.robots import ANT, RobotSpec
+
+pytestmark = pytest.mark.usefixtures("newton_without_adjoints")
 
 # One link whose centre of mass is far from its origin, and a link that swings.
 OFF_CENTRE = """<robot name="off_centre">
@@ -59,10 +60,6 @@ def replicated(robot: RobotSpec, worlds: int) -> newton.ModelBuilder:
 def one_world(robot: RobotSpec) -> newton.ModelBuilder:
     path = find_urdf(robot.urdf)
     return newton_builder(str(path), read_description(path).floating, robot.gravity)
-
-
-# Nothing here goes backwards through Newton's own kernels.
-wp.set_module_options({"enable_backward": False}, inspect.getmodule(newton.eval_fk))
 
 
 def finalized(builder: newton.ModelBuilder, device: jax.Device) -> newton.Model:

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from contract import row
 
 import newton_qd
 from newton_qd import wrappers
@@ -43,10 +44,6 @@ def batch() -> BraxState:
         action = jax.random.uniform(key, (3, 8), np.float32, -1.0, 1.0)
         state = step(state, action)
     return state
-
-
-def row(tree: Any, index: int) -> Any:
-    return jax.tree.map(lambda x: np.asarray(x)[index], tree)
 
 
 def test_bodies_are_where_the_kinematics_puts_them(batch: BraxState) -> None:
