@@ -24,7 +24,6 @@ from newton_qd.qd.algorithms.me_actor_critic import ME_ACTOR_CRITIC
 from newton_qd.qd.algorithms.me_conditioned import ME_CONDITIONED
 from newton_qd.qd.algorithms.me_es import ME_ES
 from newton_qd.qd.algorithms.me_gradient import ME_GRADIENT
-from newton_qd.qd.algorithms.me_value_gradient import ME_VALUE_GRADIENT
 from newton_qd.qd.algorithms.omg_mega import OMG_MEGA
 from newton_qd.qd.algorithms.pga_me import PGA_ME
 from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext
@@ -50,7 +49,6 @@ ALGORITHMS: tuple[AlgorithmSpec[Any], ...] = (
     ASCII_ME_EXACT,
     ME_ACTOR_CRITIC,
     ME_CONDITIONED,
-    ME_VALUE_GRADIENT,
     OMG_MEGA,
     CMA_MEGA,
     CMA_MAEGA,
