@@ -16,6 +16,7 @@ FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
 sys.path.insert(0, str(FOLDER))
 
 import study  # noqa: E402
+import study_regions  # noqa: E402
 import study_runs  # noqa: E402
 import study_scores  # noqa: E402
 from study_protocols import BASELINES, FIELD, HUMANOIDS, PROTOCOLS, SMALL, Stop  # noqa: E402
@@ -273,3 +274,30 @@ def test_wrong_words_are_refused(
     with pytest.raises(SystemExit):
         study.arguments()
     assert text in capsys.readouterr().err
+
+
+def test_regions_have_the_mean_of_their_filled_cells() -> None:
+    places = np.array([0.0, 0.2, 0.3, 0.5, 1.0])
+    fitnesses = np.array([1.0, 3.0, 7.0, -np.inf, 9.0])
+    low, middle, high = study_regions.regions(places, fitnesses, [0.0, 0.3, 0.6, 1.0])
+    assert low == (2.0, 100.0)
+    assert middle == (7.0, 50.0)
+    assert high == (9.0, 100.0)  # the last region includes its end
+    (alone,) = study_regions.regions(places, fitnesses, [0.4, 0.6])
+    assert np.isnan(alone[0]) and alone[1] == 0.0
+
+
+def test_the_table_of_regions_names_what_has_no_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    add(tmp_path, "me", 0, "60 s", 2 * np.arange(CELLS))
+    monkeypatch.setattr(study_regions, "places", lambda *_: np.linspace(0, 1, CELLS))
+    command = ["study_regions.py", str(tmp_path), TASK]
+    monkeypatch.setattr(sys, "argv", [*command, "me@0", "--ranges", "0", "0.5", "1"])
+    study_regions.main()
+    # elites lose 1 when they are evaluated again
+    assert "| 0 to 0.5 | 2 (100 %) |" in capsys.readouterr().out
+    monkeypatch.setattr(sys, "argv", [*command, "me@9"])
+    with pytest.raises(SystemExit):
+        study_regions.main()
+    assert "variants: got me@9" in capsys.readouterr().err

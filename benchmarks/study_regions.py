@@ -1,0 +1,108 @@
+"""Fitness of the elites by region of the descriptor, for a task of the study.
+
+A table of the mean fitness of re-evaluated elites, by range of the mean of the
+descriptor's components, which is scaled to 0 to 1. Each number is a mean over seeds; in
+brackets is the share of the cells that have an elite [%]:
+
+    python benchmarks/study_regions.py benchmarks/results/field walker2d_uni \
+        me-actor-critic@14 dcrl-me@6 me@5 --ranges 0.2 0.4 0.6 0.8 1
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import itertools
+from pathlib import Path
+
+import numpy as np
+from study_protocols import FIELD
+from study_runs import TUNING_SEED, lines
+
+
+@functools.cache
+def places(task_name: str, seed: int) -> np.ndarray:
+    """Returns the mean of the components of each cell's centre (cells,), in 0 to 1."""
+    from newton_qd.qd import EvolveConfig, make_task
+    from newton_qd.qd.run.search import Search
+
+    settings = FIELD.settings_of(task_name)
+    config = EvolveConfig(env_name=task_name, algorithm="me", seed=seed, **settings)
+    task = make_task(config)
+    search = Search(config.resolve(task.descriptor_length), task)
+    low, high = np.asarray(task.limits)
+    centres = np.asarray(search.empty().repertoire.centroids)
+    return ((centres - low) / (high - low)).mean(axis=1)
+
+
+def regions(
+    places: np.ndarray, fitnesses: np.ndarray, limits: list[float]
+) -> list[tuple[float, float]]:
+    """Returns mean fitness and share of filled cells [%] of each region.
+
+    Args:
+        places: (cells,) place of each cell.
+        fitnesses: (cells,) fitness of each cell, ``-inf`` if it is empty.
+        limits: Where regions end, in increasing order. The last one includes its end.
+
+    Returns:
+        One pair for each region; NaN if it has no elite, or no cell.
+    """
+    found = []
+    for low, high in itertools.pairwise(limits):
+        last = high == limits[-1]
+        inside = (places >= low) & ((places < high) | (last & (places <= high)))
+        filled = fitnesses[inside & (fitnesses > -np.inf)]
+        mean = float(filled.mean()) if len(filled) else np.nan
+        share = 100 * len(filled) / inside.sum() if inside.any() else np.nan
+        found.append((mean, share))
+    return found
+
+
+def main() -> None:
+    """Prints the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("runs", type=Path)
+    parser.add_argument("task", choices=FIELD.tasks)
+    parser.add_argument("variants", nargs="+")
+    parser.add_argument("--stop", default="60 s")
+    parser.add_argument(
+        "--ranges", type=float, nargs="+", default=[0, 0.25, 0.5, 0.75, 1]
+    )
+    args = parser.parse_args()
+    if len(args.ranges) < 2 or sorted(set(args.ranges)) != args.ranges:
+        parser.error(
+            f"--ranges: got {args.ranges}; allowed: two or more rising numbers"
+        )
+    columns = []
+    for variant in args.variants:
+        seeds = [
+            int(line["seed"])
+            for line in lines(args.runs)
+            if (line["task"], line["variant"], line["stop"])
+            == (args.task, variant, args.stop)
+            and int(line["seed"]) != TUNING_SEED
+        ]
+        if not seeds:
+            parser.error(
+                f"variants: got {variant}; allowed: one with a run at {args.stop}"
+            )
+        each = []
+        for seed in sorted(seeds):
+            path = args.runs / "cells" / f"{args.task}.{variant}.{seed}.npz"
+            fitnesses = np.load(path)[args.stop][1]
+            each.append(regions(places(args.task, seed), fitnesses, args.ranges))
+        columns.append(np.nanmean(each, axis=0))
+    print(f"| descriptor | {' | '.join(args.variants)} |")
+    print("|---" * (1 + len(columns)) + "|")
+    for index, (low, high) in enumerate(itertools.pairwise(args.ranges)):
+        cells = [
+            f"{mean:.0f} ({share:.0f} %)" for mean, share in (x[index] for x in columns)
+        ]
+        print(f"| {low:g} to {high:g} | {' | '.join(cells)} |")
+
+
+if __name__ == "__main__":
+    main()
