@@ -92,6 +92,9 @@ def readings(env: Any) -> Callable[..., jax.Array]:
     """
     first = jax.jit(env.reset)(jax.random.key(0))
 
+    # A scan's step is traced to a program before JAX transforms it. So this is traced
+    # once for all transformations, and what they see stays the same.
+    @functools.partial(jax.jit, static_argnames=("steps", "unrolled"))
     def run(inputs: Inputs, steps: int = 1, unrolled: bool = False) -> jax.Array:
         params = physics.PhysicsParams(**{name: inputs[name] for name in FIELDS})
         start = physics.initial_state(env.unwrapped.system, inputs["q"], inputs["v"])
@@ -119,9 +122,14 @@ def weighted(env: Any) -> Callable[..., jax.Array]:
 
     def value(inputs: Inputs, *options: Any) -> jax.Array:
         seen = read(inputs, *options)
-        return (np.random.default_rng(1).normal(size=seen.shape) * seen).sum()
+        return (weights_of(len(seen)) * seen).sum()
 
     return value
+
+
+def weights_of(count: int) -> np.ndarray:
+    """Weights (count,) of the readings in the functional."""
+    return np.random.default_rng(1).normal(size=count)
 
 
 def norms(x: Any) -> np.ndarray:
