@@ -14,10 +14,9 @@ def start(
     arguments: Sequence[str], *, seconds: float = SECONDS, **options: Any
 ) -> subprocess.Popen[str]:
     """A process with its output in pipes, killed after ``seconds``."""
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    process = subprocess.Popen(
-        arguments, stdin=subprocess.DEVNULL, text=True, **{**pipes, **options}
-    )
+    streams: dict[str, Any] = {"stdin": subprocess.DEVNULL}
+    streams |= {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    process = subprocess.Popen(arguments, text=True, **{**streams, **options})
     watchdog = threading.Timer(seconds, process.kill)
     watchdog.daemon = True
     watchdog.start()

@@ -7,8 +7,9 @@ import os
 import socket
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import jax
 import numpy as np
@@ -37,33 +38,82 @@ def problem(name, count, episode_length=10):
 """
 
 
-def start(code: str, **variables: str) -> subprocess.Popen[str]:
+# Runs the code of each line of its input, and prints its answer or its error.
+SERVE = """
+import contextlib, traceback
+for line in sys.stdin:
+    names = dict(globals())
+    try:
+        with contextlib.redirect_stdout(sys.stderr):
+            exec(json.loads(line), names)
+        found = {"answer": names["answer"]}
+    except Exception:
+        found = {"error": traceback.format_exc()}
+    print(json.dumps(found), flush=True)
+"""
+SECONDS = 540.0
+FLAGS = os.environ.get("XLA_FLAGS", "")
+FOUR_DEVICES = f"{FLAGS} --xla_force_host_platform_device_count=4"
+
+
+def start(
+    code: str, seconds: float = SECONDS, flags: str = FLAGS, **options: Any
+) -> subprocess.Popen[str]:
     return processes.start(
         [sys.executable, "-W", "ignore", "-c", COMMON + code],
-        seconds=540.0,
+        seconds=seconds,
         cwd=TESTS,
-        env={**os.environ, "JAX_PLATFORMS": "cpu", **variables},
+        env={**os.environ, "JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags},
+        **options,
     )
 
 
-def answer(process: subprocess.Popen[str]) -> Any:
-    output, errors = process.communicate(timeout=540)
-    assert process.returncode == 0, errors
-    return json.loads(output.splitlines()[-1])
+class Devices:
+    """A process with four devices, which several tests share: its start takes long."""
+
+    def __init__(self, errors: IO[str]) -> None:
+        streams = {"stdin": subprocess.PIPE, "stderr": errors}
+        self._process = start(SERVE, 4 * SECONDS, FOUR_DEVICES, **streams)
+        self._errors = Path(errors.name)
+
+    def answer(self, code: str) -> Any:
+        """What some code, which has names of its own, leaves in ``answer``."""
+        assert self._process.stdin is not None and self._process.stdout is not None
+        self._process.stdin.write(json.dumps(code) + "\n")
+        self._process.stdin.flush()
+        line = self._process.stdout.readline()
+        assert line, self._errors.read_text()
+        found = json.loads(line)
+        assert "error" not in found, found["error"]
+        return found["answer"]
+
+    def end(self) -> None:
+        self._process.communicate()
+        assert self._process.returncode == 0, self._errors.read_text()
 
 
-def two_processes_and_one(code: str) -> list[Any]:
-    """Answers of two processes of one JAX, and of a process of its own."""
+@pytest.fixture(scope="module")
+def devices(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Devices]:
+    path = tmp_path_factory.mktemp("devices") / "errors"
+    with path.open("w", encoding="utf-8") as errors:
+        shared = Devices(errors)
+        yield shared
+        shared.end()
+
+
+def two_processes(code: str) -> list[Any]:
+    """Answers of two processes of one JAX."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{free.getsockname()[1]}"
     join = f"jax.distributed.initialize({address!r}, 2, %d)\n"
-    runs = [start(join % 0 + code), start(join % 1 + code), start(code)]
-    return [answer(process) for process in runs]
-
-
-FLAGS = os.environ.get("XLA_FLAGS", "")
-FOUR_DEVICES = {"XLA_FLAGS": f"{FLAGS} --xla_force_host_platform_device_count=4"}
+    end = "print(json.dumps(answer))\n"
+    answers = []
+    for process in [start(join % number + code + end) for number in (0, 1)]:
+        output, errors = process.communicate(timeout=SECONDS)
+        assert process.returncode == 0, errors
+        answers.append(json.loads(output.splitlines()[-1]))
+    return answers
 
 
 def test_a_mesh_has_the_devices_that_exist() -> None:
@@ -75,7 +125,7 @@ def test_a_mesh_has_the_devices_that_exist() -> None:
 
 @pytest.mark.optimized
 @pytest.mark.slow
-def test_results_do_not_depend_on_the_number_of_devices() -> None:
+def test_results_do_not_depend_on_the_number_of_devices(devices: Devices) -> None:
     code = """
 def shapes_of(name):
     score, genotypes = problem(name, 22)
@@ -94,26 +144,29 @@ def shapes_of(name):
             np.testing.assert_array_equal(a, b, err_msg=name)
     return shapes
 
-print(json.dumps([shapes_of(name) for name in ("ant_uni", "pointmaze")]))
+answer = [shapes_of(name) for name in ("ant_uni", "pointmaze")]
 """
     # 22 individuals on 4 devices are 24 with the copies that fill up.
-    assert answer(start(code, **FOUR_DEVICES)) == [[22, 11, 6]] * 2
+    assert devices.answer(code) == [[22, 11, 6]] * 2
 
 
 @pytest.mark.slow
-def test_no_device_steps_more_worlds_than_its_share() -> None:
+def test_no_device_steps_more_worlds_than_its_share(devices: Devices) -> None:
+    # of a robot that no other test here steps, because a plan counts from its start
     code = """
 from newton_qd.physics.native import all_plans
-score, genotypes = problem("ant_uni", 32, 5)
+before = all_plans()
+score, genotypes = problem("walker2d_uni", 32, 5)
 mesh = device_mesh(4)
 jax.block_until_ready(
     jax.jit(shard_scoring(score, mesh))(genotypes, jax.random.key(2))
 )
-step = max(all_plans(), key=lambda plan: plan.launches)
-print(json.dumps([step.launches, step.most_worlds, step.worlds]))
+plans = [plan for plan in all_plans() if plan not in before]
+step = max(plans, key=lambda plan: plan.launches)
+answer = [step.launches, step.most_worlds, step.worlds]
 """
     # Five steps on each of four devices.
-    assert answer(start(code, **FOUR_DEVICES)) == [20, 8, 160]
+    assert devices.answer(code) == [20, 8, 160]
 
 
 def test_devices_that_do_not_exist_are_refused(tmp_path: Path) -> None:
@@ -143,29 +196,28 @@ def evolved(name, algorithm="me", options=(), **arguments):
 
 
 @pytest.mark.slow
-def test_an_archive_does_not_depend_on_the_number_of_devices() -> None:
+def test_an_archive_does_not_depend_on_the_number_of_devices(devices: Devices) -> None:
     tasks: list[tuple[str, str, dict[str, Any]]] = [
         ("ant_uni", "me", {}),
         ("pointmaze", "pga-me", CRITIC),
         ("pointmaze", "me-es", {"num_optimizer_steps": 2}),
     ]
     code = f"""
-found = []
+answer = []
 for task in {tasks!r}:
     alone = evolved(*task)
-    found += [evolved(*task, devices=count) == alone for count in (1, 3, 4)]
-print(json.dumps(found))
+    answer += [evolved(*task, devices=count) == alone for count in (1, 3, 4)]
 """
-    assert answer(start(EVOLVE + code, **FOUR_DEVICES)) == [True] * 9
+    assert devices.answer(EVOLVE + code) == [True] * 9
 
 
 @pytest.mark.slow
-def test_two_processes_agree_with_one() -> None:
+def test_two_processes_agree_with_one(devices: Devices) -> None:
     """In the scores of a batch, and in the archive of a run."""
     code = """
 from jax.sharding import NamedSharding, PartitionSpec
 score, genotypes = problem("ant_uni", 16, 5)
-mesh = device_mesh()
+mesh = device_mesh(count)
 data = np.asarray(jax.random.key_data(jax.random.key(2)))
 
 def run(genotypes, data):
@@ -175,15 +227,14 @@ everywhere = NamedSharding(mesh, PartitionSpec())
 found = jax.jit(run)(*jax.device_put((genotypes, data), everywhere))
 scored = [mesh.size, *(np.asarray(x).tolist() for x in found[:2])]
 
-found = evolved("pointmaze", devices=jax.device_count())
 try:
-    evolved("pointmaze", resume=True)
-    refused = ""
+    refused, found = "", evolved("pointmaze", devices=count, resume=True)
 except newton_qd.qd.ConfigError as error:
-    refused = str(error)
-print(json.dumps([scored, found, refused]))
+    refused, found = str(error), evolved("pointmaze", devices=count)
+answer = [scored, found, refused]
 """
-    first, second, alone = two_processes_and_one(EVOLVE + code)
+    first, second = two_processes("count = jax.device_count()\n" + EVOLVE + code)
+    alone = devices.answer("count = 1\n" + EVOLVE + code)
     assert (first[0][0], alone[0][0]) == (2, 1)
     assert first[0] == second[0]
     np.testing.assert_array_equal(first[0][1], alone[0][1])
@@ -212,7 +263,7 @@ def check_devices(**variables: str) -> None:
 
 @pytest.mark.slow
 def test_virtual_devices_share_the_worlds() -> None:
-    check_devices(JAX_PLATFORMS="cpu", **FOUR_DEVICES)
+    check_devices(JAX_PLATFORMS="cpu", XLA_FLAGS=FOUR_DEVICES)
 
 
 @pytest.mark.gpu
@@ -226,7 +277,9 @@ def test_gpus_share_the_worlds() -> None:
 @pytest.mark.skipif(
     jax.__version_info__ < (0, 10), reason="before, JAX cannot split random numbers so"
 )
-def test_a_mesh_with_explicit_axes_splits_steps_and_gradients() -> None:
+def test_a_mesh_with_explicit_axes_splits_steps_and_gradients(
+    devices: Devices,
+) -> None:
     """Axes are explicit by default; each device steps its share of the worlds."""
     code = """
 import contextlib
@@ -298,6 +351,6 @@ for count in (2, 4):
     for a, b in zip(expected, found, strict=True):
         assert b.sharding.spec[0] == "b", b.sharding
         np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6)
-print(json.dumps(True))
+answer = True
 """
-    assert answer(start(code, **FOUR_DEVICES))
+    assert devices.answer(code)
