@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from point_runs import SMALL, interrupt_after, point_task, run
+from point_runs import SMALL, evolve_module, interrupt_after, point_task, run
 from test_steady import compiled
 
 import newton_qd.compat
@@ -120,10 +120,13 @@ def test_a_stop_changes_nothing(
     )
     common: dict[str, Any] = {"progress": False, "checkpoint_seconds": 1e9}
     try:
+        # one search for both, which is traced once; the third run makes its own
+        search = Search(config, make_task(config))
         with monkeypatch.context() as patch:
-            counts = count_after_generations(patch, compiled)
-            whole = evolve(config, out=tmp_path / "whole", **common)
-        with monkeypatch.context() as patch:
+            patch.setattr(evolve_module, "Search", lambda *_: search)
+            with patch.context() as first:
+                counts = count_after_generations(first, compiled)
+                whole = evolve(config, out=tmp_path / "whole", **common)
             interrupt_after(patch, 3)
             assert evolve(config, out=tmp_path / "parts", **common).interrupted
         evolve(config, out=tmp_path / "parts", resume=True, **common)
