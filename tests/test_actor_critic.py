@@ -255,7 +255,7 @@ def test_a_single_copy_is_the_actor_itself() -> None:
     archive = MapElitesRepertoire.init_default(
         jnp.zeros(SIZE), compute_euclidean_centroids((4, 4), [-2.0, -2.0], [2.0, 2.0])
     )
-    offspring, _ = emitter(copies=1).emit(archive, state, jax.random.key(0))
+    offspring, _ = compiled(emitter(copies=1).emit)(archive, state, jax.random.key(0))
     np.testing.assert_array_equal(offspring, state.snapshots.reshape(-1, SIZE))
 
 

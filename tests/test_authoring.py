@@ -127,10 +127,10 @@ class Still(nq.PhysicsEnv):
 def test_defaults_of_the_methods(page: dict[str, Any]) -> None:
     env = Still(page["ROBOT"])
     assert env.observation_size == 9 + 8
-    state = env.reset(jax.random.key(0))
+    state = jax.jit(env.reset)(jax.random.key(0))
     physics = state.pipeline_state
     assert np.array_equal(state.obs, np.concatenate([physics.q, physics.v]))
-    after = env.step(state, jnp.zeros(2))
+    after = jax.jit(env.step)(state, jnp.zeros(2))
     assert after.reward == 1 and after.reward.dtype == after.done.dtype == np.float32
 
 
@@ -303,7 +303,8 @@ def test_limits_of_descriptors(limits: Any, page: dict[str, Any]) -> None:
 
 def test_descriptors_around_a_batch(page: dict[str, Any]) -> None:
     inside = nq.create("crawler", batch_size=3)
-    state = page["ArmAngles"](inside, "crawler").reset(jax.random.key(0))
+    env = page["ArmAngles"](inside, "crawler")
+    state = jax.jit(env.reset)(jax.random.key(0))
     assert state.info["state_descriptor"].shape == (3, 2)
 
 

@@ -204,9 +204,14 @@ def test_no_fault_pays_in_a_scoring_function() -> None:
         dones: jax.Array
         obs: jax.Array
 
-    states = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 2))
-    actions = jnp.array([[0.1, 0.1], [jnp.nan, 0.0]])
-    found = evaluate(play, (states, actions), (0, 0), 5, lambda data, _: data[2][:, 0])  # pyright: ignore
+    @jax.jit
+    def scores(keys: jax.Array, actions: jax.Array) -> Any:
+        states = jax.vmap(env.reset)(keys)
+        described: Any = lambda data, _: data[2][:, 0]  # noqa: E731
+        return evaluate(play, (states, actions), (0, 0), 5, described)
+
+    actions = np.array([[0.1, 0.1], [np.nan, 0.0]], np.float32)
+    found = scores(jax.random.split(jax.random.key(0), 2), actions)
     assert np.isfinite(found[0][0]) and found[0][1] == -np.inf
 
 

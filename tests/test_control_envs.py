@@ -207,11 +207,16 @@ def test_drag_is_that_of_the_links() -> None:
     """Generalized force J^T F, of coefficients computed by hand from the original's."""
     env = make("swimmer")
     system, rng = env.system, np.random.default_rng(3)
+
+    @jax.jit
+    def forces(q: jax.Array, v: jax.Array) -> jax.Array:
+        state = newton_qd.physics.initial_state(system, q, v)
+        return env.control(state, jnp.zeros(2, np.float32))
+
     for _ in range(5):
         q, v = rng.normal(size=5).astype(np.float32), rng.normal(size=5)
         v = v.astype(np.float32)
-        state = newton_qd.physics.initial_state(system, q, v)
-        control = np.asarray(env.control(state, jnp.zeros(2, np.float32)))
+        control = np.asarray(forces(q, v))
         linear, _ = reference.jacobians(system, q)
         expected = np.zeros(5)
         for body, angle in zip((2, 3, 4), np.cumsum(q[2:].astype(float)), strict=True):

@@ -155,7 +155,8 @@ def test_extractors_under_jit() -> None:
     mask = jnp.array([[0] * 5, [0, 0, 1, 1, 1], [0, 1, 1, 1, 1]], np.float32)
     for extract in (get_final_xy_position, get_feet_contact_proportion):
         assert np.array_equal(jax.jit(extract)(data, mask), extract(data, mask))
-        swapped = jax.vmap(extract)(jax.tree.map(lambda x: x[None], data), mask[None])
+        several = jax.tree.map(lambda x: np.asarray(x)[None], (data, mask))
+        swapped = jax.jit(jax.vmap(extract))(*several)
         assert np.array_equal(swapped[0], extract(data, mask))
 
 

@@ -180,7 +180,7 @@ def test_reset(name: str) -> None:
     task, env = TASKS[name], make(name)
     rest = np.zeros(task.size)
     rest[: len(task.rest)] = task.rest
-    np.testing.assert_allclose(env.fixed_state().obs, rest, atol=1e-6)
+    np.testing.assert_allclose(jax.jit(env.fixed_state)().obs, rest, atol=1e-6)
     keys = jax.random.split(jax.random.key(0), 64)
     state = jax.jit(jax.vmap(env.reset))(keys).pipeline_state
     q, v = np.asarray(state.q), np.asarray(state.v)
@@ -193,14 +193,14 @@ def test_reset(name: str) -> None:
         np.testing.assert_allclose(lowest, 0.0, atol=1e-6)
     else:
         np.testing.assert_allclose(q[:, 1], task.rest[0], atol=1e-6)
-    wide = task.env(reset_noise_scale=0.0).reset(jax.random.key(0))
+    wide = jax.jit(task.env(reset_noise_scale=0.0).reset)(jax.random.key(0))
     np.testing.assert_allclose(wide.obs, rest, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", TASKS)
 def test_joint_velocities_are_rates_of_the_angles(name: str) -> None:
     env = make(name)
-    still = env.fixed_state()
+    still = jax.jit(env.fixed_state)()
     push = jnp.zeros(env.action_size, np.float32).at[0].set(-0.05)
     after = jax.jit(env.step)(still, push)
     angle = -2 * env.action_size - 3
@@ -212,7 +212,7 @@ def test_joint_velocities_are_rates_of_the_angles(name: str) -> None:
 def test_velocities_do_not_grow(name: str) -> None:
     """In free flight; the original multiplied them by exp(dt)."""
     env = make(name)
-    state = env.fixed_state()
+    state = jax.jit(env.fixed_state)()
     start = state.pipeline_state
     q, v = start.q.at[1].add(1.0), start.v.at[0].set(1.0)
     flying = state.replace(pipeline_state=dataclasses.replace(start, q=q, v=v))

@@ -37,19 +37,24 @@ def test_within_is_a_step_with_the_slope_of_a_smooth_one(limits: Any) -> None:
     """Against the derivative in closed form, in float64."""
     low, high = limits
     with jax.enable_x64(True):
-        for value in (-0.1, 0.15, 0.2, 0.3, 0.97, 1.0, 1.02, 3.0):
-            x = jnp.float64(value)
+        steep, smooth = (
+            jax.jit(
+                lambda x, w=w: (within(x, limits, w), jax.grad(within)(x, limits, w))
+            )
+            for w in (None, WIDTH)
+        )
+        for x in np.float64([-0.1, 0.15, 0.2, 0.3, 0.97, 1.0, 1.02, 3.0]):
+            value = float(x)
             inside = low <= value <= high
-            for width in (None, WIDTH):
-                assert within(x, limits, width) == inside
+            (wide, slope), (narrow, found) = smooth(x), steep(x)
+            assert wide == narrow == inside
             slopes = [
                 sign * logistic(margin / WIDTH) * logistic(-margin / WIDTH) / WIDTH
                 for sign, margin in ((1, value - low), (-1, high - value))
             ]
             expected = slopes[0] * (value <= high) + slopes[1] * (value >= low)
-            found = jax.grad(within)(x, limits, WIDTH)
-            np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-300)
-            assert jax.grad(within)(x, limits) == 0
+            np.testing.assert_allclose(slope, expected, rtol=1e-12, atol=1e-300)
+            assert found == 0
 
 
 def _robot(env: Env) -> PhysicsEnv:
@@ -65,7 +70,7 @@ def test_done_has_a_gradient_near_its_limit(name: str) -> None:
     smooth = with_smooth_termination(env, WIDTH)
     kinds = [_robot(env), _robot(smooth)]
     assert [kind.termination_width for kind in kinds] == [None, WIDTH]
-    rest = kinds[0].fixed_state().pipeline_state
+    rest = jax.jit(kinds[0].fixed_state)().pipeline_state
     action = jnp.zeros((env.action_size,))
     fallen = rest.q * 0.3  # lower
     if "pendulum" in name:
@@ -96,7 +101,7 @@ def test_a_maze_has_a_gradient_of_done(name: str) -> None:
     """A maze has limits of its own."""
     env = newton_qd.create(name, auto_reset=False)
     smooth = with_smooth_termination(env, WIDTH)
-    state = env.reset(jax.random.key(0))
+    state = jax.jit(env.reset)(jax.random.key(0))
     wrapper: Any = smooth
     while not isinstance(wrapper, MazeWrapper):
         wrapper = wrapper.env
@@ -106,9 +111,10 @@ def test_a_maze_has_a_gradient_of_done(name: str) -> None:
         moved = dataclasses.replace(moved, q=moved.q.at[2].set(height))
         return wrapper._outcome(state.replace(pipeline_state=moved)).done
 
+    gradient = jax.jit(jax.value_and_grad(done))
     low, _ = wrapper.heights
     for height, ended in ((low + WIDTH, 0), (low - WIDTH, 1)):
-        value, slope = jax.value_and_grad(done)(jnp.float32(height))
+        value, slope = gradient(np.float32(height))
         side = logistic(1.0) * logistic(-1.0) / WIDTH
         assert value == ended
         np.testing.assert_allclose(slope, -side, rtol=1e-5)
@@ -119,13 +125,14 @@ def test_the_reward_keeps_its_gradient(name: str) -> None:
     """Also where an unhealthy robot does not end an episode, but loses a bonus."""
     env = newton_qd.create(name, auto_reset=False, terminate_when_unhealthy=False)
     kinds = [_robot(env), _robot(with_smooth_termination(env, WIDTH))]
-    rest = kinds[0].fixed_state().pipeline_state
+    rest = jax.jit(kinds[0].fixed_state)().pipeline_state
 
     def reward(q: jax.Array, robot: Any) -> jax.Array:
         state = dataclasses.replace(rest, q=q)
         return robot.outcome(rest, state, jnp.zeros((env.action_size,)))[0]
 
-    one, two = (jax.grad(reward)(rest.q, kind) for kind in kinds)
+    gradient = jax.jit(jax.grad(reward), static_argnums=1)
+    one, two = (gradient(rest.q, kind) for kind in kinds)
     np.testing.assert_array_equal(one, two)
 
 
@@ -169,8 +176,9 @@ def cliff_gradient(width: float | None, start: float) -> jax.Array:
         9,
         settings,
     )
-    first = jax.tree.map(lambda x: x[None], env.reset(jax.random.key(0)))
-    begun = way.begin(jax.random.key(1), jnp.zeros(2), jnp.array([1.0, 0, 0]), first)
+    first = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 1))
+    begin = jax.jit(way.begin)
+    begun = begin(jax.random.key(1), jnp.zeros(2), jnp.array([1.0, 0, 0]), first)
     # a critic that gives 10 everywhere
     flat = jax.tree.map(jnp.zeros_like, begun.target)
     flat[-1] = (flat[-1][0], jnp.ones_like(flat[-1][1]))
@@ -184,7 +192,7 @@ def cliff_gradient(width: float | None, start: float) -> jax.Array:
     def total(weights: jax.Array) -> jax.Array:
         return way._window(weights, begun, scale, one, one, jnp.zeros((4, 2)))[0]
 
-    return jax.grad(total)(jnp.zeros(2))
+    return jax.jit(jax.grad(total))(jnp.zeros(2))
 
 
 @pytest.mark.parametrize("start", [0.4, 0.55])
