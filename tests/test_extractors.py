@@ -74,8 +74,9 @@ def test_an_episode_checks_its_extractor() -> None:
         create_brax_scoring_fn(env, None, extractor, jax.random.key(0))  # pyright: ignore
 
 
-OBSERVATIONS = jax.random.normal(jax.random.key(0), (5, 7, 3), np.float32)
-WEIGHTS = jax.random.normal(jax.random.key(1), (3, 2), np.float32)
+# NumPy draws: every process that collects tests would compile JAX's programs for it
+OBSERVATIONS = jnp.asarray(np.random.default_rng(0).normal(size=(5, 7, 3)), np.float32)
+WEIGHTS = jnp.asarray(np.random.default_rng(1).normal(size=(3, 2)), np.float32)
 
 
 def extra_info() -> AuroraExtraInfoNormalization:

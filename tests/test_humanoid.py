@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -20,7 +21,6 @@ from newton_qd.physics import reference
 from newton_qd.physics.system import System
 from newton_qd.robots import HUMANOID
 
-HUMANOID_ENV, TRAP_ENV = Humanoid(), HumanoidTrap()
 BODIES = (
     *("torso", "lwaist", "pelvis"),
     *("right_thigh", "right_shin", "left_thigh", "left_shin"),
@@ -38,6 +38,17 @@ REST_ANGLES = (
 WORLDS, STEPS = 6, 11
 CHECKED = [(step, world) for step in (0, 4, 10) for world in range(WORLDS)]
 Rolled = tuple[State, State, np.ndarray]
+
+
+# made by the tests, because every process that collects them would wait for these
+@functools.cache
+def humanoid() -> Humanoid:
+    return Humanoid()
+
+
+@functools.cache
+def trapped() -> HumanoidTrap:
+    return HumanoidTrap()
 
 
 def roll(env: Humanoid) -> Rolled:
@@ -138,7 +149,7 @@ def close(ours: Any, theirs: Any, worst: float = 1e-9) -> None:
 
 
 def test_fixed_observation_is_that_of_the_original() -> None:
-    observed = np.asarray(jax.jit(HUMANOID_ENV.fixed_state)().obs)
+    observed = np.asarray(jax.jit(humanoid().fixed_state)().obs)
     assert observed.shape == (227,)
     expected = [1.24392, 1, 0, 0, 0, *REST_ANGLES, *[0] * 23]
     np.testing.assert_allclose(observed[:45], expected, atol=1e-5)
@@ -146,10 +157,10 @@ def test_fixed_observation_is_that_of_the_original() -> None:
 
 
 def test_layout() -> None:
-    sizes = [size for _, size in HUMANOID_ENV.observation_layout]
+    sizes = [size for _, size in humanoid().observation_layout]
     assert sizes == [1, 4, 17, 3, 3, 17, 99, 33, 33, 17]
-    assert (HUMANOID_ENV.observation_size, HUMANOID_ENV.action_size) == (227, 17)
-    assert HUMANOID_ENV.name == "humanoid" and HUMANOID_ENV.dt == 0.015
+    assert (humanoid().observation_size, humanoid().action_size) == (227, 17)
+    assert humanoid().name == "humanoid" and humanoid().dt == 0.015
 
 
 def test_observation(rolled: Rolled) -> None:
@@ -157,7 +168,7 @@ def test_observation(rolled: Rolled) -> None:
     for index in CHECKED:
         state = at(after, index)
         expected = expected_observation(
-            HUMANOID_ENV, state.pipeline_state, actions[index], scaled=False
+            humanoid(), state.pipeline_state, actions[index], scaled=False
         )
         close(state.obs, expected)
 
@@ -166,7 +177,7 @@ def test_reward_and_metrics(rolled: Rolled) -> None:
     before, after, actions = rolled
     for index in CHECKED:
         start, end = (
-            centre(HUMANOID_ENV.system, at(s, index).pipeline_state.q)
+            centre(humanoid().system, at(s, index).pipeline_state.q)
             for s in (before, after)
         )
         vx, vy, _ = (end - start) / 0.015
@@ -193,19 +204,19 @@ def test_reward_and_metrics(rolled: Rolled) -> None:
 
 def test_reset_noise_is_on_the_joints_alone() -> None:
     keys = jax.random.split(jax.random.key(0), 256)
-    state = jax.jit(jax.vmap(HUMANOID_ENV.reset))(keys).pipeline_state
+    state = jax.jit(jax.vmap(humanoid().reset))(keys).pipeline_state
     q, v = np.asarray(state.q), np.asarray(state.v)
     assert np.all(q[:, :2] == 0) and np.all(q[:, 3:7] == [0, 0, 0, 1])
     assert np.all(v[:, :6] == 0)
-    for noise in (q[:, 7:] - HUMANOID_ENV.system.rest_q[7:], v[:, 6:]):
+    for noise in (q[:, 7:] - humanoid().system.rest_q[7:], v[:, 6:]):
         assert np.all(np.abs(noise) <= 0.01 + 1e-6)
         assert np.all(np.abs(noise).max(axis=0) > 0.009)
-    lowest = jax.vmap(lambda q: physics.lowest_contact(HUMANOID_ENV.system, q))(state.q)
+    lowest = jax.vmap(lambda q: physics.lowest_contact(humanoid().system, q))(state.q)
     np.testing.assert_allclose(lowest, 0.0, atol=1e-6)
 
 
 def test_first_observation_has_no_torques() -> None:
-    state = jax.jit(HUMANOID_ENV.reset)(jax.random.key(0))
+    state = jax.jit(humanoid().reset)(jax.random.key(0))
     assert not np.asarray(state.obs[210:]).any()
     assert float(state.reward) == float(state.done) == 0.0
 
@@ -222,7 +233,7 @@ def at_height(env: Humanoid, height: float) -> State:
 
 @pytest.mark.parametrize(("height", "healthy"), [(1.5, True), (2.2, False)])
 def test_unhealthy_heights_end_the_episode(height: float, healthy: bool) -> None:
-    ends = at_height(HUMANOID_ENV, height)
+    ends = at_height(humanoid(), height)
     assert bool(ends.done) is not healthy
     assert float(ends.metrics["reward_alive"]) == 5.0
     lasting = Humanoid(terminate_when_unhealthy=False, healthy_reward=2.0)
@@ -246,7 +257,7 @@ def test_weights_and_positions_can_be_chosen() -> None:
     assert env.observation_size == 229
     assert env.observation_layout[0] == ("torso position x y [m]", 2)
     ones = jnp.ones(17, np.float32)
-    dear, cheap = (jax.jit(e.step)(e.fixed_state(), ones) for e in (env, HUMANOID_ENV))
+    dear, cheap = (jax.jit(e.step)(e.fixed_state(), ones) for e in (env, humanoid()))
     close(dear.metrics["reward_quadctrl"], -17.0, 1e-6)
     close(cheap.metrics["reward_quadctrl"], -1.7, 1e-6)
     assert float(cheap.metrics["reward_linvel"]) != 0.0
@@ -263,13 +274,13 @@ def test_unknown_options_are_refused(make: Callable[..., Humanoid]) -> None:
 
 @pytest.mark.slow
 def test_a_world_at_fault_observes_no_torque() -> None:
-    state = HUMANOID_ENV.fixed_state()
+    state = humanoid().fixed_state()
     bad = jnp.full(17, 0.5, np.float32).at[3].set(jnp.nan)
-    ends = jax.jit(HUMANOID_ENV.step)(state, bad)
+    ends = jax.jit(humanoid().step)(state, bad)
     assert int(ends.info["fault"]) == 1 and float(ends.done) == 1.0
     np.testing.assert_array_equal(ends.obs, state.obs)
     good = jnp.full(17, 0.5, np.float32)
-    gradient = jax.grad(lambda u: HUMANOID_ENV.step(ends, u).obs.sum())(good)
+    gradient = jax.grad(lambda u: humanoid().step(ends, u).obs.sum())(good)
     assert not np.asarray(gradient).any()
 
 
@@ -278,14 +289,14 @@ def test_a_world_at_fault_observes_no_torque() -> None:
 
 def test_observation_of_the_trap_task(rolled_trap: Rolled) -> None:
     _, after, actions = rolled_trap
-    assert TRAP_ENV.observation_size == 227 + 2 * 3 * 13
-    rows = solid(TRAP_ENV.system)
-    mass = TRAP_ENV.system.mass[rows, None]
+    assert trapped().observation_size == 227 + 2 * 3 * 13
+    rows = solid(trapped().system)
+    mass = trapped().system.mass[rows, None]
     seen = []
     for index in CHECKED:
         state = at(after, index)
         expected = expected_observation(
-            TRAP_ENV, state.pipeline_state, actions[index], scaled=True
+            trapped(), state.pipeline_state, actions[index], scaled=True
         )
         close(state.obs[:227], expected)
         linear = state.pipeline_state.impulse[rows, :3] / mass
@@ -306,7 +317,7 @@ def test_reward_of_the_trap_task(rolled_trap: Rolled, rolled: Rolled) -> None:
     _, after, actions = rolled_trap
     _, plain, _ = rolled
     cost = 0.01 * np.sum(actions**2, axis=-1)
-    assert TRAP_ENV.name == "humanoid_w_trap"
+    assert trapped().name == "humanoid_w_trap"
     linvel = plain.metrics["reward_linvel"]  # the same actions move it as far
     close(after.metrics["reward_linvel"], linvel)
     close(after.metrics["reward_quadctrl"], cost)
