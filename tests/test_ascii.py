@@ -207,10 +207,8 @@ def test_elites_keep_their_behavior() -> None:
     made, held, state = begun()
     genotypes, fitnesses, places, extra = told(1)
     fitnesses = fitnesses.at[0].set(-50.0)  # loses against the elite of its cell
-    held = compiled(type(held).add)(held, genotypes, places, fitnesses, {})
-    update = compiled(made.state_update)
-    after = update(state, held, genotypes, fitnesses, places, extra)
-    held, places = jax.device_get((held, places))
+    held = held.add(genotypes, places, fitnesses, {})
+    after = made.state_update(state, held, genotypes, fitnesses, places, extra)
     cells = [int(np.argmin(np.square(held.centroids - x).sum(1))) for x in places]
     np.testing.assert_array_equal(after.elites.obs[cells[0]], seen().obs[0])
     np.testing.assert_array_equal(after.elites.obs[cells[1]], seen(1).obs[1])

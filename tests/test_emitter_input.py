@@ -18,7 +18,6 @@ from emitter_problems import (
     begin,
     broken,
     centroids,
-    compiled,
     emit,
     score,
     start,
@@ -54,7 +53,7 @@ def test_missing_gradients_are_named(name: str) -> None:
 
 
 def test_errors_name_what_is_wrong() -> None:
-    fitnesses, descriptors, extra = compiled(score)(start(), jax.random.key(0))
+    fitnesses, descriptors, extra = score(start(), jax.random.key(0))
     read = functools.partial(read_scores, start(), fitnesses, descriptors)
     with pytest.raises(GradientsError, match="extra_scores: got nothing"):
         read(None)

@@ -65,9 +65,10 @@ def test_steering_lands_in_empty_cells() -> None:
     emitter = SteeringEmitter(32, max_step=100.0)
     repertoire, state = begin(emitter)
     genotypes = emit(emitter, repertoire, state)
-    descriptors = score(genotypes, jax.random.key(0))[1]
-    cells = get_cells_indices(descriptors, centroids())
-    assert jnp.all(repertoire.fitnesses[cells, 0] == -jnp.inf)
+    descriptors = compiled(score)(genotypes, jax.random.key(0))[1]
+    cells = compiled(get_cells_indices)(descriptors, centroids())
+    repertoire = jax.device_get(repertoire)
+    assert np.all(repertoire.fitnesses[cells, 0] == -jnp.inf)
     short = emit(SteeringEmitter(32, max_step=0.1), repertoire, state)
     steps = np.asarray(short)[:, None] - np.asarray(repertoire.genotypes)
     lengths = np.linalg.norm(steps, axis=-1).min(axis=1)
@@ -143,11 +144,11 @@ def test_emitting_and_updating_agree() -> None:
     search = algorithm(emitter)
     repertoire, state = begin(emitter)
     genotypes = emit(emitter, repertoire, state)
-    fitnesses, descriptors, _ = score(genotypes, jax.random.key(2))
+    fitnesses, descriptors, _ = compiled(score)(genotypes, jax.random.key(2))
     _, after, _ = compiled(search.tell)(
         genotypes, fitnesses, descriptors, repertoire, state
     )
-    cells = get_cells_indices(descriptors, centroids())[1:]
+    cells = np.asarray(compiled(get_cells_indices)(descriptors, centroids()))[1:]
     bars = np.asarray(state.bars)[cells]
     new = bars == -np.inf
     worth = np.asarray(fitnesses)[1:] - np.where(new, 0, bars)

@@ -115,9 +115,10 @@ def test_actions_of_the_quadruped_are_angles() -> None:
     """0 is the pose in which it stands; 1 and -1 are the ends of the range."""
     env = make("quadruped")
     system = env.system
-    state = env.fixed_state().pipeline_state
+    state = jax.jit(env.fixed_state)().pipeline_state
     actions = np.array([[0.0], [1.0], [-3.0]]) * np.ones(env.action_size)
-    middle, high, low = (env.control(state, a.astype(np.float32)) for a in actions)
+    control = jax.jit(env.control)
+    middle, high, low = (control(state, a.astype(np.float32)) for a in actions)
     dofs = system.control_dof
     np.testing.assert_allclose(middle, system.rest_q[dofs + 1], atol=1e-6)
     np.testing.assert_allclose(high, system.limit_upper[dofs], rtol=1e-6)

@@ -46,7 +46,7 @@ def assert_same(a: Any, b: Any) -> None:
 
 def check(env: Any) -> None:
     """The states of plans are those of steps, with and without a fault."""
-    states = jax.vmap(env.reset)(jax.random.split(jax.random.key(1), WORLDS))
+    states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(1), WORLDS))
     actions = plans(env)
     expected = jax.jit(jax.vmap(lambda s, a: scanned(env, s, a)))(states, actions)
     assert_same(jax.jit(jax.vmap(env.rollout))(states, actions), expected)

@@ -40,7 +40,7 @@ def action_of(env: Env, size: float = 0.0) -> jax.Array:
 
 def placed(env: Env, position: list[float]) -> State:
     """A state of the reset with the torso elsewhere."""
-    state = jax.jit(env.reset)(KEY)
+    state = env.reset(KEY)
     physics: Any = state.pipeline_state
     q = physics.q.at[:3].set(jnp.asarray(position, env.dtype))
     return state.replace(pipeline_state=dataclasses.replace(physics, q=q))
