@@ -131,7 +131,7 @@ def test_defaults_of_the_methods(page: dict[str, Any]) -> None:
     physics = state.pipeline_state
     assert np.array_equal(state.obs, np.concatenate([physics.q, physics.v]))
     after = jax.jit(env.step)(state, jnp.zeros(2))
-    assert after.reward == 1 and after.reward.dtype == after.done.dtype == np.float32
+    assert after.reward.dtype == after.done.dtype == np.float32 and after.reward == 1
 
 
 def test_a_pose_of_ones_own(page: dict[str, Any]) -> None:

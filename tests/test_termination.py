@@ -43,7 +43,7 @@ def test_within_is_a_step_with_the_slope_of_a_smooth_one(limits: Any) -> None:
             )
             for w in (None, WIDTH)
         )
-        for x in np.float64([-0.1, 0.15, 0.2, 0.3, 0.97, 1.0, 1.02, 3.0]):
+        for x in np.array([-0.1, 0.15, 0.2, 0.3, 0.97, 1.0, 1.02, 3.0], np.float64):
             value = float(x)
             inside = low <= value <= high
             (wide, slope), (narrow, found) = smooth(x), steep(x)
