@@ -1,8 +1,9 @@
 """Fitness of the elites by region of the descriptor, for a task of the study.
 
 A table of the mean fitness of re-evaluated elites, by range of the mean of the
-descriptor's components, which is scaled to 0 to 1. Each number is a mean over seeds; in
-brackets is the share of the cells that have an elite [%]:
+descriptor's components, which is scaled to 0 to 1. Each number is a mean over the seeds
+that have elites there; in brackets is the share of the cells that have an elite [%], a
+mean over all seeds:
 
     python benchmarks/study_regions.py benchmarks/results/field walker2d_uni \
         me-actor-critic@14 dcrl-me@6 me@5 --ranges 0.2 0.4 0.6 0.8 1
@@ -18,6 +19,8 @@ from pathlib import Path
 import numpy as np
 from study_protocols import FIELD
 from study_runs import TUNING_SEED, lines
+
+from newton_qd.qd.run import quality
 
 
 @functools.cache
@@ -46,17 +49,28 @@ def regions(
         limits: Where regions end, in increasing order. The last one includes its end.
 
     Returns:
-        One pair for each region; NaN if it has no elite, or no cell.
+        One pair for each region. The mean of a region without elites is NaN; the share
+        of a region without cells is 0.
     """
     found = []
     for low, high in itertools.pairwise(limits):
         last = high == limits[-1]
         inside = (places >= low) & ((places < high) | (last & (places <= high)))
-        filled = fitnesses[inside & (fitnesses > -np.inf)]
-        mean = float(filled.mean()) if len(filled) else np.nan
-        share = 100 * len(filled) / inside.sum() if inside.any() else np.nan
-        found.append((mean, share))
+        own = fitnesses[inside]
+        share = float(quality.coverage(own)) if len(own) else 0.0
+        found.append((float(quality.mean_fitness(own)), share))
     return found
+
+
+def cell(each: list[tuple[float, float]]) -> str:
+    """Returns the text of a region: mean fitness and share of filled cells.
+
+    Args:
+        each: Mean fitness and share of each seed.
+    """
+    means = [mean for mean, share in each if share > 0]
+    share = np.mean([share for _, share in each])
+    return f"{np.mean(means):.0f} ({share:.0f} %)" if means else "-"
 
 
 def main() -> None:
@@ -86,21 +100,18 @@ def main() -> None:
             and int(line["seed"]) != TUNING_SEED
         ]
         if not seeds:
-            parser.error(
-                f"variants: got {variant}; allowed: one with a run at {args.stop}"
-            )
+            allowed = f"one with a run at {args.stop}"
+            parser.error(f"variants: got {variant}; allowed: {allowed}")
         each = []
         for seed in sorted(seeds):
             path = args.runs / "cells" / f"{args.task}.{variant}.{seed}.npz"
             fitnesses = np.load(path)[args.stop][1]
             each.append(regions(places(args.task, seed), fitnesses, args.ranges))
-        columns.append(np.nanmean(each, axis=0))
+        columns.append([cell(list(pairs)) for pairs in zip(*each, strict=True)])
     print(f"| descriptor | {' | '.join(args.variants)} |")
     print("|---" * (1 + len(columns)) + "|")
-    for index, (low, high) in enumerate(itertools.pairwise(args.ranges)):
-        cells = [
-            f"{mean:.0f} ({share:.0f} %)" for mean, share in (x[index] for x in columns)
-        ]
+    ranges = itertools.pairwise(args.ranges)
+    for (low, high), *cells in zip(ranges, *columns, strict=True):
         print(f"| {low:g} to {high:g} | {' | '.join(cells)} |")
 
 

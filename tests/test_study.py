@@ -283,8 +283,11 @@ def test_regions_have_the_mean_of_their_filled_cells() -> None:
     assert low == (2.0, 100.0)
     assert middle == (7.0, 50.0)
     assert high == (9.0, 100.0)  # the last region includes its end
-    (alone,) = study_regions.regions(places, fitnesses, [0.4, 0.6])
-    assert np.isnan(alone[0]) and alone[1] == 0.0
+    for empty in ([0.4, 0.6], [2.0, 3.0]):  # no elite; no cell
+        (alone,) = study_regions.regions(places, fitnesses, empty)
+        assert np.isnan(alone[0]) and alone[1] == 0.0
+    assert study_regions.cell([(4.0, 50.0), (np.nan, 0.0)]) == "4 (25 %)"
+    assert study_regions.cell([(np.nan, 0.0)]) == "-"
 
 
 def test_the_table_of_regions_names_what_has_no_run(
