@@ -19,7 +19,6 @@ from newton_qd.qd.algorithms.cma_maega_actor_critic import CMA_MAEGA_ACTOR_CRITI
 from newton_qd.qd.algorithms.cma_me import CMA_ME
 from newton_qd.qd.algorithms.cma_mega import CMA_MEGA
 from newton_qd.qd.algorithms.dcrl_me import DCRL_ME
-from newton_qd.qd.algorithms.dcrl_me_exact import DCRL_ME_EXACT
 from newton_qd.qd.algorithms.me import ME
 from newton_qd.qd.algorithms.me_actor_critic import ME_ACTOR_CRITIC
 from newton_qd.qd.algorithms.me_conditioned import ME_CONDITIONED
@@ -44,7 +43,6 @@ ALGORITHMS: tuple[AlgorithmSpec[Any], ...] = (
     CMA_ME,
     PGA_ME,
     DCRL_ME,
-    DCRL_ME_EXACT,
     ME_ES,
     ASCII_ME,
     ME_GRADIENT,
