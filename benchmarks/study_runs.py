@@ -51,10 +51,12 @@ class Run:
 
 def variants() -> dict[str, dict[str, Any]]:
     """Returns the settings of all variants; number 0 has the defaults of ``evolve``."""
-    found = {
-        name: {key: given[key] for key in given.keys() - {"tasks", "chosen"}}
-        for name, given in _file().items()
-    }
+    found: dict[str, dict[str, Any]] = {}
+    for name, given in _file().items():
+        parent = found[given["of"]] if "of" in given else {}
+        own = {key: given[key] for key in given.keys() - {"of", "tasks", "chosen"}}
+        options = {**parent.get("options", {}), **given.get("options", {})}
+        found[name] = {**parent, **own, **({"options": options} if options else {})}
     algorithms = dict.fromkeys(name.split("@")[0] for name in found)
     return {**found, **{f"{algorithm}@0": {} for algorithm in algorithms}}
 

@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from point_runs import PointEnv
 from qdax.core.containers.mapelites_repertoire import compute_euclidean_centroids
 from test_actor_critic import SIZE, compiled, method, play
 
@@ -30,11 +29,10 @@ def score(genotypes: jax.Array, key: jax.Array) -> tuple[Any, Any, dict[str, Any
 
 def emitter(**changes: Any) -> WindowArborescenceEmitter:
     given: dict[str, Any] = {"probes": 3, "walks": 3, "sigma_g": 0.5}
-    first = PointEnv().reset(jax.random.key(0))
     return WindowArborescenceEmitter(
         score,
         method(),
-        first,
+        method().first_states(jax.random.key(0)),
         batch_size=EACH,
         num_emitters=POINTS,
         **{**given, **changes},

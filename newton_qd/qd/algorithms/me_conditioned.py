@@ -85,11 +85,12 @@ def _make(context: EmitterContext, options: ConditionedOptions) -> Any:
     policy = ConditionedPolicy(context.policy, task.descriptor_length)
     white = Whitening.of(context.policy) if options.whiten else Whitening()
     length = config.episode_length
+    method = ActorCritic(env, policy.act, no_measure, length, options, white)
     emitter = ConditionedActorEmitter(
-        ActorCritic(env, policy.act, no_measure, length, options, white),
+        method,
         env,
         policy,
-        task.env.reset(context.reset_key),
+        method.first_states(context.reset_key).state,
         copies=copies,
         between=between,
         updates=options.updates,
