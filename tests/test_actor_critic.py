@@ -204,7 +204,7 @@ def test_measures_are_those_of_the_descriptor() -> None:
 
 def emitter(measure: Any = reading, **changes: Any) -> ActorCriticEmitter:
     given = {"actors": 3, "branches": 2, "copies": 4, "updates": 2, "lifetime": 2}
-    first = method(measure).first_states(jax.random.key(0))
+    first = PointEnv().reset(jax.random.key(0))
     options: Any = {**given, "steered": 0.7, "measures": 2, **changes}
     return ActorCriticEmitter(method(measure), first, **options)
 

@@ -122,7 +122,7 @@ def emitter(**changes: Any) -> ConditionedActorEmitter:
     settings = dataclasses.replace(SETTINGS, worlds=6, rate=0.02)
     given = {"copies": 4, "between": 3, "updates": 2, "empty": 0.5, **changes}
     method = ActorCritic(env, own.act, no_measure, LENGTH, settings)
-    first = method.first_states(jax.random.key(0)).state
+    first = Placed().reset(jax.random.key(0))
     options: Any = given
     return ConditionedActorEmitter(method, env, own, first, **options)
 

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from point_runs import PointEnv
 from qdax.core.containers.mapelites_repertoire import compute_euclidean_centroids
 from test_actor_critic import SIZE, compiled, method, play
 
@@ -29,10 +30,11 @@ def score(genotypes: jax.Array, key: jax.Array) -> tuple[Any, Any, dict[str, Any
 
 def emitter(**changes: Any) -> WindowArborescenceEmitter:
     given: dict[str, Any] = {"probes": 3, "walks": 3, "sigma_g": 0.5}
+    first = PointEnv().reset(jax.random.key(0))
     return WindowArborescenceEmitter(
         score,
         method(),
-        method().first_states(jax.random.key(0)),
+        first,
         batch_size=EACH,
         num_emitters=POINTS,
         **{**given, **changes},

@@ -72,7 +72,7 @@ def _make(context: EmitterContext, options: ArborescenceActorOptions) -> Any:
     emitter = WindowArborescenceEmitter(
         context.score,
         method,
-        method.first_states(context.reset_key),
+        task.env.reset(context.reset_key),
         probes=each,
         walks=options.walks,
         sigma_g=options.sigma_g,

@@ -61,7 +61,7 @@ def _make(context: EmitterContext, options: ActorCriticOptions) -> Any:
     config, (task, method) = context.config, learning_method(context, options)
     emitter = ActorCriticEmitter(
         method,
-        method.first_states(context.reset_key),
+        task.env.reset(context.reset_key),
         actors=options.actors,
         branches=options.branches,
         copies=options.copies,

@@ -85,12 +85,11 @@ def _make(context: EmitterContext, options: ConditionedOptions) -> Any:
     policy = ConditionedPolicy(context.policy, task.descriptor_length)
     white = Whitening.of(context.policy) if options.whiten else Whitening()
     length = config.episode_length
-    method = ActorCritic(env, policy.act, no_measure, length, options, white)
     emitter = ConditionedActorEmitter(
-        method,
+        ActorCritic(env, policy.act, no_measure, length, options, white),
         env,
         policy,
-        method.first_states(context.reset_key).state,
+        task.env.reset(context.reset_key),
         copies=copies,
         between=between,
         updates=options.updates,

@@ -87,7 +87,7 @@ class ActorCriticEmitter(Emitter):
 
         Args:
             method: Learning method of an actor.
-            first: Initial states of the W worlds of an actor, leaves (W, ...).
+            first: Initial state of every episode.
             actors: Number of actors.
             branches: Times per generation that actors produce offspring.
             copies: Offspring of an actor each time.
@@ -148,7 +148,7 @@ class ActorCriticEmitter(Emitter):
         learners = self._begun(critic_key, weights, self._aims(aim_key))
         return ActorCriticState(
             learners=learners,
-            scale=self._method.scale(scale_key, self._first),
+            scale=self._method.scale(scale_key, self._worlds()),
             snapshots=jnp.tile(weights, (self._branches, 1, 1)),
             failed=jnp.zeros((self._actors,), jnp.int32),
             generation=jnp.zeros((), jnp.int32),
@@ -218,11 +218,18 @@ class ActorCriticEmitter(Emitter):
             learners, state.scale, snapshots, failed, state.generation + 1, key
         )
 
+    def _worlds(self) -> PyTree:
+        """Returns the initial states of the worlds of an actor."""
+        number = self._method.settings.worlds
+        return jax.tree.map(
+            lambda leaf: jnp.broadcast_to(leaf, (number, *jnp.shape(leaf))), self._first
+        )
+
     def _begun(self, key: jax.Array, weights: jax.Array, aims: jax.Array) -> Learner:
         """Returns K new actors with weights (K, size)."""
         keys = jax.random.split(key, self._actors)
         begin = jax.vmap(self._method.begin, in_axes=(0, 0, 0, None))
-        return begin(keys, weights, aims, self._first)
+        return begin(keys, weights, aims, self._worlds())
 
     def _aims(self, key: jax.Array) -> jax.Array:
         """Returns the aims (K, 1 + D) of the actors; steered actors are last."""

@@ -18,7 +18,7 @@ from newton_qd.gradients.flow import passed_back
 from newton_qd.qd.emitters.actor_critic_settings import ActorCriticSettings
 from newton_qd.qd.emitters.whitening import Whitening
 from newton_qd.qd.scoring.task import Task
-from newton_qd.types import Environment, PyTree, RNGKey, StateLike
+from newton_qd.types import Environment, PyTree, StateLike
 
 Layers: TypeAlias = list[tuple[jax.Array, jax.Array]]
 """Weights and bias of each layer of a perceptron."""
@@ -99,24 +99,11 @@ class ActorCritic:
     @functools.cached_property
     def _optimizers(self) -> tuple[PyTree, PyTree]:
         rates = self.settings.rate, self.settings.critic_rate
-        decays = {"b1": 0.7, "b2": self.settings.second_decay}
         actor, critic = (
-            optax.chain(optax.clip_by_global_norm(1.0), optax.adam(rate, **decays))
+            optax.chain(optax.clip_by_global_norm(1.0), optax.adam(rate, b1=0.7))
             for rate in rates
         )
         return actor, critic
-
-    def first_states(self, key: RNGKey) -> PyTree:
-        """Returns the initial states of the worlds of an actor, leaves (W, ...).
-
-        Args:
-            key: Key of the reset; with one start state, the reset to this state.
-        """
-        number = self.settings.world_starts
-        keys = key[None] if number == 1 else jax.random.split(key, number)
-        first = jax.vmap(self.env.reset)(keys)
-        order = jnp.arange(self.settings.worlds) % number
-        return jax.tree.map(lambda leaf: leaf[order], first)
 
     def scale(self, key: jax.Array, first: PyTree) -> tuple[jax.Array, jax.Array]:
         """Returns mean and deviation (no,) of observations with random actions.

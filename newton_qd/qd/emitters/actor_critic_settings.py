@@ -14,12 +14,9 @@ class ActorCriticSettings:
 
     Attributes:
         worlds: Worlds of each actor.
-        world_starts: Start states of these worlds; world w begins in the one with
-            number w modulo ``world_starts``.
         window: Control steps of an update.
         rate: Learning rate of the actor [-].
         critic_rate: Learning rate of the critic [-].
-        second_decay: Decay of the mean square of gradients, in both optimizers [-].
         clip: Largest norm of the adjoint of the state of a world.
         noise: Standard deviation of the noise of actions [-].
         critic: Widths of the critic's hidden layers.
@@ -39,11 +36,9 @@ class ActorCriticSettings:
     """
 
     worlds: int = 16
-    world_starts: int = 1
     window: int = 8
     rate: float = 5e-3
     critic_rate: float = 2e-3
-    second_decay: float = 0.999
     clip: float = 100.0
     noise: float = 0.1
     critic: tuple[int, ...] = (64, 64)
@@ -64,7 +59,7 @@ class ActorCriticSettings:
         """
         checks.flag("whiten", self.whiten)
         object.__setattr__(self, "critic", tuple(self.critic))
-        for name in ("worlds", "world_starts", "window", "epochs", "batches"):
+        for name in ("worlds", "window", "epochs", "batches"):
             checks.integer(name, getattr(self, name), most=None)
         steps = self.worlds * self.window
         if self.batches > steps:
@@ -74,7 +69,6 @@ class ActorCriticSettings:
             checks.number(name, getattr(self, name), above=0)
         for name in ("noise", "termination_width"):
             checks.number(name, getattr(self, name), least=0)
-        for name in ("discount", "second_decay"):
-            checks.number(name, getattr(self, name), least=0, below=1)
+        checks.number("discount", self.discount, least=0, below=1)
         checks.number("trace", self.trace, least=0, most=1)
         checks.number("actor_trace", self.actor_trace, least=0, most=1)

@@ -93,7 +93,7 @@ class ConditionedActorEmitter(Emitter):
             method: Learning method of the actor, with ``env`` and ``policy``.
             env: Environment of the worlds.
             policy: Policy that depends on a target.
-            first: Initial states of the W worlds, without target, leaves (W, ...).
+            first: Initial state of every episode, without target.
             copies: Copies of the actor in a generation.
             between: Individuals between the actor and elites.
             updates: Updates of the actor in a generation.
@@ -258,7 +258,7 @@ class ConditionedActorEmitter(Emitter):
         share = share if self._conditioned else jnp.zeros_like(share)
         length = self._method.episode_length
         weights = jnp.stack([(1 - share) * length / unit, share], axis=1)
-        return jax.vmap(self._env.aimed)(self._first, targets, weights)
+        return jax.vmap(self._env.aimed, (None, 0, 0))(self._first, targets, weights)
 
     def _scale(self, key: jax.Array, worlds: AimedState) -> tuple:
         """Returns the scale of observations; that of targets is known."""

@@ -64,7 +64,7 @@ class WindowArborescenceEmitter(CMAMAEGAEmitter):
         Args:
             scoring_function: Scores solution points (E, size), without gradients.
             method: Learning method of the actors.
-            first: Initial states of the W worlds of an actor, leaves (W, ...).
+            first: Initial state of every episode.
             probes: Updates of an actor that finds a gradient.
             walks: Updates of an actor that moves a point.
             **options: Those of ``CMAMAEGAEmitter``, without ``optimizer``.
@@ -83,9 +83,13 @@ class WindowArborescenceEmitter(CMAMAEGAEmitter):
     def _begun(
         self, points: jax.Array, descriptor_length: int, key: jax.Array, old: Any
     ) -> Climbers:
+        number = self._method.settings.worlds
+        worlds = jax.tree.map(
+            lambda leaf: jnp.broadcast_to(leaf, (number, *jnp.shape(leaf))), self._first
+        )
         scale_key, probe_key, walk_key = jax.random.split(key, 3)
         if old is None:
-            found = self._method.scale(scale_key, self._first)
+            found = self._method.scale(scale_key, worlds)
             scale = jax.tree.map(lambda x: jnp.tile(x, (len(points), 1)), found)
         else:
             scale = old.scale
@@ -94,7 +98,7 @@ class WindowArborescenceEmitter(CMAMAEGAEmitter):
         count = len(points), len(aims)
 
         def begin(key: jax.Array, weights: jax.Array, aim: jax.Array) -> Learner:
-            return self._method.begin(key, weights, aim, self._first)
+            return self._method.begin(key, weights, aim, worlds)
 
         probes = jax.vmap(jax.vmap(begin, (0, None, 0)), (0, 0, None))
         return Climbers(
