@@ -16,6 +16,7 @@ sys.path.insert(0, str(FOLDER))
 
 import study_clock  # noqa: E402
 import study_execution  # noqa: E402
+import study_runs  # noqa: E402
 from study_protocols import Protocol, Stop  # noqa: E402
 from study_runs import Run, lines  # noqa: E402
 
@@ -44,6 +45,19 @@ def execute(out: Path, deadline: float = np.inf) -> bool:
     out.mkdir(exist_ok=True)
     limits = study_execution.Limits(60.0, deadline=deadline)
     return study_execution.execute(PROTOCOL, RUN, out, limits, "cpu")
+
+
+def test_a_variant_changes_settings_of_its_parent(monkeypatch: Any) -> None:
+    file = {
+        "me@1": {"tasks": ["ant_uni"], "starts": 4, "options": {"a": 1, "b": 2}},
+        "me@2": {"of": "me@1", "starts": 8, "options": {"b": 3}},
+        "me@3": {"of": "me@2", "iso_sigma": 0.1},
+    }
+    monkeypatch.setattr(study_runs, "_file", lambda: file)
+    found = study_runs.variants()
+    assert found["me@1"] == {"starts": 4, "options": {"a": 1, "b": 2}}
+    assert found["me@2"] == {"starts": 8, "options": {"a": 1, "b": 3}}
+    assert found["me@3"] == {**found["me@2"], "iso_sigma": 0.1}
 
 
 def test_a_clock_starts_when_no_other_run_uses_the_gpu(tmp_path: Path) -> None:
