@@ -104,6 +104,9 @@ class EvolveConfig:
     new_starts: bool = False
     renewal_period: int = 0
     renewal_weight: float = 1.0
+    verified: int = 0
+    verified_starts: int = 12
+    spread_scale: float = 0.0
     randomize: tuple[tuple[str, Any], ...] = ()
     warm_start: str | None = None
 

@@ -52,3 +52,27 @@ def renewed(
     )
     kept = without_ties(fitness, descriptor, repertoire.centroids)
     return empty.add(repertoire.genotypes, descriptor, kept, {})
+
+
+def entrants(repertoire, fitnesses, descriptors, most):
+    """Returns the individuals (most,) that gain most, and whether they enter."""
+    from qdax.core.containers.mapelites_repertoire import get_cells_indices
+
+    most = min(most, len(fitnesses))
+    kept = without_ties(fitnesses, descriptors, repertoire.centroids)
+    cells = get_cells_indices(descriptors, repertoire.centroids)
+    number = len(repertoire.centroids)
+    kept = jnp.where(jnp.isfinite(descriptors).all(axis=1), kept, -jnp.inf)
+    best = jax.ops.segment_max(kept, cells, num_segments=number)
+    now = repertoire.fitnesses[cells, 0]
+    enters = jnp.isfinite(kept) & (kept == best[cells]) & (kept > now)
+    gain = jnp.where(enters, jnp.where(jnp.isfinite(now), kept - now, 1e9), -1.0)
+    _, chosen = jax.lax.top_k(gain, most)
+    return chosen, enters[chosen]
+
+
+def merged(scores, chosen, ok, again):
+    fitnesses = jnp.full_like(scores[0], -jnp.inf)
+    fitnesses = fitnesses.at[chosen].set(jnp.where(ok, again[0], -jnp.inf))
+    descriptors = scores[1].at[chosen].set(again[1])
+    return fitnesses, descriptors, scores[2]

@@ -28,7 +28,7 @@ from newton_qd.qd.run.reevaluation import (
     corrected_fitnesses,
     reevaluate,
 )
-from newton_qd.qd.run.renewal import renewed
+from newton_qd.qd.run.renewal import entrants, merged, renewed
 from newton_qd.qd.scoring.networks import policy_for
 from newton_qd.qd.scoring.robust import robust_scoring, run_scoring
 from newton_qd.qd.scoring.rollout import (
@@ -122,6 +122,12 @@ class Search:
         self._score = self._compiled(score)
         self._ask = jax.jit(parts.propose)
         self._enter = jax.jit(self._generation.enter)
+        if config.verified:
+            self._score_again = self._compiled(
+                run_scoring(config, task, self._policy, starts=config.verified_starts)
+            )
+            self._entrants = jax.jit(functools.partial(entrants, most=config.verified))
+            self._merge = jax.jit(merged)
         self._rebuild = jax.jit(
             functools.partial(renewed, weight=config.renewal_weight)
         )
@@ -170,6 +176,9 @@ class Search:
                 self._drawn, state.repertoire, state.emitter, key
             )
             scores = self._score(genotypes, self._start(iteration))
+            if self._config.verified:
+                scores, extra = self._verified(state, genotypes, scores)
+                renewals += extra
             initial = np.float32(state.metrics[0][COLUMNS.index("initial_fitness")])
             repertoire, emitter, metrics = self._tell(
                 self._drawn,
@@ -193,6 +202,14 @@ class Search:
             raise SearchError(self._emptiness(genotypes))
         rows = np.vstack([state.metrics, [row[name] for name in COLUMNS]])
         return SearchState(iteration, repertoire, rows, emitter)
+
+    def _verified(self, state: SearchState, genotypes: Any, scores: Any) -> Any:
+        most = min(self._config.verified, len(genotypes))
+        key = jax.random.fold_in(self._key_renewals, 2**30 + state.iteration)
+        chosen, ok = self._entrants(state.repertoire, scores[0], scores[1])
+        again = self._score_again(genotypes[chosen], key)
+        scores = self._merge(scores, chosen, ok, again)
+        return scores, most * self._config.verified_starts
 
     def _renewed(self, state: SearchState) -> tuple[SearchState, int]:
         """Evaluates the elites again from new start states, and rebuilds the archive.

@@ -56,26 +56,58 @@ def robust_scoring(
     ) -> tuple[jax.Array, jax.Array, ExtraScores]:
         keys = jax.random.split(key, starts)
         fitnesses, found, extra = jax.vmap(score, (None, 0))(genotypes, keys)
-        bad = jnp.any(jnp.isneginf(fitnesses), axis=0)
-        rows = jnp.concatenate([fitnesses[..., None], found], axis=-1)
-        # an infinite fitness would make weights of 0 to NaN
-        rows = jnp.where(bad[..., None], jnp.zeros_like(rows), rows)
-        weights = _weights(rows, statistic)
-        mixed = _weighted(weights, rows)
-        fitness = jnp.where(bad, -jnp.inf, mixed[:, 0])
-        return fitness, mixed[:, 1:], _joined(extra, weights)
+        return joined(fitnesses, found, extra, statistic)
 
     return scored
 
 
+def joined(fitnesses, found, extra, statistic):
+    bad = jnp.any(jnp.isneginf(fitnesses), axis=0)
+    rows = jnp.concatenate([fitnesses[..., None], found], axis=-1)
+    # an infinite fitness would make weights of 0 to NaN
+    rows = jnp.where(bad[..., None], jnp.zeros_like(rows), rows)
+    weights = _weights(rows, statistic)
+    mixed = _weighted(weights, rows)
+    fitness = jnp.where(bad, -jnp.inf, mixed[:, 0])
+    return fitness, mixed[:, 1:], _joined(extra, weights)
+
+
 def run_scoring(
-    config: EvolveConfig, task: Task, policy: Policy, *, transitions: bool = False
+    config: EvolveConfig,
+    task: Task,
+    policy: Policy,
+    *,
+    transitions: bool = False,
+    starts: int = 0,
 ) -> ScoringFunction:
     """Returns the scoring function of a run without gradients."""
     score = make_scoring_function(
         task, policy, config.episode_length, transitions=transitions
     )
-    return robust_scoring(score, starts=config.starts, statistic=config.statistic)
+    starts = starts or config.starts
+    robust = robust_scoring(score, starts=starts, statistic=config.statistic)
+    if not config.spread_scale:
+        return robust
+    low, high = (jnp.asarray(x) for x in task.limits)
+    cells = config.centroids
+    width = (jnp.prod(high - low) / cells) ** (1 / len(low)) * config.spread_scale
+    offset = task.reward_offset * config.episode_length
+
+    def scored(genotypes: Genotype, key: RNGKey) -> PyTree:
+        keys = jax.random.split(key, starts)
+        fitnesses, found, extra = jax.vmap(score, (None, 0))(genotypes, keys)
+        fitness, middle, _ = joined(fitnesses, found, extra, config.statistic)
+        square = jnp.mean(jnp.sum((found - middle) ** 2, axis=-1), axis=0)
+        share = 1 / (1 + square / width**2)
+        return (
+            jnp.where(
+                jnp.isfinite(fitness), (fitness + offset) * share - offset, fitness
+            ),
+            middle,
+            {},
+        )
+
+    return scored
 
 
 def _weights(rows: jax.Array, statistic: str) -> jax.Array:
