@@ -106,7 +106,7 @@ class EvolveConfig:
     renewal_weight: float = 1.0
     verified: int = 0
     verified_starts: int = 12
-    spread_scale: float = 0.0
+    spread: float = 0.0
     randomize: tuple[tuple[str, Any], ...] = ()
     warm_start: str | None = None
 

@@ -13,6 +13,7 @@ from newton_qd.checks import listed, message
 from newton_qd.gradients.scores import unit_rows
 from newton_qd.qd.config import STATISTICS, EvolveConfig
 from newton_qd.qd.scoring.rollout import Policy, make_scoring_function
+from newton_qd.qd.scoring.spread import Spread, spread_of
 from newton_qd.qd.scoring.task import Task
 from newton_qd.types import ExtraScores, Genotype, PyTree, RNGKey, ScoringFunction
 
@@ -20,7 +21,11 @@ _KNOWN = ("transitions", "gradients", "normalized_grads", "faulty", "overflowed"
 
 
 def robust_scoring(
-    score: ScoringFunction, *, starts: int, statistic: str = "mean"
+    score: ScoringFunction,
+    *,
+    starts: int,
+    statistic: str = "mean",
+    spread: Spread | None = None,
 ) -> ScoringFunction:
     """Makes a scoring function that evaluates each individual from several starts.
 
@@ -34,6 +39,7 @@ def robust_scoring(
         starts: Start states of each individual.
         statistic: ``"mean"`` or ``"median"`` of the fitnesses, and of each component
             of the descriptors.
+        spread: What the spread of an individual's descriptors costs; ``None``: nothing.
 
     Returns:
         Function with the arguments and results of ``score``. The fitness is ``-inf`` if
@@ -56,20 +62,19 @@ def robust_scoring(
     ) -> tuple[jax.Array, jax.Array, ExtraScores]:
         keys = jax.random.split(key, starts)
         fitnesses, found, extra = jax.vmap(score, (None, 0))(genotypes, keys)
-        return joined(fitnesses, found, extra, statistic)
+        bad = jnp.any(jnp.isneginf(fitnesses), axis=0)
+        rows = jnp.concatenate([fitnesses[..., None], found], axis=-1)
+        # an infinite fitness would make weights of 0 to NaN
+        rows = jnp.where(bad[..., None], jnp.zeros_like(rows), rows)
+        weights = _weights(rows, statistic)
+        mixed = _weighted(weights, rows)
+        fitness = mixed[:, 0]
+        if spread is not None:
+            fitness = spread.weighed(fitness, found, mixed[:, 1:])
+        fitness = jnp.where(bad, -jnp.inf, fitness)
+        return fitness, mixed[:, 1:], _joined(extra, weights)
 
     return scored
-
-
-def joined(fitnesses, found, extra, statistic):
-    bad = jnp.any(jnp.isneginf(fitnesses), axis=0)
-    rows = jnp.concatenate([fitnesses[..., None], found], axis=-1)
-    # an infinite fitness would make weights of 0 to NaN
-    rows = jnp.where(bad[..., None], jnp.zeros_like(rows), rows)
-    weights = _weights(rows, statistic)
-    mixed = _weighted(weights, rows)
-    fitness = jnp.where(bad, -jnp.inf, mixed[:, 0])
-    return fitness, mixed[:, 1:], _joined(extra, weights)
 
 
 def run_scoring(
@@ -84,30 +89,12 @@ def run_scoring(
     score = make_scoring_function(
         task, policy, config.episode_length, transitions=transitions
     )
-    starts = starts or config.starts
-    robust = robust_scoring(score, starts=starts, statistic=config.statistic)
-    if not config.spread_scale:
-        return robust
-    low, high = (jnp.asarray(x) for x in task.limits)
-    cells = config.centroids
-    width = (jnp.prod(high - low) / cells) ** (1 / len(low)) * config.spread_scale
-    offset = task.reward_offset * config.episode_length
-
-    def scored(genotypes: Genotype, key: RNGKey) -> PyTree:
-        keys = jax.random.split(key, starts)
-        fitnesses, found, extra = jax.vmap(score, (None, 0))(genotypes, keys)
-        fitness, middle, _ = joined(fitnesses, found, extra, config.statistic)
-        square = jnp.mean(jnp.sum((found - middle) ** 2, axis=-1), axis=0)
-        share = 1 / (1 + square / width**2)
-        return (
-            jnp.where(
-                jnp.isfinite(fitness), (fitness + offset) * share - offset, fitness
-            ),
-            middle,
-            {},
-        )
-
-    return scored
+    return robust_scoring(
+        score,
+        starts=starts or config.starts,
+        statistic=config.statistic,
+        spread=spread_of(config, task),
+    )
 
 
 def _weights(rows: jax.Array, statistic: str) -> jax.Array:
