@@ -24,6 +24,9 @@ SETTINGS: tuple[dict[str, Any], ...] = (
     {"starts": 4},
     {"starts": 4, "statistic": "median"},
     {"starts": 4, "new_starts": True},
+    {"starts": 4, "scatter": 1.0},
+    {"starts": 4, "scatter": 3.0},
+    {"starts": 4, "statistic": "median", "scatter": 1.0},
     {"starts": 16},
 )
 

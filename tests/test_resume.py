@@ -267,6 +267,7 @@ CHANGES = {
     "env_options": {"healthy_reward": 2.0},
     "starts": 2,
     "statistic": "median",
+    "scatter": 1.0,
     "new_starts": True,
     "randomize": {"friction": (0.5, 1.5)},
     "warm_start": "0" * 64,

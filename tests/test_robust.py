@@ -14,6 +14,7 @@ from point_runs import SMALL, compile_once, interrupt_after, point_task, run
 import newton_qd
 from newton_qd.qd import (
     EvolveConfig,
+    Scatter,
     load_run,
     make_policy,
     make_scoring_function,
@@ -21,6 +22,7 @@ from newton_qd.qd import (
 )
 from newton_qd.qd.config import ConfigError
 from newton_qd.qd.run.search import Search
+from newton_qd.qd.scoring.scatter import scatter_of
 from newton_qd.wrappers import RandomParamsWrapper
 
 __all__ = ["compile_once"]  # fixtures
@@ -54,9 +56,13 @@ def some_scores(genotypes: jax.Array, key: jax.Array) -> Any:
 
 @pytest.mark.parametrize("starts", [3, 4])
 @pytest.mark.parametrize("statistic", ["mean", "median"])
-def test_results_are_joined(starts: int, statistic: str) -> None:
+@pytest.mark.parametrize("scatter", [None, Scatter(width=0.7, offset=2.0)])
+def test_results_are_joined(
+    starts: int, statistic: str, scatter: Scatter | None
+) -> None:
     genotypes = jnp.asarray([[0.3, 0.1], [1.2, -0.7], [9.0, 0.0]], jnp.float32)
-    score = jax.jit(robust_scoring(some_scores, starts=starts, statistic=statistic))
+    settings: Any = {"starts": starts, "statistic": statistic, "scatter": scatter}
+    score = jax.jit(robust_scoring(some_scores, **settings))
     fitness, found, extra = score(genotypes, KEY)
     alone = jax.jit(some_scores)
     each = [alone(genotypes, key) for key in jax.random.split(KEY, starts)]
@@ -65,6 +71,11 @@ def test_results_are_joined(starts: int, statistic: str) -> None:
     bad = np.isneginf(rows[..., 0]).any(axis=0)
     assert bad.tolist() == [False, False, True] == extra["faulty"].tolist()
     expected = function(rows[:, :2], axis=0)
+    if scatter is not None:
+        away = np.linalg.norm(rows[:, :2, 1:] - expected[:, 1:], axis=-1)
+        share = 1 / (1 + (away**2).mean(axis=0) / 0.7**2)
+        assert share.max() < 0.9
+        expected[:, 0] = (expected[:, 0] + 2.0) * share - 2.0
     assert np.allclose(fitness[:2], expected[:, 0], atol=1e-6)
     assert np.isneginf(fitness[2])
     assert np.allclose(found[:2], expected[:, 1:], atol=1e-6)
@@ -74,7 +85,7 @@ def test_results_are_joined(starts: int, statistic: str) -> None:
     # compiled, some processors round differently; other starts are far away
     assert np.allclose(steps[:, 2:4], second, atol=1e-6)
     assert not np.allclose(steps[:, :2], second, atol=1e-2)
-    # the gradient is that of the mean or median, by central differences
+    # the gradient is that of fitness and descriptor, by central differences
     for axis in range(2):
         moved = genotypes.at[:, axis].add(1e-2), genotypes.at[:, axis].add(-1e-2)
         (up, above, _), (down, below, _) = (score(x, KEY) for x in moved)
@@ -83,6 +94,36 @@ def test_results_are_joined(starts: int, statistic: str) -> None:
     unit = np.linalg.norm(extra["normalized_grads"][:2], axis=1)
     assert np.allclose(unit, 1, atol=1e-5)
     assert not np.any(extra["gradients"][2])
+
+
+def test_the_price_of_scatter() -> None:
+    price = Scatter(width=3.0, offset=10.0)
+    # two episodes that end 2 w apart: each is w away from their mean
+    found = jnp.asarray([[[0.0, 1.0]] * 3, [[6.0, 1.0]] * 3], jnp.float32)
+    fitnesses = jnp.asarray([30.0, -4.0, -12.0], jnp.float32)
+    counted = price.counted(fitnesses, found, found.mean(axis=0))
+    # half of the fitness with offset; what is below the offset does not gain
+    assert np.allclose(counted, [10.0, -7.0, -12.0])
+    same = price.counted(fitnesses, found[:1], found[0])
+    assert np.allclose(same, fitnesses)
+    # a run's width is that of a cell: 16 cells in a square of side 2
+    config = SMALL.replace(scatter=0.5, starts=2)
+    task = point_task(config)
+    chosen = scatter_of(config, task)
+    assert chosen is not None
+    sides = np.asarray(task.limits[1]) - np.asarray(task.limits[0])
+    assert np.isclose(chosen.width, 0.5 * np.sqrt(sides.prod() / 16))
+    assert chosen.offset == task.reward_offset * config.episode_length
+    assert scatter_of(SMALL, task) is None
+
+
+@pytest.mark.parametrize(
+    ("numbers", "text"),
+    [((0.0, 1.0), "width: got 0.0"), ((1.0, np.inf), "offset: got inf")],
+)
+def test_a_wrong_price(numbers: tuple[float, float], text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        Scatter(*numbers)
 
 
 def test_what_cannot_be_joined() -> None:
@@ -95,22 +136,27 @@ def test_what_cannot_be_joined() -> None:
         robust_scoring(some_scores, starts=2, statistic="mode")
     with pytest.raises(TypeError, match="score: got 3; allowed: a function of genoty"):
         robust_scoring(3, starts=2)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match=r"scatter: got 1.0; allowed: a Scatter, None"):
+        robust_scoring(some_scores, starts=2, scatter=1.0)  # type: ignore[arg-type]
     odd = robust_scoring(lambda g, k: (g[:, 0], g, {"colour": g}), starts=2)
     with pytest.raises(ValueError, match="extra scores: got 'colour'; allowed: trans"):
         odd(jnp.zeros((2, 2)), KEY)
     for changes, text in (
         ({"starts": 0}, "starts: got 0"),
         ({"statistic": "mode"}, "statistic: got 'mode'; allowed: mean, median"),
+        ({"scatter": -1.0}, "scatter: got -1.0"),
         ({"new_starts": 1}, "new_starts: got 1; allowed: True, False"),
     ):
         with pytest.raises(ConfigError, match=text):
             SMALL.replace(**changes)
+    with pytest.raises(ConfigError, match=r"scatter: got 1.0; .* more than one start"):
+        run(SMALL.replace(scatter=1.0))
     with pytest.raises(ConfigError, match="randomize: env: got <point_runs"):
         run(SMALL.replace(randomize={"friction": (1, 2)}))
 
 
 def test_a_run_from_several_starts(tmp_path: Path) -> None:
-    config = SMALL.replace(starts=3, iterations=2)
+    config = SMALL.replace(starts=3, scatter=0.5, iterations=2)
     result = run(config, out=tmp_path / "run")
     assert result.metrics["evaluations"].tolist() == [48, 96, 144]
     assert result.metrics["env_steps"][-1] == 144 * config.episode_length
@@ -120,8 +166,13 @@ def test_a_run_from_several_starts(tmp_path: Path) -> None:
     assert np.array_equal(again.fitnesses, result.archive.fitnesses[filled])
     assert np.array_equal(again.descriptors, result.archive.descriptors[filled])
     alone = opened.evaluate(keys=jax.random.split(opened.start_key, 3))
-    mean = alone.fitnesses.mean(axis=1)
-    assert np.allclose(mean, again.fitnesses, rtol=1e-5)
+    price = scatter_of(config, opened.task)
+    assert price is not None
+    each = jnp.moveaxis(jnp.asarray(alone.descriptors), 1, 0)
+    mean = jnp.asarray(alone.fitnesses.mean(axis=1))
+    counted = price.counted(mean, each, jnp.asarray(again.descriptors))
+    assert np.allclose(counted, again.fitnesses, rtol=1e-5)
+    assert np.any(again.fitnesses < mean - 1)
 
 
 @pytest.mark.slow

@@ -181,6 +181,13 @@ def _add_start_arguments(group: argparse._ArgumentGroup) -> None:
         f"{_DEFAULTS.statistic})",
     )
     group.add_argument(
+        "--scatter",
+        type=float,
+        metavar="CELLS",
+        help="scatter of the descriptors over the start states that halves a fitness "
+        "with offset, in widths of a cell (default: it costs nothing)",
+    )
+    group.add_argument(
         "--new-starts",
         action="store_const",
         const=True,

@@ -50,6 +50,7 @@ if TYPE_CHECKING:
         make_policy,
         make_scoring_function,
     )
+    from newton_qd.qd.scoring.scatter import Scatter
     from newton_qd.qd.scoring.sharding import device_mesh, shard_scoring
     from newton_qd.qd.scoring.task import Task, make_task
 
@@ -68,6 +69,7 @@ __all__ = [
     "Options",
     "Policy",
     "Run",
+    "Scatter",
     "SearchError",
     "Task",
     "device_mesh",
@@ -104,6 +106,7 @@ _HOME = {
     "Options": "algorithms.options",
     "Policy": "scoring.rollout",
     "Run": "run.opened",
+    "Scatter": "scoring.scatter",
     "SearchError": "run.search",
     "Task": "scoring.task",
     "device_mesh": "scoring.sharding",

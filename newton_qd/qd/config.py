@@ -70,11 +70,10 @@ class EvolveConfig:
             with the fields of ``Scene``.
         starts: Start states from which each individual is evaluated.
         statistic: ``"mean"`` or ``"median"`` of fitness and descriptor over them.
+        scatter: Scatter of an individual's descriptors over its start states that
+            halves its fitness with offset, in widths of a cell (see ``Scatter``); 0:
+            scatter costs nothing.
         new_starts: Whether every generation has other start states.
-        renewal_period: Generations between two renewals of the archive: all elites are
-            evaluated again from new start states, and the archive is rebuilt; 0: none.
-        renewal_weight: Weight of the new scores of an elite in a renewal [-]; 1: the
-            old ones are forgotten.
         randomize: Ranges of physical parameters, as ``(name, (lowest, highest))`` or
             as a dictionary; each start state has its own parameters
             (:func:`~newton_qd.randomize_params`).
@@ -101,12 +100,8 @@ class EvolveConfig:
     env_options: tuple[tuple[str, Any], ...] = ()
     starts: int = 1
     statistic: str = "mean"
+    scatter: float = 0.0
     new_starts: bool = False
-    renewal_period: int = 0
-    renewal_weight: float = 1.0
-    verified: int = 0
-    verified_starts: int = 12
-    spread: float = 0.0
     randomize: tuple[tuple[str, Any], ...] = ()
     warm_start: str | None = None
 
@@ -124,7 +119,7 @@ class EvolveConfig:
             )
             object.__setattr__(self, name, frozen)
         self._check()
-        for name in ("iso_sigma", "line_sigma", "renewal_weight"):
+        for name in ("iso_sigma", "line_sigma", "scatter"):
             object.__setattr__(self, name, float(getattr(self, name)))
 
     def _check(self) -> None:
@@ -137,12 +132,9 @@ class EvolveConfig:
         check_integer("starts", self.starts, 1)
         if self.statistic not in STATISTICS:
             raise ConfigError(message("statistic", self.statistic, listed(STATISTICS)))
+        checks.number("scatter", self.scatter, least=0, error=ConfigError)
         checks.instance(
             "new_starts", self.new_starts, bool, "True, False", error=ConfigError
-        )
-        check_integer("renewal_period", self.renewal_period, 0)
-        checks.number(
-            "renewal_weight", self.renewal_weight, above=0, most=1, error=ConfigError
         )
         check_integer("reevaluations", self.reevaluations, 0)
         check_integer("episode_length", self.episode_length, 1)

@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 
 from newton_qd.qd.run import quality
-from newton_qd.qd.run.ties import without_ties
 from newton_qd.types import ExtraScores, Genotype, PyTree, Repertoire
 
 
@@ -87,7 +86,7 @@ class Generation:
     ) -> tuple[Any, dict]:
         """Returns the archive with a generation added, and the emitter's arguments."""
         fitnesses, found, extra = scores
-        kept = without_ties(fitnesses, found, repertoire.centroids)
+        kept = _break_ties(fitnesses, found, repertoire.centroids)
         repertoire = repertoire.add(genotypes, found, kept, {})
         if not self.takes_faulty:
             fitnesses = jnp.where(jnp.isfinite(fitnesses), fitnesses, -self.offset)
@@ -131,3 +130,30 @@ def _strongly_typed(tree: PyTree) -> PyTree:
         return jax.lax.convert_element_type(leaf, leaf.dtype)
 
     return jax.tree.map(strong, tree)
+
+
+def _break_ties(
+    fitnesses: jax.Array, descriptors: jax.Array, centroids: jax.Array
+) -> jax.Array:
+    """Keeps the first of several equally fit individuals of one cell.
+
+    QDax would write all of them to the same row of the archive. XLA does not define the
+    order on a GPU.
+
+    Args:
+        fitnesses: (N,) returns.
+        descriptors: (N, D) descriptors.
+        centroids: (cells, D) centres of the cells.
+
+    Returns:
+        (N,) returns, ``-inf`` for the later ones.
+    """
+    from qdax.core.containers.mapelites_repertoire import get_cells_indices
+
+    cells = get_cells_indices(descriptors, centroids)
+    order = jnp.lexsort((fitnesses, cells))
+    same = (cells[order][1:] == cells[order][:-1]) & (
+        fitnesses[order][1:] == fitnesses[order][:-1]
+    )
+    later = jnp.concatenate([jnp.zeros((1,), bool), same])
+    return jnp.where(jnp.zeros_like(later).at[order].set(later), -jnp.inf, fitnesses)

@@ -29,7 +29,7 @@ from newton_qd.qd.run.reevaluation import Reevaluated
 from newton_qd.qd.run.results import read_reevaluated, read_results
 from newton_qd.qd.run.search import start_key
 from newton_qd.qd.scoring.networks import policy_for
-from newton_qd.qd.scoring.robust import robust_scoring, run_scoring
+from newton_qd.qd.scoring.robust import robust, run_scoring
 from newton_qd.qd.scoring.rollout import (
     Policy,
     episode_of,
@@ -283,7 +283,7 @@ class Run:
             return run_scoring(config, self.task, self.policy)
         options = spec.read_options(config)
         score = spec.scoring(config, options, self.task, self.policy)
-        return robust_scoring(score, starts=config.starts, statistic=config.statistic)
+        return robust(score, config, self.task)
 
     @functools.cached_property
     def _pairs(self) -> Callable[[jax.Array, jax.Array], tuple]:

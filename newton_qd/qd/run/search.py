@@ -28,9 +28,8 @@ from newton_qd.qd.run.reevaluation import (
     corrected_fitnesses,
     reevaluate,
 )
-from newton_qd.qd.run.renewal import entrants, merged, renewed
 from newton_qd.qd.scoring.networks import policy_for
-from newton_qd.qd.scoring.robust import robust_scoring, run_scoring
+from newton_qd.qd.scoring.robust import robust, run_scoring
 from newton_qd.qd.scoring.rollout import (
     episode_of,
     make_scoring_function,
@@ -103,7 +102,6 @@ class Search:
         keys = _keys(config.seed)
         key_centroids, self._key_reset = keys[0], keys[1]
         self._key_initial, self._key_generations = keys[2], keys[3]
-        self._key_renewals = jax.random.fold_in(self._key_reset, 0)
         self._key_reevaluations = jax.random.fold_in(self._key_reset, 1)
         self._policy = policy_for(task, config.hidden)
         self._centroids = cell_centroids(config, task.limits, key_centroids)
@@ -122,15 +120,6 @@ class Search:
         self._score = self._compiled(score)
         self._ask = jax.jit(parts.propose)
         self._enter = jax.jit(self._generation.enter)
-        if config.verified:
-            self._score_again = self._compiled(
-                run_scoring(config, task, self._policy, starts=config.verified_starts)
-            )
-            self._entrants = jax.jit(functools.partial(entrants, most=config.verified))
-            self._merge = jax.jit(merged)
-        self._rebuild = jax.jit(
-            functools.partial(renewed, weight=config.renewal_weight)
-        )
         self._begin = self._compiled(parts.begin, learns_on_mesh)
         self._tell = self._compiled(parts.tell, learns_on_mesh)
         # one after the other if the network is the user's: on a CPU, two batches of QR
@@ -158,10 +147,6 @@ class Search:
             SearchError: No individual of the initial population has finite scores.
         """
         iteration = state.iteration + 1
-        renewals = 0
-        period = self._config.renewal_period
-        if period and iteration and iteration % period == 0:
-            state, renewals = self._renewed(state)
         if iteration == 0:
             genotypes, repertoire, evaluations, rejected = self._settled(state)
             evaluations *= self._config.starts
@@ -176,9 +161,6 @@ class Search:
                 self._drawn, state.repertoire, state.emitter, key
             )
             scores = self._score(genotypes, self._start(iteration))
-            if self._config.verified:
-                scores, extra = self._verified(state, genotypes, scores)
-                renewals += extra
             initial = np.float32(state.metrics[0][COLUMNS.index("initial_fitness")])
             repertoire, emitter, metrics = self._tell(
                 self._drawn,
@@ -191,7 +173,7 @@ class Search:
             )
             each = self._episodes
             before = state.metrics[-1][COLUMNS.index("evaluations")]
-            evaluations = int(before) + each + renewals
+            evaluations = int(before) + each
         row = {
             "iteration": iteration,
             "evaluations": evaluations,
@@ -202,35 +184,6 @@ class Search:
             raise SearchError(self._emptiness(genotypes))
         rows = np.vstack([state.metrics, [row[name] for name in COLUMNS]])
         return SearchState(iteration, repertoire, rows, emitter)
-
-    def _verified(self, state: SearchState, genotypes: Any, scores: Any) -> Any:
-        most = min(self._config.verified, len(genotypes))
-        key = jax.random.fold_in(self._key_renewals, 2**30 + state.iteration)
-        chosen, ok = self._entrants(state.repertoire, scores[0], scores[1])
-        again = self._score_again(genotypes[chosen], key)
-        scores = self._merge(scores, chosen, ok, again)
-        return scores, most * self._config.verified_starts
-
-    def _renewed(self, state: SearchState) -> tuple[SearchState, int]:
-        """Evaluates the elites again from new start states, and rebuilds the archive.
-
-        Returns:
-            The state, and the number of episodes.
-        """
-        repertoire, size = state.repertoire, self._config.batch_size
-        key = jax.random.fold_in(self._key_renewals, state.iteration + 1)
-        cells = len(self._centroids)
-        filled = np.flatnonzero(np.isfinite(repertoire.fitnesses[:, 0]))
-        fitnesses = np.full(cells, -np.inf, np.float32)
-        descriptors = np.zeros(self._centroids.shape, np.float32)
-        for begin in range(0, len(filled), size):
-            rows = np.minimum(np.arange(begin, begin + size), len(filled) - 1)
-            some = filled[rows]  # the last part is filled up with the last elite
-            fitness, descriptor, _ = self._score(repertoire.genotypes[some], key)
-            fitnesses[some], descriptors[some] = fitness, descriptor
-        repertoire = self._rebuild(repertoire, fitnesses, descriptors)
-        state = dataclasses.replace(state, repertoire=repertoire)
-        return state, len(filled) * self._config.starts
 
     def _settled(self, state: SearchState) -> tuple[jax.Array, Repertoire, int, int]:
         """Prepares the initial population.
@@ -401,8 +354,7 @@ class Search:
         score = self._algorithm.scoring(
             self._config, self.options, self._task, self._policy
         )
-        starts, statistic = self._config.starts, self._config.statistic
-        return self._split(robust_scoring(score, starts=starts, statistic=statistic))
+        return self._split(robust(score, self._config, self._task))
 
     def _plain_scoring(self) -> ScoringFunction:
         """Returns a scoring function of one start state, split over the mesh."""

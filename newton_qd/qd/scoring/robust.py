@@ -13,7 +13,7 @@ from newton_qd.checks import listed, message
 from newton_qd.gradients.scores import unit_rows
 from newton_qd.qd.config import STATISTICS, EvolveConfig
 from newton_qd.qd.scoring.rollout import Policy, make_scoring_function
-from newton_qd.qd.scoring.spread import Spread, spread_of
+from newton_qd.qd.scoring.scatter import Scatter, scatter_of
 from newton_qd.qd.scoring.task import Task
 from newton_qd.types import ExtraScores, Genotype, PyTree, RNGKey, ScoringFunction
 
@@ -25,7 +25,7 @@ def robust_scoring(
     *,
     starts: int,
     statistic: str = "mean",
-    spread: Spread | None = None,
+    scatter: Scatter | None = None,
 ) -> ScoringFunction:
     """Makes a scoring function that evaluates each individual from several starts.
 
@@ -39,21 +39,24 @@ def robust_scoring(
         starts: Start states of each individual.
         statistic: ``"mean"`` or ``"median"`` of the fitnesses, and of each component
             of the descriptors.
-        spread: What the spread of an individual's descriptors costs; ``None``: nothing.
+        scatter: What it costs if the descriptors of an individual differ; ``None``:
+            nothing. One start state has no scatter.
 
     Returns:
         Function with the arguments and results of ``score``. The fitness is ``-inf`` if
-        that of any start is. Gradients are those of the statistic. Transitions of all
-        starts follow each other, (N, starts T, ...). It raises ``ValueError`` for other
-        entries of the dictionary.
+        that of any start is. Gradients are those of these fitnesses and descriptors.
+        Transitions of all starts follow each other, (N, starts T, ...). It raises
+        ``ValueError`` for other entries of the dictionary.
 
     Raises:
-        TypeError: ``score`` is not a function.
+        TypeError: ``score`` is not a function, or ``scatter`` is no ``Scatter``.
         ValueError: ``starts`` is not an integer from 1, or ``statistic`` is unknown.
     """
     checks.function("score", score, "a function of genotypes and a key")
     checks.integer("starts", starts)
     checks.choice("statistic", statistic, STATISTICS)
+    if scatter is not None:
+        checks.instance("scatter", scatter, Scatter, "a Scatter, None")
     if starts == 1:
         return score
 
@@ -68,32 +71,36 @@ def robust_scoring(
         rows = jnp.where(bad[..., None], jnp.zeros_like(rows), rows)
         weights = _weights(rows, statistic)
         mixed = _weighted(weights, rows)
-        fitness = mixed[:, 0]
-        if spread is not None:
-            fitness = spread.weighed(fitness, found, mixed[:, 1:])
+        fitness, slopes = mixed[:, 0], None
+        if scatter is not None:
+            fitness, slopes = _scattered(scatter, rows, weights)
         fitness = jnp.where(bad, -jnp.inf, fitness)
-        return fitness, mixed[:, 1:], _joined(extra, weights)
+        return fitness, mixed[:, 1:], _joined(extra, weights, slopes)
 
     return scored
 
 
 def run_scoring(
-    config: EvolveConfig,
-    task: Task,
-    policy: Policy,
-    *,
-    transitions: bool = False,
-    starts: int = 0,
+    config: EvolveConfig, task: Task, policy: Policy, *, transitions: bool = False
 ) -> ScoringFunction:
     """Returns the scoring function of a run without gradients."""
     score = make_scoring_function(
         task, policy, config.episode_length, transitions=transitions
     )
+    return robust(score, config, task)
+
+
+def robust(score: ScoringFunction, config: EvolveConfig, task: Task) -> ScoringFunction:
+    """Returns ``robust_scoring`` with the settings of a run.
+
+    Raises:
+        ConfigError: The settings do not fit each other.
+    """
     return robust_scoring(
         score,
-        starts=starts or config.starts,
+        starts=config.starts,
         statistic=config.statistic,
-        spread=spread_of(config, task),
+        scatter=scatter_of(config, task),
     )
 
 
@@ -120,8 +127,37 @@ def _weighted(weights: jax.Array, rows: jax.Array) -> jax.Array:
     return total
 
 
-def _joined(extra: ExtraScores, weights: jax.Array) -> ExtraScores:
+def _scattered(
+    scatter: Scatter, rows: jax.Array, weights: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Returns the fitness (N,) that counts, and its slope for each row.
+
+    Args:
+        scatter: The price.
+        rows: (starts, N, 1 + D) fitness and descriptor of each episode.
+        weights: Weight of each start in the statistic, with the same shape.
+    """
+
+    def total(rows: jax.Array) -> tuple[jax.Array, jax.Array]:
+        middle = _weighted(weights, rows)
+        fitness = scatter.counted(middle[:, 0], rows[..., 1:], middle[:, 1:])
+        return jnp.sum(fitness), fitness
+
+    # individuals do not depend on each other, so the slope of the sum is that of each
+    slopes, fitness = jax.grad(total, has_aux=True)(rows)
+    return fitness, slopes
+
+
+def _joined(
+    extra: ExtraScores, weights: jax.Array, slopes: jax.Array | None
+) -> ExtraScores:
     """Returns the dictionary of the scores, from those of all starts.
+
+    Args:
+        extra: Dictionary whose leaves begin with the axis of the starts.
+        weights: (starts, N, R) weight of each start in each row.
+        slopes: (starts, N, R) slope of the fitness with respect to each row; ``None``:
+            the fitness is the first row.
 
     Raises:
         ValueError: It has entries whose mean is not defined.
@@ -133,7 +169,7 @@ def _joined(extra: ExtraScores, weights: jax.Array) -> ExtraScores:
             raise ValueError(message("extra scores", name, allowed))
         joined[name] = jax.tree.map(_PARTS[name], value)
     if "gradients" in extra:
-        mixed = jax.tree.map(lambda x: _mixed(weights, x), extra["gradients"])
+        mixed = jax.tree.map(lambda x: _mixed(weights, slopes, x), extra["gradients"])
         sound = ~joined["faulty"]
         mixed = jax.tree.map(lambda x: _where(sound, x), mixed)
         joined["gradients"] = mixed
@@ -141,11 +177,17 @@ def _joined(extra: ExtraScores, weights: jax.Array) -> ExtraScores:
     return joined
 
 
-def _mixed(weights: jax.Array, gradients: jax.Array) -> jax.Array:
-    """Returns gradients (N, ..., R) of the statistic, from (starts, N, ..., R)."""
+def _mixed(
+    weights: jax.Array, slopes: jax.Array | None, gradients: jax.Array
+) -> jax.Array:
+    """Returns gradients (N, ..., R) of the results, from (starts, N, ..., R)."""
     inner = (1,) * (gradients.ndim - weights.ndim)
     shape = (*weights.shape[:2], *inner, weights.shape[2])
-    return _weighted(weights.reshape(shape), gradients)
+    mixed = _weighted(weights.reshape(shape), gradients)
+    if slopes is None:
+        return mixed
+    first = jnp.sum(_weighted(slopes.reshape(shape), gradients), axis=-1)
+    return mixed.at[..., 0].set(first)
 
 
 def _where(sound: jax.Array, leaf: jax.Array) -> jax.Array:
