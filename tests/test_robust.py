@@ -75,6 +75,8 @@ def test_results_are_joined(
         away = np.linalg.norm(rows[:, :2, 1:] - expected[:, 1:], axis=-1)
         share = 1 / (1 + (away**2).mean(axis=0) / 0.7**2)
         assert share.max() < 0.9
+        assert np.allclose(extra["unscattered"][:2], expected[:, 0], atol=1e-6)
+        assert np.isneginf(extra["unscattered"][2])
         expected[:, 0] = (expected[:, 0] + 2.0) * share - 2.0
     assert np.allclose(fitness[:2], expected[:, 0], atol=1e-6)
     assert np.isneginf(fitness[2])
@@ -160,6 +162,9 @@ def test_a_run_from_several_starts(tmp_path: Path) -> None:
     result = run(config, out=tmp_path / "run")
     assert result.metrics["evaluations"].tolist() == [48, 96, 144]
     assert result.metrics["env_steps"][-1] == 144 * config.episode_length
+    plain = run(config.replace(scatter=0.0, iterations=0))
+    untrained = result.metrics["initial_fitness"]
+    assert np.allclose(untrained, plain.metrics["initial_fitness"][0], rtol=1e-6)
     opened = load_run(tmp_path / "run", task_factory=point_task)
     again = opened.evaluate()
     filled = result.archive.filled

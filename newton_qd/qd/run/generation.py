@@ -50,7 +50,8 @@ class Generation:
         """Returns archive, emitter's state and metrics after the initial population."""
         repertoire, told = self._added(repertoire, genotypes, scores)
         emitter = self.emitter.init(key=self.key, **told)
-        fitnesses = scores[0]
+        # the median is compared with true returns, so it has no price of scatter
+        fitnesses = scores[2].get("unscattered", scores[0])
         finite = jnp.where(jnp.isfinite(fitnesses), fitnesses, jnp.nan)
         metrics = self._measured(repertoire, scores, jnp.nanmedian(finite))
         return repertoire, _strongly_typed(emitter), metrics
