@@ -199,7 +199,9 @@ def test_eval_says_that_the_bits_are_the_same(
     assert "their median" not in printed  # of a single elite
     for best, over in ((["--best", 3], "these 3 elites"), ([], "all elites")):
         assert call("eval", reference, *best, "--starts", 4) == cli.OK
-        assert f"their median over {over} is" in capsys.readouterr().out
+        printed = capsys.readouterr().out
+        assert f"their median over {over} is" in printed
+        assert "lost more than a tenth" in printed
     out = tmp_path / "run"
     shutil.copytree(reference, out)
     text = (out / "config.json").read_text()
@@ -207,6 +209,18 @@ def test_eval_says_that_the_bits_are_the_same(
     assert call("eval", out) == cli.FAILED
     printed = capsys.readouterr().out
     assert "have other results" in printed and "same bits" in printed
+
+
+def test_eval_does_not_compare_returns_with_what_counts(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = SMALL.replace(starts=2, scatter=1.0, iterations=0, reevaluations=0)
+    run(config, out=tmp_path / "run")
+    capsys.readouterr()
+    assert call("eval", tmp_path / "run", "--starts", 2) == cli.OK
+    printed = capsys.readouterr().out
+    assert "fitness: with the price of scatter; again: without it" in printed
+    assert "lost more" not in printed
 
 
 @pytest.mark.parametrize(

@@ -147,6 +147,7 @@ def test_what_cannot_be_joined() -> None:
         ({"starts": 0}, "starts: got 0"),
         ({"statistic": "mode"}, "statistic: got 'mode'; allowed: mean, median"),
         ({"scatter": -1.0}, "scatter: got -1.0"),
+        ({"scatter": 1e300}, "scatter: got 1e[+]300"),
         ({"new_starts": 1}, "new_starts: got 1; allowed: True, False"),
     ):
         with pytest.raises(ConfigError, match=text):

@@ -184,8 +184,9 @@ def _add_start_arguments(group: argparse._ArgumentGroup) -> None:
         "--scatter",
         type=float,
         metavar="CELLS",
-        help="scatter of the descriptors over the start states that halves a fitness "
-        "with offset, in widths of a cell (default: it costs nothing)",
+        help="lower the fitness of individuals whose episodes end apart: half of it, "
+        "with offset, at a scatter of so many widths of a cell; needs several start "
+        "states (default: 0, no price)",
     )
     group.add_argument(
         "--new-starts",

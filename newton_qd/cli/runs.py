@@ -117,7 +117,7 @@ def evaluate(arguments: argparse.Namespace, task_factory: TaskFactory = None) ->
         import jax
 
         keys = jax.random.split(jax.random.key(seed), arguments.starts)
-        _print_starts(elites, run.evaluate(cells, keys), whole)
+        _print_starts(run, elites, run.evaluate(cells, keys), whole)
         return OK
     return _print_repeated(run, elites, run.evaluate(cells), whole)
 
@@ -186,7 +186,9 @@ def _print_repeated(
     return FAILED
 
 
-def _print_starts(elites: Sequence[Elite], found: Evaluation, whole: bool) -> None:
+def _print_starts(
+    run: Run, elites: Sequence[Elite], found: Evaluation, whole: bool
+) -> None:
     """Prints results from several start states, of chosen elites or the whole run."""
     import numpy as np
 
@@ -216,9 +218,12 @@ def _print_starts(elites: Sequence[Elite], found: Evaluation, whole: bool) -> No
     over = "all elites" if whole else f"these {len(elites)} elites"
     text = f"again: medians over {starts} start state{'s' if starts > 1 else ''}"
     if len(elites) > 1:
-        text += f"; their median over {over} is {np.median(median):.6g}, {lost:.0%} "
-        text += "lost more than a tenth of their fitness"
+        text += f"; their median over {over} is {np.median(median):.6g}"
+        if not run.config.scatter:
+            text += f", {lost:.0%} lost more than a tenth of their fitness"
     say(text)
+    if run.config.scatter:
+        say("fitness: with the price of scatter; again: without it")
 
 
 def _lost(elites: Sequence[Elite], medians: Any) -> float:

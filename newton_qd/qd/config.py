@@ -71,8 +71,8 @@ class EvolveConfig:
         starts: Start states from which each individual is evaluated.
         statistic: ``"mean"`` or ``"median"`` of fitness and descriptor over them.
         scatter: Scatter of an individual's descriptors over its start states that
-            halves its fitness with offset, in widths of a cell (see ``Scatter``); 0:
-            scatter costs nothing.
+            halves its fitness with offset (see ``Scatter``); 0: scatter costs nothing.
+            Its unit is the edge of a cube with the volume of a cell.
         new_starts: Whether every generation has other start states.
         randomize: Ranges of physical parameters, as ``(name, (lowest, highest))`` or
             as a dictionary; each start state has its own parameters
@@ -132,7 +132,7 @@ class EvolveConfig:
         check_integer("starts", self.starts, 1)
         if self.statistic not in STATISTICS:
             raise ConfigError(message("statistic", self.statistic, listed(STATISTICS)))
-        checks.number("scatter", self.scatter, least=0, error=ConfigError)
+        checks.number("scatter", self.scatter, least=0, most=1e6, error=ConfigError)
         checks.instance(
             "new_starts", self.new_starts, bool, "True, False", error=ConfigError
         )

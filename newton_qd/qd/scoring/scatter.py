@@ -71,8 +71,8 @@ class Scatter:
 def scatter_of(config: EvolveConfig, task: Task) -> Scatter | None:
     """Returns the price that the settings ask for; ``None``: none.
 
-    The width is that of a cell, if all have the same volume and are cubes, times
-    ``config.scatter``.
+    The width is ``config.scatter`` times the edge of a cube with the volume of a cell:
+    (volume of the descriptor's range / cells) ** (1 / D).
 
     Args:
         config: Settings with a grid or a number of centroids.
