@@ -158,27 +158,36 @@ def test_what_cannot_be_joined() -> None:
         run(SMALL.replace(randomize={"friction": (1, 2)}))
 
 
-def test_a_run_from_several_starts(tmp_path: Path) -> None:
-    config = SMALL.replace(starts=3, scatter=0.5, iterations=2)
+@pytest.mark.parametrize("scatter", [0.0, 0.5])
+def test_a_run_from_several_starts(tmp_path: Path, scatter: float) -> None:
+    config = SMALL.replace(starts=3, scatter=scatter, iterations=2)
     result = run(config, out=tmp_path / "run")
     assert result.metrics["evaluations"].tolist() == [48, 96, 144]
     assert result.metrics["env_steps"][-1] == 144 * config.episode_length
-    plain = run(config.replace(scatter=0.0, iterations=0))
-    untrained = result.metrics["initial_fitness"]
-    assert np.allclose(untrained, plain.metrics["initial_fitness"][0], rtol=1e-6)
     opened = load_run(tmp_path / "run", task_factory=point_task)
     again = opened.evaluate()
     filled = result.archive.filled
     assert np.array_equal(again.fitnesses, result.archive.fitnesses[filled])
     assert np.array_equal(again.descriptors, result.archive.descriptors[filled])
     alone = opened.evaluate(keys=jax.random.split(opened.start_key, 3))
+    mean = alone.fitnesses.mean(axis=1)
     price = scatter_of(config, opened.task)
-    assert price is not None
+    if price is None:
+        assert np.allclose(mean, again.fitnesses, rtol=1e-5)
+        return
     each = jnp.moveaxis(jnp.asarray(alone.descriptors), 1, 0)
-    mean = jnp.asarray(alone.fitnesses.mean(axis=1))
-    counted = price.counted(mean, each, jnp.asarray(again.descriptors))
+    middle = jnp.asarray(again.descriptors)
+    counted = price.counted(jnp.asarray(mean), each, middle)
     assert np.allclose(counted, again.fitnesses, rtol=1e-5)
     assert np.any(again.fitnesses < mean - 1)
+
+
+def test_the_untrained_policy_has_no_price_of_scatter() -> None:
+    config = SMALL.replace(starts=3, iterations=0)
+    plain, priced = (run(config.replace(scatter=x)) for x in (0.0, 0.5))
+    untrained = [x.metrics["initial_fitness"] for x in (plain, priced)]
+    assert np.allclose(*untrained, rtol=1e-6)
+    assert priced.metrics["mean_fitness"] < plain.metrics["mean_fitness"]
 
 
 @pytest.mark.slow
