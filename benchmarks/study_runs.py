@@ -17,6 +17,7 @@ from study_protocols import Protocol
 
 VARIANTS = Path(__file__).resolve().parent / "study" / "field.toml"
 TUNING_SEED = 1000
+_ABOUT = {"of", "tasks", "chosen", "chosen_at_evaluations"}  # no settings
 SCORES = ("qd_score", "coverage", "max_fitness", "mean_fitness", "qd_gain")
 HEAD = (
     *("protocol", "task", "algorithm", "variant", "seed", "stop", "device", "clock"),
@@ -54,7 +55,7 @@ def variants() -> dict[str, dict[str, Any]]:
     found: dict[str, dict[str, Any]] = {}
     for name, given in _file().items():
         parent = found[given["of"]] if "of" in given else {}
-        own = {key: given[key] for key in given.keys() - {"of", "tasks", "chosen"}}
+        own = {key: given[key] for key in given.keys() - _ABOUT}
         options = {**parent.get("options", {}), **given.get("options", {})}
         found[name] = {**parent, **own, **({"options": options} if options else {})}
     algorithms = dict.fromkeys(name.split("@")[0] for name in found)
@@ -102,10 +103,21 @@ def numbered(algorithm: str, task: str) -> list[str]:
     return found
 
 
-def chosen(algorithm: str, task: str) -> str:
-    """Returns the variant that the report has for a task, or else the first one."""
+def chosen(algorithm: str, task: str, *, at_evaluations: bool = False) -> str:
+    """Returns the variant that the report has for a task, or else the first one.
+
+    Args:
+        algorithm: Name of the algorithm.
+        task: Name of the environment.
+        at_evaluations: Whether the stop is a number of evaluations. There, more start
+            states leave fewer generations, so another variant may be chosen.
+    """
     names, file = numbered(algorithm, task), _file()
-    return next((x for x in names if task in file[x].get("chosen", ())), names[0])
+    for key in ("chosen_at_evaluations",) * at_evaluations + ("chosen",):
+        for name in names:
+            if task in file[name].get(key, ()):
+                return name
+    return names[0]
 
 
 @dataclasses.dataclass(frozen=True)

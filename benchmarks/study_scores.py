@@ -92,7 +92,7 @@ def _main_variants(kept: list[dict[str, str]]) -> dict[tuple[str, str, str], str
     # later keys replace earlier ones
     for *place, variant in sorted(counts, key=lambda key: counts[key]):
         task, algorithm, stop = place
-        wanted = chosen(algorithm, task)
+        wanted = chosen(algorithm, task, at_evaluations="evaluations" in stop)
         there = (task, algorithm, stop, wanted) in counts
         found[task, algorithm, stop] = wanted if there else variant
     return found

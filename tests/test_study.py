@@ -67,7 +67,7 @@ def test_every_variant_is_a_setting(protocol: Any) -> None:
 def test_baselines_get_as_many_variants(task: str) -> None:
     ours = [len(study_runs.numbered(name, task)) for name in study_scores.OURS]
     others = [len(study_runs.numbered(name, task)) for name in BASELINES]
-    assert 1 <= min(ours) and max(ours) <= min(others) == 6
+    assert 1 <= min(ours) and max(ours) <= min(others) == 7
 
 
 def test_variants_name_tasks_of_the_protocol() -> None:
@@ -121,7 +121,7 @@ def test_without_tuning_chosen_variants_run_and_are_reported() -> None:
         tasks=[TASK], algorithms=["me", "me-actor-critic"], seeds=1, until=60
     )
     found = [run.variant for run in study_runs.planned(FIELD, choice)]
-    assert found == ["me@5", "me-actor-critic@13"]
+    assert found == ["me@5", "me-actor-critic@21"]
     found = [run.variant for run in study_runs.planned(SMALL, choice)]
     assert found == ["me@0", "me-actor-critic@0"]
 
@@ -140,7 +140,7 @@ def test_finished_runs_are_left_out(tmp_path: Path) -> None:
 
 
 def test_tuning_chooses_the_corrected_score(tmp_path: Path) -> None:
-    assert len(left(tmp_path, tune=True)) == 6
+    assert len(left(tmp_path, tune=True)) == 7
     for variant, gain in (("me@1", 3.0), ("me@2", 5.0), ("me@3", 4.0)):
         row = line("me", 1000, "20 s", corrected_qd_gain=gain) | {"variant": variant}
         study_runs.add_line(tmp_path / "runs.csv", row)
@@ -180,6 +180,24 @@ def test_a_chosen_variant_has_the_name_where_it_came_so_far() -> None:
         (TASK, "me", "60 s"): main,
         (TASK, "me", "250 s"): "me@1",
     }
+
+
+def test_a_number_of_evaluations_can_have_another_variant() -> None:
+    main = study_runs.chosen("me-actor-critic", TASK)
+    other = study_runs.chosen("me-actor-critic", TASK, at_evaluations=True)
+    assert main != other
+    rows = [
+        line("me-actor-critic", 0, stop) | {"variant": variant}
+        for stop in ("1000000 evaluations", "60 s")
+        for variant in (main, other)
+    ]
+    assert study_scores._main_variants(rows) == {
+        (TASK, "me-actor-critic", "1000000 evaluations"): other,
+        (TASK, "me-actor-critic", "60 s"): main,
+    }
+    assert study_runs.chosen("me", TASK, at_evaluations=True) == study_runs.chosen(
+        "me", TASK
+    )
 
 
 def test_the_best_variant_of_others_is_compared() -> None:
