@@ -93,7 +93,7 @@ def test_the_gradient_is_that_of_the_window() -> None:
             state = env.step(state, policy(weights, state.obs))
             gain = jnp.append(state.reward, state.pipeline_state) @ aim
             total += discount**step * gain
-        value = way._values(start.target, scale, state.obs) @ aim
+        value = way._value(start.target, scale, state.obs)
         return total + discount**SETTINGS.window * value
 
     def by_window(weights: jax.Array) -> jax.Array:
@@ -131,7 +131,7 @@ def test_values_inside_of_a_window_count() -> None:
         for step in range(SETTINGS.window):
             state = env.step(state, policy(weights, state.obs))
             total += discount**step * state.reward
-            value = way._values(start.target, scale, state.obs)[0]
+            value = way._value(start.target, scale, state.obs)
             returns.append(total + discount ** (step + 1) * value)
         last = len(returns) - 1
         mean = sum((1 - part) * part**i * x for i, x in enumerate(returns[:last]))
@@ -144,33 +144,6 @@ def test_values_inside_of_a_window_count() -> None:
     pairs = (compiled(jax.value_and_grad(x))(weights) for x in (by_window, by_hand))
     for found, expected in zip(*pairs, strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-3)
-
-
-def test_a_critic_does_not_depend_on_the_aim() -> None:
-    """The same episodes teach it the same, whatever the actor learns from them."""
-    way = method()
-    one, two = (learner(way, aim) for aim in ((1.0, 0.0, 0.0), (0.0, 0.6, -0.8)))
-    scale = compiled(way.scale)(jax.random.key(2), one.first)
-    update = compiled(way.update)
-    one, two = (update(x, scale, jax.random.key(3))[0] for x in (one, two))
-    assert not np.allclose(one.weights, two.weights)
-    for pair in zip(*map(jax.tree.leaves, (one.critic, two.critic)), strict=True):
-        np.testing.assert_array_equal(*pair)
-
-
-def test_a_restarted_actor_keeps_its_critic() -> None:
-    way = method()
-    old, _ = learned(way, (1.0, 0.0, 0.0), updates=3)
-    aim = jnp.array([0.5, 0.0, 1.0])
-    new, fresh = way.restarted(old, jnp.ones(SIZE), aim), learner(way)
-    kept, begun = (
-        (x.critic, x.target, x.moments[1], x.aim, x.weights)
-        for x in (new, dataclasses.replace(old, aim=aim, weights=jnp.ones(SIZE)))
-    )
-    again = [(x.worlds, x.age, x.moments[0]) for x in (new, fresh)]
-    for pair in ((kept, begun), again):
-        for one, two in zip(*map(jax.tree.leaves, pair), strict=True):
-            np.testing.assert_array_equal(one, two)
 
 
 def test_the_age_of_a_world_begins_again_after_a_fall() -> None:
@@ -248,21 +221,14 @@ def parts(measure: Any = reading) -> tuple[ActorCriticEmitter, Any, Any, Any]:
     return made, compiled(made.init), compiled(made.emit), compiled(made.state_update)
 
 
-@functools.cache
-def archive() -> tuple[Any, Any, Any, Any]:
-    """An archive, and the genotypes, fitness and descriptors of its first policies."""
+def generations(number: int, measure: Any = reading) -> list[tuple[Any, Any, Any]]:
+    """State, individuals and what is told of them, of each generation."""
+    _, init, emit, update = parts(measure)
     cells = compute_euclidean_centroids((4, 4), [-2.0, -2.0], [2.0, 2.0])
     genotypes = 0.1 * jax.random.normal(jax.random.key(0), (16, SIZE), jnp.float32)
     fitnesses, found = jax.vmap(play)(genotypes)
     repertoire = MapElitesRepertoire.init(genotypes, fitnesses, found, cells, {})
-    return repertoire, genotypes, fitnesses, found
-
-
-def generations(number: int, measure: Any = reading) -> list[tuple[Any, Any, Any]]:
-    """State, individuals and what is told of them, of each generation."""
-    _, init, emit, update = parts(measure)
-    repertoire, *scored = archive()
-    state = init(jax.random.key(1), repertoire, *scored, {})
+    state = init(jax.random.key(1), repertoire, genotypes, fitnesses, found, {})
     rows = []
     for generation in range(number):
         offspring, told = emit(repertoire, state, jax.random.key(generation))
@@ -286,10 +252,10 @@ def test_individuals_are_actors_and_what_lies_between_them_and_elites() -> None:
 
 def test_a_single_copy_is_the_actor_itself() -> None:
     state = generations(1)[0][0]
-    empty = MapElitesRepertoire.init_default(
+    archive = MapElitesRepertoire.init_default(
         jnp.zeros(SIZE), compute_euclidean_centroids((4, 4), [-2.0, -2.0], [2.0, 2.0])
     )
-    offspring, _ = compiled(emitter(copies=1).emit)(empty, state, jax.random.key(0))
+    offspring, _ = compiled(emitter(copies=1).emit)(archive, state, jax.random.key(0))
     np.testing.assert_array_equal(offspring, state.snapshots.reshape(-1, SIZE))
 
 
@@ -301,25 +267,6 @@ def test_steered_actors_begin_again() -> None:
     changed = (np.diff(aims, axis=0) != 0).any(axis=2)
     assert changed[:, 1].sum() == changed[:, 2].sum() == 2
     assert not (changed[:, 1] & changed[:, 2]).any()
-
-
-@pytest.mark.parametrize("keep", [False, True])
-def test_a_critic_stays_if_that_is_asked_for(keep: bool) -> None:
-    made = emitter(keep_critic=keep, steered=1.0, lifetime=1)
-    state = generations(1)[0][0]
-    begun = compiled(made._renewed)(
-        dataclasses.replace(state, generation=jnp.ones((), jnp.int32)),
-        archive()[0],
-        jax.random.key(3),
-    )
-    assert not np.allclose(begun.aim, state.learners.aim)
-    same = [
-        np.array_equal(*pair)
-        for pair in zip(
-            *map(jax.tree.leaves, (begun.critic, state.learners.critic)), strict=True
-        )
-    ]
-    assert same[0] == keep
 
 
 def test_equal_keys_give_equal_bits() -> None:

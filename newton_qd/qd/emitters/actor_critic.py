@@ -81,7 +81,6 @@ class ActorCriticEmitter(Emitter):
         steered: float = 0.5,
         fitness: float = 0.1,
         lifetime: int = 10,
-        keep_critic: bool = False,
         measures: int,
     ) -> None:
         """Sets the actors and how much they learn.
@@ -98,7 +97,6 @@ class ActorCriticEmitter(Emitter):
             steered: Share of the actors that follow directions of the descriptor [-].
             fitness: Weight of the reward for steered actors [-].
             lifetime: Generations after which a steered actor restarts.
-            keep_critic: Whether the critic stays when an actor restarts.
             measures: Length of the descriptor.
 
         Raises:
@@ -111,7 +109,6 @@ class ActorCriticEmitter(Emitter):
         if not 0 < spread[0] <= spread[1]:
             raise ValueError(message("spread", spread, "0 < smallest <= largest"))
         checks.number("steered", steered, least=0, most=1)
-        checks.flag("keep_critic", keep_critic)
         self._method = method
         self._first = first
         self._actors = actors
@@ -122,7 +119,6 @@ class ActorCriticEmitter(Emitter):
         self._steered = round(steered * actors)
         self._fitness = fitness
         self._lifetime = lifetime
-        self._keep_critic = keep_critic
         self._measures = measures
 
     @property
@@ -258,12 +254,7 @@ class ActorCriticEmitter(Emitter):
         cells = draw_cells(cell_key, filled, self._actors)
         weights = repertoire.genotypes[cells]
         weights = self._method.whitening.whitened(weights, state.scale)
-        aims = self._aims(aim_key)
-        if self._keep_critic:
-            restarted = jax.vmap(self._method.restarted)
-            new = restarted(state.learners, weights, aims)
-        else:
-            new = self._begun(critic_key, weights, aims)
+        new = self._begun(critic_key, weights, self._aims(aim_key))
         number = jnp.arange(self._actors)
         # one after the other, so that there are actors of all ages
         turn = number * self._lifetime // max(self._actors, 1)

@@ -61,14 +61,10 @@ class ActorCritic:
     simulation", equations 4 to 8. With the aim :math:`w`, the policy maximizes, with
     gradients of the physics,
 
-    .. math:: w \cdot \Big( \sum_{t<h} \gamma^t (r_t, m_t) + \gamma^h V(s_h) \Big)
+    .. math:: \sum_{t<h} \gamma^t w \cdot (r_t, m_t) + \gamma^h V(s_h)
 
     over a window of h control steps, where V is the value of the last state. The next
     window continues from this state. V is fitted to TD(lambda) targets.
-
-    V has an entry for the reward and one for each measure (Barreto et al. 2017,
-    "Successor features for transfer in reinforcement learning", equation 3). So it does
-    not depend on the aim, and an actor with another aim can go on with it.
 
     A fall ends an episode, and the gradient of the physics does not see it, unless
     ``done`` has a gradient (:func:`~newton_qd.gradients.with_smooth_termination`): the
@@ -140,8 +136,8 @@ class ActorCritic:
             aim: (1 + D,) weights of the reward and of each measure.
             first: Initial states of its worlds, leaves (W, ...).
         """
-        sizes = (first.obs.shape[-1], *self.settings.critic, len(aim))
-        critic = _network(key, sizes)
+        number = self.settings.worlds
+        critic = _network(key, (first.obs.shape[-1], *self.settings.critic, 1))
         actor_optimizer, critic_optimizer = self._optimizers
         return Learner(
             weights=weights,
@@ -151,22 +147,8 @@ class ActorCritic:
             moments=(actor_optimizer.init(weights), critic_optimizer.init(critic)),
             first=first,
             worlds=first,
-            age=self._ages(),
-        )
-
-    def restarted(
-        self, learner: Learner, weights: jax.Array, aim: jax.Array
-    ) -> Learner:
-        """Returns the actor with other weights and another aim, in new episodes.
-
-        Args:
-            learner: The actor, whose critic stays.
-            weights: (size,) weights, for whitened observations.
-            aim: (1 + D,) weights of the reward and of each measure.
-        """
-        moved = self.moved(learner, weights)
-        return dataclasses.replace(
-            moved, aim=aim, worlds=learner.first, age=self._ages()
+            # worlds of all ages, so that they do not restart at the same time
+            age=jnp.arange(number, dtype=jnp.int32) * self.episode_length // number,
         )
 
     def moved(self, learner: Learner, weights: jax.Array) -> Learner:
@@ -234,20 +216,14 @@ class ActorCritic:
         kept = dataclasses.replace(learner, worlds=learned.worlds, age=learned.age)
         return select(failed, kept, learned), failed
 
-    def _ages(self) -> jax.Array:
-        """Returns ages (W,), so that the worlds do not restart at the same time."""
-        number = self.settings.worlds
-        return jnp.arange(number, dtype=jnp.int32) * self.episode_length // number
-
-    def _values(self, critic: Layers, scale: PyTree, obs: jax.Array) -> jax.Array:
-        """Returns the values (1 + D,) of the reward and of each measure."""
+    def _value(self, critic: Layers, scale: PyTree, obs: jax.Array) -> jax.Array:
         mean, deviation = scale
         for weights, bias in critic[:-1]:
             obs = jnp.tanh(((obs - mean) / deviation) @ weights + bias)
             mean, deviation = 0.0, 1.0
         weights, bias = critic[-1]
-        # the outputs of the network have the scale of the reward of one step
-        return (obs @ weights + bias) / (1 - self.settings.discount)
+        # the output of the network has the scale of the reward of one step
+        return (obs @ weights + bias)[0] / (1 - self.settings.discount)
 
     def _window(
         self,
@@ -270,8 +246,8 @@ class ActorCritic:
             before = passed_back(state, one, settings.clip)
             action = self.policy(weights, before.obs) + noise
             after = self.env.step(before, jnp.clip(action, -1, 1))
-            gain = jnp.append(after.reward, self.measure(before, after))
-            value = self._values(learner.target, scale, after.obs)
+            gain = jnp.append(after.reward, self.measure(before, after)) @ learner.aim
+            value = self._value(learner.target, scale, after.obs)
             row = gain, after.done, value, jnp.where(_sound(after), value, 0)
             return select(after.done > 0, first, after), (state.obs, row)
 
@@ -292,8 +268,7 @@ class ActorCritic:
 
         ends = (rows[2][-1], rows[2][-1])
         (total, _), targets = jax.lax.scan(back, ends, rows, reverse=True)
-        found = (last, obs, targets, rows[1])
-        return total @ learner.aim, jax.lax.stop_gradient(found)
+        return total, jax.lax.stop_gradient((last, obs, targets, rows[1]))
 
     def _fit(
         self,
@@ -303,15 +278,15 @@ class ActorCritic:
         obs: PyTree,
         targets: PyTree,
     ) -> tuple[Layers, PyTree]:
-        """Fits the critic to targets (worlds, window, 1 + D) in several steps."""
+        """Fits the critic to its targets (worlds, window) in several steps."""
         optimizer = self._optimizers[1]
-        obs, targets = (x.reshape(self.steps, -1) for x in (obs, targets))
+        obs, targets = obs.reshape(self.steps, -1), targets.reshape(self.steps)
         factor = 1 - self.settings.discount
 
         def error(critic: Layers, rows: jax.Array) -> jax.Array:
-            values = jax.vmap(self._values, (None, None, 0))(critic, scale, obs[rows])
-            errors = jnp.square(factor * (values - targets[rows]))
-            return errors.sum(axis=1).mean()
+            value = functools.partial(self._value, critic, scale)
+            values = jax.vmap(value)(obs[rows])
+            return jnp.square(factor * (values - targets[rows])).mean()
 
         def fit(carry: PyTree, rows: jax.Array) -> tuple[PyTree, None]:
             critic, moments = carry
