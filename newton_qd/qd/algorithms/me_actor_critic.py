@@ -26,8 +26,6 @@ class ActorCriticOptions(LearningOptions):
         steered: Share of the actors that follow directions of the descriptor [-].
         fitness: Weight of the reward of steered actors [-].
         lifetime: Generations after which a steered actor restarts from a random elite.
-        shared: Share of the offspring of actors that are elites with the steps of an
-            actor [-].
     """
 
     actors: int = 2
@@ -37,7 +35,6 @@ class ActorCriticOptions(LearningOptions):
     steered: float = 0.5
     fitness: float = 0.1
     lifetime: int = 10
-    shared: float = 0.0
 
     def episodes(self, config: EvolveConfig) -> int:
         """Returns the control steps of a generation's updates, counted in episodes."""
@@ -72,7 +69,6 @@ def _make(context: EmitterContext, options: ActorCriticOptions) -> Any:
         steered=options.steered,
         fitness=options.fitness,
         lifetime=options.lifetime,
-        shared=options.shared,
         measures=task.descriptor_length,
     )
     if emitter.batch_size > config.batch_size:

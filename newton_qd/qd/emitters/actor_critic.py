@@ -29,7 +29,6 @@ class ActorCriticState:
 
     Attributes:
         learners: The K actors, leaves (K, ...).
-        origins: (K, size) weights of the actors at the start of their lives.
         scale: Mean and standard deviation of observations, (no,) each.
         snapshots: (branches, K, size) weights of the actors during the generation, for
             whitened observations.
@@ -39,7 +38,6 @@ class ActorCriticState:
     """
 
     learners: Learner
-    origins: jax.Array
     scale: tuple[jax.Array, jax.Array]
     snapshots: jax.Array
     failed: jax.Array
@@ -84,7 +82,6 @@ class ActorCriticEmitter(Emitter):
         fitness: float = 0.1,
         lifetime: int = 10,
         measures: int,
-        shared: float = 0.0,
     ) -> None:
         """Sets the actors and how much they learn.
 
@@ -101,8 +98,6 @@ class ActorCriticEmitter(Emitter):
             fitness: Weight of the reward for steered actors [-].
             lifetime: Generations after which a steered actor restarts.
             measures: Length of the descriptor.
-            shared: Share of the offspring that are elites with the steps of an actor
-                [-].
 
         Raises:
             ValueError: A number is out of its range.
@@ -125,7 +120,6 @@ class ActorCriticEmitter(Emitter):
         self._fitness = fitness
         self._lifetime = lifetime
         self._measures = measures
-        self._shared = round(shared * (copies - 1))
 
     @property
     def batch_size(self) -> int:
@@ -154,7 +148,6 @@ class ActorCriticEmitter(Emitter):
         learners = self._begun(critic_key, weights, self._aims(aim_key))
         return ActorCriticState(
             learners=learners,
-            origins=weights,
             scale=self._method.scale(scale_key, self._worlds()),
             snapshots=jnp.tile(weights, (self._branches, 1, 1)),
             failed=jnp.zeros((self._actors,), jnp.int32),
@@ -186,12 +179,7 @@ class ActorCriticEmitter(Emitter):
         sizes = jax.random.uniform(size_key, (*shape, 1), dtype)
         sizes = smallest * (largest / smallest) ** sizes
         noise = jax.random.normal(noise_key, elites.shape, dtype)
-        between = actors + part * (elites - actors)
-        # elites with the steps that an actor has made since the start of its life
-        steps = actors - jnp.tile(emitter_state.origins, (self._branches, 1))
-        moved = elites + part * steps
-        row = jnp.arange(self._copies - 1)[:, None, None]
-        between = jnp.where(row < self._shared, moved, between) + sizes * noise
+        between = actors + part * (elites - actors) + sizes * noise
         offspring = jnp.concatenate([actors, between.reshape(-1, actors.shape[-1])])
         overflowed = {"overflowed": emitter_state.failed}
         return white.plain(offspring, scale), overflowed
@@ -209,7 +197,7 @@ class ActorCriticEmitter(Emitter):
         del genotypes, fitnesses, descriptors, extra_scores
         state = emitter_state
         key, renewal_key, learn_key = jax.random.split(state.key, 3)
-        learners, origins = self._renewed(state, repertoire, renewal_key)
+        learners = self._renewed(state, repertoire, renewal_key)
         update = jax.vmap(self._method.update, in_axes=(0, None, 0))
 
         def learn(carry: tuple, key: jax.Array) -> tuple[tuple, None]:
@@ -227,7 +215,7 @@ class ActorCriticEmitter(Emitter):
         keys = jax.random.split(learn_key, self._branches)
         (learners, failed), snapshots = jax.lax.scan(branch, begin, keys)
         return ActorCriticState(
-            learners, origins, state.scale, snapshots, failed, state.generation + 1, key
+            learners, state.scale, snapshots, failed, state.generation + 1, key
         )
 
     def _worlds(self) -> PyTree:
@@ -259,8 +247,8 @@ class ActorCriticEmitter(Emitter):
 
     def _renewed(
         self, state: ActorCriticState, repertoire: Repertoire, key: jax.Array
-    ) -> tuple[Learner, jax.Array]:
-        """Returns the actors and their origins; restarts those with a finished lifetime from elites."""
+    ) -> Learner:
+        """Returns the actors; restarts those with a finished lifetime from elites."""
         aim_key, cell_key, critic_key = jax.random.split(key, 3)
         filled = repertoire.fitnesses[:, 0] > -jnp.inf
         cells = draw_cells(cell_key, filled, self._actors)
@@ -273,5 +261,4 @@ class ActorCriticEmitter(Emitter):
         due = (state.generation + turn) % self._lifetime == 0
         steered = number >= self._actors - self._steered
         begun = state.generation > 0
-        learners = select(due & steered & begun, new, state.learners)
-        return learners, select(due & begun, learners.weights, state.origins)
+        return select(due & steered & begun, new, state.learners)
