@@ -109,6 +109,25 @@ def test_the_gradient_is_that_of_the_window() -> None:
     )
 
 
+def test_each_world_has_weights_of_its_own() -> None:
+    """With noise on weights, each window has the policy that its noise makes."""
+    way = method(noise=0.0, weight_noise=0.3)
+    start, key = learner(way), jax.random.key(4)
+    scale = compiled(way.scale)(jax.random.key(2), start.first)
+    weights = 0.3 * jax.random.normal(key, (SIZE,))
+    rest = jnp.zeros((SETTINGS.window, 2))
+
+    def window(weights: jax.Array, world: Any) -> jax.Array:
+        return way._window(weights, start, scale, world, world, rest)[0]
+
+    found = compiled(lambda: way._windows(weights, start, scale, key)[0])()
+    shape = (SETTINGS.worlds, SIZE)
+    moved = weights + 0.3 * jax.random.normal(jax.random.fold_in(key, 0), shape)
+    expected = compiled(jax.vmap(window))(moved, start.first)
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+    assert np.ptp(found - compiled(jax.vmap(window, (None, 0)))(weights, start.first))
+
+
 @pytest.mark.slow
 def test_values_inside_of_a_window_count() -> None:
     """The TD(lambda) return as the weighted mean of the returns of all lengths."""

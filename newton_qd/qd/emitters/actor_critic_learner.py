@@ -177,15 +177,10 @@ class ActorCritic:
         """
         settings = self.settings
         noise_key, order_key = jax.random.split(key)
-        shape = (settings.worlds, settings.window, self.env.action_size)
-        noise = jax.random.normal(noise_key, shape, learner.weights.dtype)
 
         def loss(weights: jax.Array) -> tuple[jax.Array, PyTree]:
             plain = self.whitening.plain(weights, scale)
-            run = functools.partial(self._window, plain, learner, scale)
-            returns, found = jax.vmap(run)(
-                learner.first, learner.worlds, settings.noise * noise
-            )
+            returns, found = self._windows(plain, learner, scale, noise_key)
             return -returns.sum(), found
 
         slope, found = jax.grad(loss, has_aux=True)(learner.weights)
@@ -215,6 +210,25 @@ class ActorCritic:
         )
         kept = dataclasses.replace(learner, worlds=learned.worlds, age=learned.age)
         return select(failed, kept, learned), failed
+
+    def _windows(
+        self, weights: jax.Array, learner: Learner, scale: PyTree, key: jax.Array
+    ) -> tuple[jax.Array, PyTree]:
+        """Runs the windows of all worlds, each with its noise.
+
+        Returns:
+            The returns (worlds,), and the rest of ``_window``, leaves (worlds, ...).
+        """
+        settings = self.settings
+        shape = (settings.worlds, settings.window, self.env.action_size)
+        noise = settings.noise * jax.random.normal(key, shape, weights.dtype)
+        weights_axis = None
+        if settings.weight_noise:
+            key, shape = jax.random.fold_in(key, 0), (settings.worlds, weights.size)
+            other = jax.random.normal(key, shape, weights.dtype)
+            weights, weights_axis = weights + settings.weight_noise * other, 0
+        run = jax.vmap(self._window, in_axes=(weights_axis, None, None, 0, 0, 0))
+        return run(weights, learner, scale, learner.first, learner.worlds, noise)
 
     def _value(self, critic: Layers, scale: PyTree, obs: jax.Array) -> jax.Array:
         mean, deviation = scale

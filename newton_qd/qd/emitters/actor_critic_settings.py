@@ -19,6 +19,8 @@ class ActorCriticSettings:
         critic_rate: Learning rate of the critic [-].
         clip: Largest norm of the adjoint of the state of a world.
         noise: Standard deviation of the noise of actions [-].
+        weight_noise: Standard deviation of the noise of weights, in units of the
+            genotype; each world has weights of its own for a window.
         critic: Widths of the critic's hidden layers.
         discount: Discount of a control step [-].
         trace: Lambda of the critic's TD(lambda) targets [-].
@@ -41,6 +43,7 @@ class ActorCriticSettings:
     critic_rate: float = 2e-3
     clip: float = 100.0
     noise: float = 0.1
+    weight_noise: float = 0.0
     critic: tuple[int, ...] = (64, 64)
     discount: float = 0.97
     trace: float = 0.95
@@ -67,7 +70,7 @@ class ActorCriticSettings:
             raise ValueError(message("batches", self.batches, allowed))
         for name in ("rate", "critic_rate", "clip"):
             checks.number(name, getattr(self, name), above=0)
-        for name in ("noise", "termination_width"):
+        for name in ("noise", "weight_noise", "termination_width"):
             checks.number(name, getattr(self, name), least=0)
         checks.number("discount", self.discount, least=0, below=1)
         checks.number("trace", self.trace, least=0, most=1)
