@@ -73,6 +73,10 @@ class ActorCritic:
     in which the value of every state counts, also that of a state shortly before a fall
     (Hafner et al. 2020, "Dream to control").
 
+    With ``weight_noise``, the policy maximizes the mean return of the policies around
+    it: each world has weights of its own for a window (Plappert et al. 2018, "Parameter
+    space noise for exploration").
+
     Attributes:
         env: Environment of one world without auto-reset.
         policy: Maps weights (size,) and an observation to an action.
