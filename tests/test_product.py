@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 from typing import Any
 
@@ -43,12 +44,25 @@ def allowed(options: dict[str, Any]) -> bool:
     return options["action_repeat"] == 1 and not options["eval_metrics"]
 
 
+def traced_once(env: Any) -> Any:
+    """JAX traces its methods once, whatever wraps it; so for what it is turned into."""
+    kind = type(env)
+    for change in ("with_scene", "with_feet_width"):
+        if hasattr(kind, change):
+            make = functools.partial(getattr(kind, change), env)
+            changed = functools.cache(lambda *x, make=make: traced_once(make(*x)))
+            vars(env)[change] = changed
+    for method in ("reset", "step"):
+        vars(env)[method] = jax.jit(functools.partial(getattr(kind, method), env))
+    return env
+
+
 @pytest.fixture
 def shared_base(monkeypatch: pytest.MonkeyPatch, request: Any) -> str:
-    """The environment inside is made once a name: making it is the slow part."""
+    """The environment inside is made and traced once a name: that is the slow part."""
     name = request.param
     row = tasks.ENVIRONMENTS[name]
-    base = row.base()
+    base = traced_once(row.base())
     shared = dataclasses.replace(row, base=lambda: base)
     monkeypatch.setitem(tasks.ENVIRONMENTS, name, shared)
     return name
