@@ -40,6 +40,9 @@ def main() -> None:
     args = parser.parse_args()
     if args.variant not in study_runs.variants():
         parser.error(f"variant: got {args.variant}; allowed: a key of study/field.toml")
+    for name in ("generations", "every"):
+        if getattr(args, name) < 1:
+            parser.error(f"{name}: got {getattr(args, name)}; allowed: integers from 1")
     run = study_runs.Run(args.task, args.variant, args.seed)
     with tempfile.TemporaryDirectory() as out:
         search = Progress(FIELD, run, Path(out), math.inf)
