@@ -54,6 +54,19 @@ def test_ratios_of_other_runs(runs: study_repeats.Runs) -> None:
     )
 
 
+def test_without_the_chosen_variant_the_one_with_most_seeds_counts(
+    runs: study_repeats.Runs,
+) -> None:
+    task = "hopper_uni"
+    other = {
+        (task, OTHER): runs[task, OTHER],
+        (task, "me-actor-critic@11"): {0: [99.0]},
+        (task, "me-actor-critic@13"): runs[task, OURS],
+    }
+    row = study_repeats.ratios(other, "60 s").splitlines()[2]
+    assert row.startswith(f"| {task} | me-actor-critic@13 | {OTHER} | 1.20 (apart)")
+
+
 def test_tasks_without_runs_made_again_are_left_out(
     runs: study_repeats.Runs,
 ) -> None:
