@@ -18,10 +18,10 @@ from pathlib import Path
 from statistics import fmean
 
 import numpy as np
-from study_protocols import BASELINES, OURS
+from study_protocols import OURS
 from study_report import interval
-from study_runs import TUNING_SEED, chosen, lines, numbered
-from study_scores import LEAST_SEEDS
+from study_runs import TUNING_SEED, lines
+from study_scores import compared, is_variant, main_variants
 
 Seeds = dict[int, list[float]]
 """Corrected QD scores by seed; the reported run is first."""
@@ -37,25 +37,29 @@ PICKS: dict[str, tuple[Pick, Pick]] = {
 """Which run of a seed counts, of ours and of the other."""
 
 
-def load(folder: Path, repeats: Path, stop: str) -> Runs:
+def load(folder: Path, repeats: Path, stop: str) -> tuple[Runs, set[tuple[str, str]]]:
     """Reads the runs at a stop; the seed of the tuning is left out.
+
+    Returns:
+        The runs, and task and variant of those that the report names by the algorithm.
 
     Raises:
         ValueError: No run of ``folder`` came to the stop.
     """
-    reported = [line for line in lines(folder) if line["stop"] == stop]
+    kept = [line for line in lines(folder) if int(line["seed"]) != TUNING_SEED]
+    reported = [line for line in kept if line["stop"] == stop]
     if not reported:
-        known = sorted({line["stop"] for line in lines(folder)})
+        known = sorted({line["stop"] for line in kept})
         raise ValueError(f"stop: {stop!r} has no runs in {folder}; there are {known}")
     with repeats.open(newline="", encoding="utf-8") as file:
         others = [line for line in csv.DictReader(file) if line["stop"] == stop]
     found: Runs = {}
     for line in reported + others:
-        if int(line["seed"]) < TUNING_SEED:
-            seeds = found.setdefault((line["task"], line["variant"]), {})
-            score = float(line["corrected_qd_score"])
-            seeds.setdefault(int(line["seed"]), []).append(score)
-    return found
+        seeds = found.setdefault((line["task"], line["variant"]), {})
+        score = float(line["corrected_qd_score"])
+        seeds.setdefault(int(line["seed"]), []).append(score)
+    main = main_variants(reported)
+    return found, {(task, variant) for (task, _, _), variant in main.items()}
 
 
 def again(runs: Runs) -> str:
@@ -71,7 +75,7 @@ def again(runs: Runs) -> str:
     return "\n".join(rows)
 
 
-def ratios(runs: Runs, stop: str) -> str:
+def ratios(runs: Runs, main: set[tuple[str, str]]) -> str:
     """Markdown table of our chosen variant and the best other one of each task.
 
     Tasks where neither of them was made again are left out.
@@ -79,33 +83,20 @@ def ratios(runs: Runs, stop: str) -> str:
     head = " | ".join(PICKS)
     rows = [f"| task | ours | best other | {head} |", "|---" * (3 + len(PICKS)) + "|"]
     for task in sorted({task for task, _ in runs}):
-        at = "evaluations" in stop
-        ours = [_ours(runs, algorithm, task, at) for algorithm in OURS]
-        others = [name for algorithm in BASELINES for name in numbered(algorithm, task)]
-        mine, its = (
-            {name: runs[task, name] for name in names if (task, name) in runs}
-            for names in (ours, others)
-        )
-        if not mine or not its:
+        sides: tuple[dict[str, Seeds], dict[str, Seeds]] = {}, {}
+        for (own, name), seeds in runs.items():
+            other = name.partition("@")[0] not in OURS
+            if own == task and (is_variant(name) if other else (task, name) in main):
+                sides[other][name] = seeds
+        if not all(sides):
             continue
-        own, best = (
-            max(side, key=lambda name: _middle(side[name])) for side in (mine, its)
-        )
-        made = *mine[own].values(), *its[best].values()
-        if all(len(scores) == 1 for scores in made):
+        ours, best = (max(side, key=lambda name: _middle(side[name])) for side in sides)
+        pair = sides[0][ours], sides[1][best]
+        if all(len(scores) == 1 for seeds in pair for scores in seeds.values()):
             continue
-        cells = [_compared(mine[own], its[best], *picks) for picks in PICKS.values()]
-        rows.append(f"| {task} | {own} | {best} | {' | '.join(cells)} |")
+        cells = [_compared(*pair, *picks) for picks in PICKS.values()]
+        rows.append(f"| {task} | {ours} | {best} | {' | '.join(cells)} |")
     return "\n".join(rows)
-
-
-def _ours(runs: Runs, algorithm: str, task: str, at_evaluations: bool) -> str:
-    """The chosen variant, or else the one with the most seeds, as in the report."""
-    name = chosen(algorithm, task, at_evaluations=at_evaluations)
-    if (task, name) in runs:
-        return name
-    names = numbered(algorithm, task)
-    return max(names, key=lambda name: len(runs.get((task, name), {})))
 
 
 def _middle(seeds: Seeds) -> float:
@@ -119,10 +110,8 @@ def _compared(mine: Seeds, its: Seeds, own: Pick, other: Pick) -> str:
         interval([np.array([pick(scores) for scores in seeds.values()])])
         for seeds, pick in ((mine, own), (its, other))
     )
-    apart = ours[1] > best[2] or ours[2] < best[1]
-    few = min(len(mine), len(its)) < LEAST_SEEDS
-    word = "too few seeds" if few else "apart" if apart else "overlap"
-    return f"{ours[0] / best[0]:.2f} ({word})"
+    ratio, word = compared(ours, best, min(len(mine), len(its)))
+    return f"{ratio:.2f} ({word})"
 
 
 def main() -> None:
@@ -135,10 +124,10 @@ def main() -> None:
     parser.add_argument("--stop", default="60 s", help="as in runs.csv")
     args = parser.parse_args()
     try:
-        runs = load(args.folder, args.repeats, args.stop)
+        runs, named = load(args.folder, args.repeats, args.stop)
     except (OSError, ValueError) as error:
         parser.error(str(error))
-    print(again(runs), ratios(runs, args.stop), sep="\n\n")
+    print(again(runs), ratios(runs, named), sep="\n\n")
 
 
 if __name__ == "__main__":

@@ -66,7 +66,7 @@ def load(folder: Path) -> Results:
     were algorithms of their own.
     """
     kept = [line for line in lines(folder) if int(line["seed"]) != TUNING_SEED]
-    main = _main_variants(kept)
+    main = main_variants(kept)
     found: Results = {}
     for line in kept:
         name = f"{line['task']}.{line['variant']}.{line['seed']}.npz"
@@ -78,7 +78,7 @@ def load(folder: Path) -> Results:
     return found
 
 
-def _main_variants(kept: list[dict[str, str]]) -> dict[tuple[str, str, str], str]:
+def main_variants(kept: list[dict[str, str]]) -> dict[tuple[str, str, str], str]:
     """Returns the chosen variant, by task, algorithm and stop; no ablations.
 
     A variant without a line is not chosen. Then the one with the most lines is taken.
@@ -86,7 +86,7 @@ def _main_variants(kept: list[dict[str, str]]) -> dict[tuple[str, str, str], str
     counts = Counter(
         (line["task"], line["algorithm"], line["stop"], line["variant"])
         for line in kept
-        if _numbered(line["variant"])
+        if is_variant(line["variant"])
     )
     found = {}
     # later keys replace earlier ones
@@ -98,7 +98,7 @@ def _main_variants(kept: list[dict[str, str]]) -> dict[tuple[str, str, str], str
     return found
 
 
-def _numbered(name: str) -> bool:
+def is_variant(name: str) -> bool:
     """Whether this is an algorithm or a variant of it, and no ablation."""
     return name.partition("@")[2].isdigit() or "@" not in name
 
@@ -211,6 +211,23 @@ def table(results: Results, stop: str) -> str:
     return "\n".join(rows)
 
 
+def compared(
+    ours: tuple[float, float, float], other: tuple[float, float, float], seeds: int
+) -> tuple[float, str]:
+    """Returns the ratio of two scores, and whether their intervals overlap.
+
+    Args:
+        ours: Middle, low and high of our score.
+        other: The same of another one.
+        seeds: Number of seeds of that which has fewer.
+    """
+    ratio = ours[0] / other[0] if other[0] > 0 else np.inf
+    if seeds < LEAST_SEEDS:
+        return ratio, "too few seeds"
+    apart = ours[1] > other[2] or ours[2] < other[1]
+    return ratio, "apart" if apart else "overlap"
+
+
 def verdict(results: Results, stop: str) -> str:
     """Markdown table: our best algorithm and the best other one of each task.
 
@@ -224,25 +241,21 @@ def verdict(results: Results, stop: str) -> str:
         sides: list[list[tuple[float, float, float, str, int]]] = [[], []]
         for (own, algorithm, at), runs in results.items():
             other = algorithm.split("@")[0] not in OURS
-            compared = _numbered(algorithm) if other else "@" not in algorithm
-            if (own, at) == (task, stop) and compared:
+            counts = is_variant(algorithm) if other else "@" not in algorithm
+            if (own, at) == (task, stop) and counts:
                 found = [float(run.line["corrected_qd_score"]) for run in runs]
                 scores = interval([np.asarray(found)])
                 sides[other].append((*scores, algorithm, len(runs)))
         if not all(sides):
             continue
         ours, best = (max(side) for side in sides)
-        few = min(ours[4], best[4]) < LEAST_SEEDS
-        apart = ours[1] > best[2] or ours[2] < best[1]
-        ratio = ours[0] / best[0] if best[0] > 0 else np.inf
+        seeds = min(ours[4], best[4])
+        ratio, word = compared(ours[:3], best[:3], seeds)
         cells = [f"{x[3]} {x[0]:,.0f}" for x in (ours, best)]
-        if not few:
+        if seeds >= LEAST_SEEDS:
             pairs = zip(cells, (ours, best), strict=True)
             cells = [f"{cell} ({x[1]:,.0f} to {x[2]:,.0f})" for cell, x in pairs]
-        rows.append(
-            f"| {task} | {' | '.join(cells)} | {ratio:.2f} | "
-            f"{'too few seeds' if few else 'apart' if apart else 'overlap'} |"
-        )
+        rows.append(f"| {task} | {' | '.join(cells)} | {ratio:.2f} | {word} |")
     return "\n".join(rows)
 
 

@@ -112,7 +112,7 @@ def left(out: Path, until: float = 60, **given: Any) -> list[str]:
 
 def test_without_tuning_chosen_variants_run_and_are_reported() -> None:
     reported = study_runs.lines(FOLDER / "results" / "field")
-    for (task, algorithm, stop), variant in study_scores._main_variants(
+    for (task, algorithm, stop), variant in study_scores.main_variants(
         reported
     ).items():
         if stop == "20 s":  # all runs came so far
@@ -175,7 +175,7 @@ def test_a_chosen_variant_has_the_name_where_it_came_so_far() -> None:
     main = study_runs.chosen("me", TASK)
     rows = [line("me", 0, stop) | {"variant": main} for stop in ("20 s", "60 s")]
     more = [line("me", 0, stop) | {"variant": "me@1"} for stop in ("60 s", "250 s")]
-    assert study_scores._main_variants(rows + more) == {
+    assert study_scores.main_variants(rows + more) == {
         (TASK, "me", "20 s"): main,
         (TASK, "me", "60 s"): main,
         (TASK, "me", "250 s"): "me@1",
@@ -191,7 +191,7 @@ def test_a_number_of_evaluations_can_have_another_variant() -> None:
         for stop in ("1000000 evaluations", "60 s")
         for variant in (main, other)
     ]
-    assert study_scores._main_variants(rows) == {
+    assert study_scores.main_variants(rows) == {
         (TASK, "me-actor-critic", "1000000 evaluations"): other,
         (TASK, "me-actor-critic", "60 s"): main,
     }
