@@ -228,6 +228,52 @@ def compared(
     return ratio, "apart" if apart else "overlap"
 
 
+Side = list[tuple[float, float, float, str, int]]
+"""Middle, low and high of the corrected QD score, algorithm, and number of seeds."""
+
+
+def _sides(results: Results, task: str, stop: str) -> tuple[Side, Side]:
+    """Returns our algorithms, with chosen variants, and all variants of others."""
+    sides: tuple[Side, Side] = [], []
+    for (own, algorithm, at), runs in results.items():
+        other = algorithm.split("@")[0] not in OURS
+        counts = is_variant(algorithm) if other else "@" not in algorithm
+        if (own, at) == (task, stop) and counts:
+            found = [float(run.line["corrected_qd_score"]) for run in runs]
+            scores = interval([np.asarray(found)])
+            sides[other].append((*scores, algorithm, len(runs)))
+    return sides
+
+
+def overview(results: Results) -> str:
+    """Markdown table: our ratio to the best other algorithm, by task and stop.
+
+    Those with enough seeds count first. Bold: the intervals do not overlap.
+    """
+    stops = sorted({key[2] for key in results}, key=lambda stop: (len(stop), stop))
+    rows = [f"| task | {' | '.join(stops)} |", "|---" * (1 + len(stops)) + "|"]
+    for task in sorted({key[0] for key in results}):
+        cells = []
+        for stop in stops:
+            sides = _sides(results, task, stop)
+            if not all(sides):
+                cells.append("-")
+                continue
+            ours, best = (max(_enough(side)) for side in sides)
+            seeds = min(ours[4], best[4])
+            ratio, word = compared(ours[:3], best[:3], seeds)
+            mark = "**" if word == "apart" else ""
+            few = f" ({seeds} of {LEAST_SEEDS} seeds)" if seeds < LEAST_SEEDS else ""
+            cells.append(f"{mark}{ratio:.2f}{mark}{few}")
+        rows.append(f"| {task} | {' | '.join(cells)} |")
+    return "\n".join(rows)
+
+
+def _enough(side: Side) -> Side:
+    """Those with enough seeds, or all if none has."""
+    return [one for one in side if one[4] >= LEAST_SEEDS] or side
+
+
 def verdict(results: Results, stop: str) -> str:
     """Markdown table: our best algorithm and the best other one of each task.
 
@@ -238,14 +284,7 @@ def verdict(results: Results, stop: str) -> str:
         "|---|---|---|---|---|",
     ]
     for task in sorted({key[0] for key in results}):
-        sides: list[list[tuple[float, float, float, str, int]]] = [[], []]
-        for (own, algorithm, at), runs in results.items():
-            other = algorithm.split("@")[0] not in OURS
-            counts = is_variant(algorithm) if other else "@" not in algorithm
-            if (own, at) == (task, stop) and counts:
-                found = [float(run.line["corrected_qd_score"]) for run in runs]
-                scores = interval([np.asarray(found)])
-                sides[other].append((*scores, algorithm, len(runs)))
+        sides = _sides(results, task, stop)
         if not all(sides):
             continue
         ours, best = (max(side) for side in sides)
@@ -322,11 +361,10 @@ def figure(results: Results, stop: str, path: Path) -> None:
 
 def report(results: Results) -> str:
     """Returns all tables."""
-    parts = []
+    parts = ["## Overview", overview(results)]
     for stop in dict.fromkeys(key[2] for key in sorted(results, key=lambda k: k[2])):
         parts += [f"## At {stop}", verdict(results, stop), table(results, stop)]
-    ratios = published(results)
-    if ratios:
+    if ratios := published(results):
         parts += ["## Ratios to MAP-Elites", ratios]
     return "\n\n".join(parts) + "\n"
 

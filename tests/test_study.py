@@ -211,6 +211,26 @@ def test_the_best_variant_of_others_is_compared() -> None:
     assert rows == [f"| {TASK} | me-actor-critic 4 | me@1 3 | 1.33 | too few seeds |"]
 
 
+def test_the_overview_prefers_enough_seeds() -> None:
+    def runs(algorithm: str, score: float, seeds: int) -> list[study_scores.Scored]:
+        row = line(algorithm, 0, "20 s", corrected_qd_score=score)
+        return [study_scores.Scored(0, row, np.empty(0), np.empty(0))] * seeds
+
+    ours = runs("me-actor-critic", 4.0, 3)
+    results = {
+        (TASK, "me-actor-critic", "20 s"): ours,
+        (TASK, "me", "20 s"): runs("me", 2.0, 3),
+        (TASK, "me@1", "20 s"): runs("me", 3.0, 1),
+        (TASK, "me-actor-critic", "60 s"): ours,
+        (TASK, "me@1", "60 s"): runs("me", 3.0, 1),
+        (TASK, "me", "250 s"): runs("me", 2.0, 3),
+    }
+    assert study_scores.overview(results).splitlines()[::2] == [
+        "| task | 20 s | 60 s | 250 s |",
+        f"| {TASK} | **2.00** | 1.33 (1 of 3 seeds) | - |",
+    ]
+
+
 def test_published_ratios_are_of_single_evaluations() -> None:
     stop = "1000000 evaluations"
     results = {}
