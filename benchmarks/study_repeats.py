@@ -1,9 +1,10 @@
 """How much equal runs of the study differ, and what other ones of them would say.
 
-A run that was made more than once is reported once. The first table has all runs with
-the same settings and seed at a stop. The second one has the ratio of our chosen variant
-to the best other one with the reported runs, with the least favourable ones (the lowest
-of ours and the highest of the other, for each seed), and with the means of all:
+A run that was made more than once is reported once. The first table says how much runs
+with the same settings and seed differ at a stop. The second one has the ratio of our
+chosen variant to the best other one with the reported runs, with the least favourable
+ones (the lowest of ours and the highest of the other, for each seed), and with the
+means of all:
 
     python benchmarks/study_repeats.py benchmarks/results/field \
         benchmarks/results/field_repeats.csv --stop "60 s"
@@ -27,6 +28,9 @@ Seeds = dict[int, list[float]]
 """Corrected QD scores by seed; the reported run is first."""
 Runs = dict[tuple[str, str], Seeds]
 """By task and variant."""
+
+CLOSE = 1.15
+"""Ratio of the highest to the lowest of equal runs below which they hardly differ."""
 
 Pick = Callable[[list[float]], float]
 PICKS: dict[str, tuple[Pick, Pick]] = {
@@ -63,16 +67,23 @@ def load(folder: Path, repeats: Path, stop: str) -> tuple[Runs, set[tuple[str, s
 
 
 def again(runs: Runs) -> str:
-    """Markdown table of the runs that were made more than once."""
-    rows = ["| task, variant and seed | reported | other runs |", "|---|---|---|"]
+    """Sentence and Markdown table about the seeds that were run more than once."""
+    rows = [
+        "| task | variant | runs of each seed | highest to lowest |",
+        "|---|---|---|---|",
+    ]
+    every: list[float] = []
     for (task, variant), seeds in sorted(runs.items()):
-        for seed, (first, *others) in sorted(seeds.items()):
-            if others:
-                rest = ", ".join(f"{score:,.0f}" for score in others)
-                rows.append(
-                    f"| `{task}`, `{variant}`, {seed} | {first:,.0f} | {rest} |"
-                )
-    return "\n".join(rows)
+        equal = [scores for _, scores in sorted(seeds.items()) if len(scores) > 1]
+        if equal:
+            spread = [max(scores) / min(scores) for scores in equal]
+            every += spread
+            counts = ", ".join(str(len(scores)) for scores in equal)
+            ratio = ", ".join(f"{ratio:.2f}" for ratio in spread)
+            rows.append(f"| {task} | {variant} | {counts} | {ratio} |")
+    close = sum(ratio < CLOSE for ratio in every)
+    first = f"Of {len(every)} groups of equal runs, {close} differ by less than"
+    return "\n".join([f"{first} {100 * (CLOSE - 1):.0f} %.", "", *rows])
 
 
 def ratios(runs: Runs, main: set[tuple[str, str]]) -> str:
