@@ -21,8 +21,8 @@ from statistics import fmean
 import numpy as np
 from study_protocols import OURS
 from study_report import interval
+from study_results import compared, is_variant, main_variants
 from study_runs import TUNING_SEED, lines
-from study_scores import compared, is_variant, main_variants
 
 Seeds = dict[int, list[float]]
 """Corrected QD scores by seed; the reported run is first."""

@@ -17,6 +17,7 @@ sys.path.insert(0, str(FOLDER))
 
 import study  # noqa: E402
 import study_regions  # noqa: E402
+import study_results  # noqa: E402
 import study_runs  # noqa: E402
 import study_scores  # noqa: E402
 from study_protocols import BASELINES, FIELD, HUMANOIDS, PROTOCOLS, SMALL, Stop  # noqa: E402
@@ -112,7 +113,7 @@ def left(out: Path, until: float = 60, **given: Any) -> list[str]:
 
 def test_without_tuning_chosen_variants_run_and_are_reported() -> None:
     reported = study_runs.lines(FOLDER / "results" / "field")
-    for (task, algorithm, stop), variant in study_scores.main_variants(
+    for (task, algorithm, stop), variant in study_results.main_variants(
         reported
     ).items():
         if stop == "20 s":  # all runs came so far
@@ -158,7 +159,7 @@ def names(folder: Path, runs: tuple[tuple[str, int], ...]) -> dict[str, list[int
         np.savez(folder / "cells" / f"{TASK}.{variant}.{seed}.npz", **cells)
         row = line("me", seed, "20 s") | {"variant": variant}
         study_runs.add_line(folder / "runs.csv", row)
-    found = study_scores.load(folder)
+    found = study_results.load(folder)
     return {key[1]: [run.seed for run in runs] for key, runs in found.items()}
 
 
@@ -175,7 +176,7 @@ def test_a_chosen_variant_has_the_name_where_it_came_so_far() -> None:
     main = study_runs.chosen("me", TASK)
     rows = [line("me", 0, stop) | {"variant": main} for stop in ("20 s", "60 s")]
     more = [line("me", 0, stop) | {"variant": "me@1"} for stop in ("60 s", "250 s")]
-    assert study_scores.main_variants(rows + more) == {
+    assert study_results.main_variants(rows + more) == {
         (TASK, "me", "20 s"): main,
         (TASK, "me", "60 s"): main,
         (TASK, "me", "250 s"): "me@1",
@@ -191,7 +192,7 @@ def test_a_number_of_evaluations_can_have_another_variant() -> None:
         for stop in ("1000000 evaluations", "60 s")
         for variant in (main, other)
     ]
-    assert study_scores.main_variants(rows) == {
+    assert study_results.main_variants(rows) == {
         (TASK, "me-actor-critic", "1000000 evaluations"): other,
         (TASK, "me-actor-critic", "60 s"): main,
     }
@@ -206,15 +207,15 @@ def test_the_best_variant_of_others_is_compared() -> None:
     for name, score in {**scores, "me-actor-critic@4": 9.0}.items():
         row = line(name.split("@")[0], 0, "20 s", corrected_qd_score=score)
         archive = np.full(CELLS, score)
-        results[TASK, name, "20 s"] = [study_scores.Scored(0, row, archive, archive)]
+        results[TASK, name, "20 s"] = [study_results.Scored(0, row, archive, archive)]
     rows = study_scores.verdict(results, "20 s").splitlines()[2:]
     assert rows == [f"| {TASK} | me-actor-critic 4 | me@1 3 | 1.33 | too few seeds |"]
 
 
 def test_the_overview_prefers_enough_seeds() -> None:
-    def runs(algorithm: str, score: float, seeds: int) -> list[study_scores.Scored]:
+    def runs(algorithm: str, score: float, seeds: int) -> list[study_results.Scored]:
         row = line(algorithm, 0, "20 s", corrected_qd_score=score)
-        return [study_scores.Scored(0, row, np.empty(0), np.empty(0))] * seeds
+        return [study_results.Scored(0, row, np.empty(0), np.empty(0))] * seeds
 
     ours = runs("me-actor-critic", 4.0, 3)
     results = {
@@ -241,7 +242,7 @@ def test_published_ratios_are_of_single_evaluations() -> None:
     ):
         row = line(variant.split("@")[0], 0, stop) | {"variant": variant}
         raw = np.array([value, value, -np.inf])
-        results[TASK, name, stop] = [study_scores.Scored(0, row, raw, raw)]
+        results[TASK, name, stop] = [study_results.Scored(0, row, raw, raw)]
     rows = study_scores.published(results).splitlines()[2:]
     assert rows == [
         f"| {TASK} | me | 1.00 | 1.00 |",
@@ -250,19 +251,19 @@ def test_published_ratios_are_of_single_evaluations() -> None:
 
 
 def test_the_best_known_fitness_only_rises(tmp_path: Path, monkeypatch: Any) -> None:
-    monkeypatch.setattr(study_scores, "BEST_KNOWN", tmp_path / "best_known.csv")
+    monkeypatch.setattr(study_results, "BEST_KNOWN", tmp_path / "best_known.csv")
     for best in (4.0, 2.0):
         add(tmp_path, "me", 0, "20 s", [best] * CELLS)
-        study_scores.note_best(study_scores.load(tmp_path))
+        study_results.note_best(study_results.load(tmp_path))
         # the elites lose 1 when they are evaluated again
-        assert study_scores.best_known() == {TASK: 3.0}
+        assert study_results.best_known() == {TASK: 3.0}
         (tmp_path / "runs.csv").unlink()
 
 
 def test_the_report_compares_corrected_archives(
     tmp_path: Path, monkeypatch: Any
 ) -> None:
-    monkeypatch.setattr(study_scores, "BEST_KNOWN", tmp_path / "best_known.csv")
+    monkeypatch.setattr(study_results, "BEST_KNOWN", tmp_path / "best_known.csv")
     empty, stop = -np.inf, "20 s"
     me = [4.0, empty, 6.0, empty, 3.0, 2.0, empty, empty]
     ours = [9.0, 5.0, 11.0, empty, empty, empty, empty, empty]
@@ -270,13 +271,13 @@ def test_the_report_compares_corrected_archives(
         add(tmp_path, "me", seed, stop, me)
         add(tmp_path, "me-conditioned", seed, stop, ours)
     add(tmp_path, "me", study_runs.TUNING_SEED, stop, ours)
-    results = study_scores.load(tmp_path)
+    results = study_results.load(tmp_path)
     # untrained: 2; best known: 11 - 1 after another evaluation
-    assert study_scores.references(results) == {TASK: (2.0, 10.0)}
-    shared = study_scores.common(results, TASK, stop)
+    assert study_results.references(results) == {TASK: (2.0, 10.0)}
+    shared = study_results.common(results, TASK, stop)
     assert shared == {"me": [4.0] * 3, "me-conditioned": [9.0] * 3}
     scores = {
-        key[1]: study_scores.normalized(runs[0], (2.0, 10.0))
+        key[1]: study_results.normalized(runs[0], (2.0, 10.0))
         for key, runs in results.items()
     }
     assert scores["me"] == pytest.approx((1 + 3) / 8 / CELLS)
