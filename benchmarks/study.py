@@ -83,6 +83,12 @@ def arguments() -> argparse.Namespace:
         help="field, small: runs share a GPU; their clock is the number of "
         "generations times the time of a generation alone",
     )
+    parser.add_argument(
+        "--no-states",
+        action="store_true",
+        help="field, small: save no states, which takes time if they are large; who "
+        "continues a run begins it again",
+    )
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     parser.add_argument("--gpus", type=int, default=1)
@@ -192,7 +198,11 @@ def one(args: argparse.Namespace, begin: float) -> None:
         study_runs.Run(task, variant, int(seed)),
         Path(out),
         study_execution.Limits(
-            args.until, args.reach_evaluations, begin + args.stop_after, args.paced
+            args.until,
+            args.reach_evaluations,
+            begin + args.stop_after,
+            args.paced,
+            not args.no_states,
         ),
         args.device,
     )
@@ -223,6 +233,7 @@ def main() -> None:
             more += ["--stop-after", str(args.stop_after - spent)]
             more += ["--reach-evaluations"] * args.reach_evaluations
             more += ["--paced"] * args.paced
+            more += ["--no-states"] * args.no_states
         pool.start(slot, *more, "--run", *what)
     pool.drain()
 

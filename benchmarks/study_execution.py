@@ -37,12 +37,15 @@ class Limits:
         reach: Whether it goes on after that until it has its number of evaluations.
         deadline: ``time.monotonic()`` after which the run saves its state and ends.
         paced: Whether runs share a GPU, with generations as their clock.
+        states: Whether the state is saved. DCRL-ME has gigabytes of it, and a GPU that
+            is lent is idle meanwhile.
     """
 
     until: float
     reach: bool = False
     deadline: float = math.inf
     paced: bool = False
+    states: bool = True
 
 
 class Progress:
@@ -211,6 +214,7 @@ def _to_the_end(
 ) -> bool:
     """Advances a run past its stops that are not done, and writes a line at each."""
     wall = clock != "processor"
+    save = here.save if limits.states else lambda: None
     left = [stop for stop in here.stops if str(stop) not in done]
     saved = here.seconds(wall)
     while left:
@@ -221,12 +225,12 @@ def _to_the_end(
         for stop in [x for x in left if x.reached(evaluations, seconds)]:
             left.remove(stop)
             _write(protocol, here, stop, clock, out)
-            here.save()
+            save()
         if time.monotonic() > limits.deadline and left:
-            here.save()
+            save()
             return False
         if seconds - saved > _SAVED_EVERY:
-            here.save()
+            save()
             saved = seconds
         late = seconds > limits.until and not any(x.unit == "s" for x in left)
         if late and not limits.reach:

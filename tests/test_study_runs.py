@@ -132,6 +132,19 @@ def test_a_run_can_go_on_to_its_evaluations(
     assert run.seconds(False) == (5.0 if reach else 3.0)
 
 
+@pytest.mark.parametrize("states", [False, True])
+def test_a_run_need_not_save_its_state(
+    tmp_path: Path, monkeypatch: Any, states: bool
+) -> None:
+    saved = []
+    monkeypatch.setattr(study_execution, "_write", lambda *_: None)
+    monkeypatch.setattr(Clockwork, "save", lambda _: saved.append(1))
+    run: Any = Clockwork()
+    limits = study_execution.Limits(2.0, states=states)
+    study_execution._to_the_end(PROTOCOL, run, set(), tmp_path, limits, "processor")
+    assert bool(saved) == states
+
+
 @pytest.mark.slow
 def test_a_paced_run_counts_its_generations(tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.setattr(study_execution, "variants", lambda: SETTINGS)
