@@ -14,6 +14,8 @@ from collections import Counter
 from pathlib import Path
 
 import numpy as np
+from study_protocols import OURS
+from study_report import interval
 from study_runs import TUNING_SEED, chosen, lines
 
 from newton_qd.qd.run import quality
@@ -167,3 +169,40 @@ def compared(
         return ratio, "too few seeds"
     apart = ours[1] > other[2] or ours[2] < other[1]
     return ratio, "apart" if apart else "overlap"
+
+
+Side = list[tuple[float, float, float, str, int]]
+"""Middle, low and high of the corrected QD score, algorithm, and number of seeds."""
+
+
+def sides_of(results: Results, task: str, stop: str) -> tuple[Side, Side]:
+    """Returns our algorithms, with chosen variants, and all variants of others."""
+    sides: tuple[Side, Side] = [], []
+    for (own, algorithm, at), runs in results.items():
+        other = algorithm.split("@")[0] not in OURS
+        counts = is_variant(algorithm) if other else "@" not in algorithm
+        if (own, at) == (task, stop) and counts:
+            found = [float(run.line["corrected_qd_score"]) for run in runs]
+            scores = interval([np.asarray(found)])
+            sides[other].append((*scores, algorithm, len(runs)))
+    return sides
+
+
+def to_best_other(results: Results, task: str, stop: str) -> tuple | None:
+    """Compares our best algorithm with the best other one; enough seeds count first.
+
+    Returns:
+        Their ratio, whether their intervals overlap, and the number of seeds of that
+        which has fewer; or None if one side has no run.
+    """
+    sides = sides_of(results, task, stop)
+    if not all(sides):
+        return None
+    ours, best = (max(_enough(side)) for side in sides)
+    seeds = min(ours[4], best[4])
+    return *compared(ours[:3], best[:3], seeds), seeds
+
+
+def _enough(side: Side) -> Side:
+    """Those with enough seeds, or all if none has."""
+    return [one for one in side if one[4] >= LEAST_SEEDS] or side

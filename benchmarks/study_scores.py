@@ -13,8 +13,8 @@ import itertools
 from pathlib import Path
 
 import numpy as np
-from study_figure import figure
-from study_protocols import OURS, PROTOCOLS
+from study_figure import distribution, ratios
+from study_protocols import PROTOCOLS
 from study_report import interval
 from study_results import (
     LEAST_SEEDS,
@@ -22,11 +22,12 @@ from study_results import (
     Scored,
     common,
     compared,
-    is_variant,
     load,
     normalized,
     note_best,
     references,
+    sides_of,
+    to_best_other,
 )
 
 PUBLISHED = {
@@ -83,23 +84,6 @@ def table(results: Results, stop: str) -> str:
     return "\n".join(rows)
 
 
-Side = list[tuple[float, float, float, str, int]]
-"""Middle, low and high of the corrected QD score, algorithm, and number of seeds."""
-
-
-def _sides(results: Results, task: str, stop: str) -> tuple[Side, Side]:
-    """Returns our algorithms, with chosen variants, and all variants of others."""
-    sides: tuple[Side, Side] = [], []
-    for (own, algorithm, at), runs in results.items():
-        other = algorithm.split("@")[0] not in OURS
-        counts = is_variant(algorithm) if other else "@" not in algorithm
-        if (own, at) == (task, stop) and counts:
-            found = [float(run.line["corrected_qd_score"]) for run in runs]
-            scores = interval([np.asarray(found)])
-            sides[other].append((*scores, algorithm, len(runs)))
-    return sides
-
-
 def overview(results: Results) -> str:
     """Markdown table: our ratio to the best other algorithm, by task and stop.
 
@@ -110,23 +94,16 @@ def overview(results: Results) -> str:
     for task in sorted({key[0] for key in results}):
         cells = []
         for stop in stops:
-            sides = _sides(results, task, stop)
-            if not all(sides):
+            found = to_best_other(results, task, stop)
+            if found is None:
                 cells.append("-")
                 continue
-            ours, best = (max(_enough(side)) for side in sides)
-            seeds = min(ours[4], best[4])
-            ratio, word = compared(ours[:3], best[:3], seeds)
+            ratio, word, seeds = found
             mark = "**" if word == "apart" else ""
             few = f" ({seeds} of {LEAST_SEEDS} seeds)" if seeds < LEAST_SEEDS else ""
             cells.append(f"{mark}{ratio:.2f}{mark}{few}")
         rows.append(f"| {task} | {' | '.join(cells)} |")
     return "\n".join(rows)
-
-
-def _enough(side: Side) -> Side:
-    """Those with enough seeds, or all if none has."""
-    return [one for one in side if one[4] >= LEAST_SEEDS] or side
 
 
 def verdict(results: Results, stop: str) -> str:
@@ -139,7 +116,7 @@ def verdict(results: Results, stop: str) -> str:
         "|---|---|---|---|---|",
     ]
     for task in sorted({key[0] for key in results}):
-        sides = _sides(results, task, stop)
+        sides = sides_of(results, task, stop)
         if not all(sides):
             continue
         ours, best = (max(side) for side in sides)
@@ -180,8 +157,8 @@ def report(results: Results) -> str:
     parts = ["## Overview", overview(results)]
     for stop in dict.fromkeys(key[2] for key in sorted(results, key=lambda k: k[2])):
         parts += [f"## At {stop}", verdict(results, stop), table(results, stop)]
-    if ratios := published(results):
-        parts += ["## Ratios to MAP-Elites", ratios]
+    if found := published(results):
+        parts += ["## Ratios to MAP-Elites", found]
     return "\n\n".join(parts) + "\n"
 
 
@@ -205,7 +182,9 @@ def main() -> None:
     if args.figures:
         for stop in stops:
             name = f"study_ccdf_{stop.replace(' ', '_')}.png"
-            figure(results, stop, args.figures / name)
+            distribution(results, stop, args.figures / name)
+        timed = sorted((s for s in stops if s.endswith(" s")), key=len)
+        ratios(results, timed, args.figures / "study_ratios.png")
     content = report(results)
     if args.out:
         args.out.write_text(content, encoding="utf-8")

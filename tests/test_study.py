@@ -16,11 +16,12 @@ FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
 sys.path.insert(0, str(FOLDER))
 
 import study  # noqa: E402
+import study_figure  # noqa: E402
 import study_regions  # noqa: E402
 import study_results  # noqa: E402
 import study_runs  # noqa: E402
 import study_scores  # noqa: E402
-from study_protocols import BASELINES, FIELD, HUMANOIDS, PROTOCOLS, SMALL, Stop  # noqa: E402
+from study_protocols import BASELINES, FIELD, HUMANOIDS, OURS, PROTOCOLS, SMALL, Stop  # noqa: E402
 from study_report import interval  # noqa: E402
 
 TASK, CELLS = "hopper_uni", 8
@@ -66,7 +67,7 @@ def test_every_variant_is_a_setting(protocol: Any) -> None:
 
 @pytest.mark.parametrize("task", FIELD.tasks)
 def test_baselines_get_as_many_variants(task: str) -> None:
-    ours = [len(study_runs.numbered(name, task)) for name in study_scores.OURS]
+    ours = [len(study_runs.numbered(name, task)) for name in OURS]
     others = [len(study_runs.numbered(name, task)) for name in BASELINES]
     assert 1 <= min(ours) and max(ours) <= min(others)
 
@@ -287,6 +288,9 @@ def test_the_report_compares_corrected_archives(
     assert "| 1.02 | apart |" in content
     assert "| hopper_uni | me | 3 | 51 (51 to 51) | 0.0625 (0.0625 to" in content
     assert interval([np.array([1.0, 1.0])]) == (1.0, 1.0, 1.0)
+    study_figure.ratios(results, [stop], tmp_path / "figures" / "ratios.png")
+    study_figure.distribution(results, stop, tmp_path / "figures" / "ccdf.png")
+    assert len(list((tmp_path / "figures").iterdir())) == 2
 
 
 @pytest.mark.parametrize(
