@@ -211,7 +211,9 @@ def memory(name: str, worlds: int, count: int) -> bool:
 
 def main() -> int:
     """Measures, and returns the exit code."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("what", choices=("speed", "memory"))
     parser.add_argument("--env", default="ant_uni")
     parser.add_argument("--worlds", type=int, help="default: 1024 or 4")

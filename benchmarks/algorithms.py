@@ -38,7 +38,9 @@ def generation_times(config: EvolveConfig, generations: int) -> np.ndarray:
 
 def main() -> None:
     """Prints the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--env", default="ant_uni")
     parser.add_argument("--algorithm", action="append", help="default: all")
     parser.add_argument("--generations", type=int, default=3)

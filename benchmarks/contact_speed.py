@@ -147,7 +147,9 @@ def compare(
 
 def main() -> None:
     """Prints a table, and writes it as csv if asked."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("base", type=Path, help="checkout to compare with")
     parser.add_argument("--robots", nargs="+")
     parser.add_argument("--kinds", nargs="+", default=list(STEPS))

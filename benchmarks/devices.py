@@ -121,7 +121,9 @@ def compare(
 
 def main() -> int:
     """Compares, and returns the exit code."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--env", default="ant_uni")
     parser.add_argument("--batch-size", type=int, default=8192)
     parser.add_argument("--episode-length", type=int, default=100)

@@ -41,7 +41,9 @@ def row(name: str) -> str:
 
 def main() -> None:
     """Prints the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--envs", nargs="+", default=newton_qd.registered_envs())
     print(
         f"| environment | duration of {HORIZONS[-1]} steps [s] | alive "

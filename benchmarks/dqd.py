@@ -326,7 +326,9 @@ def spread(values: list[float]) -> str:
 
 def main() -> None:
     """Runs what is missing and prints the table of everything in the file."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--out", type=Path, default=Path("dqd.csv"))
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--first-seed", type=int, default=0, help="of those seeds")

@@ -95,7 +95,9 @@ def measure(config: EvolveConfig, repetitions: int) -> dict[str, np.ndarray]:
 
 def main() -> None:
     """Prints one line for each part."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--env", default="ant_uni")
     parser.add_argument("--algorithm", default="me")
     parser.add_argument("--batch-size", type=int, default=256)

@@ -283,7 +283,9 @@ def plot(points: Sequence[Point], path: Path) -> None:
 
 def main() -> None:
     """Compares, screens or draws."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--problems", nargs="+", default=list(PROBLEMS))
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--first-seed", type=int, help="of those seeds")

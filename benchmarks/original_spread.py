@@ -59,7 +59,9 @@ def last_descriptors(env: Any, worlds: int, steps: int) -> tuple[np.ndarray, ...
 
 def main() -> None:
     """Prints coverage and quantiles."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--names", nargs="+", default=["humanoid_omni"])
     parser.add_argument("--worlds", type=int, default=500)
     parser.add_argument("--steps", type=int, default=100)

@@ -51,7 +51,9 @@ def measured(config: EvolveConfig) -> list[float]:
 
 def main() -> None:
     """Prints the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--env", default="ant_uni")
     parser.add_argument("--generations", type=int, default=400)
     parser.add_argument("--seeds", type=int, default=2)

@@ -86,7 +86,9 @@ def measured(search: Search, generations: int, own: int) -> tuple[Share, Share]:
 
 def main() -> None:
     """Prints the table of one run."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("env_name")
     parser.add_argument("variant", help="a key of study/field.toml")
     parser.add_argument("--generations", type=int, default=100)

@@ -283,7 +283,9 @@ RUNS |= {"kills": (kills, 50), "full-disk": (full_disk, 10)}
 
 def main() -> int:
     """Runs one of the four, and returns the exit code."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("run", choices=list(RUNS))
     parser.add_argument("--count", type=int, help="default: 200000, 5000, 50 or 10")
     options = parser.parse_args()

@@ -44,7 +44,9 @@ def torso(env: Any, seconds: float) -> np.ndarray:
 
 def main() -> None:
     """Prints one row a robot and factor."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--robots", nargs="+", default=["ant", "halfcheetah", "hopper"])
     names = parser.parse_args().robots
     print(

@@ -52,7 +52,9 @@ from study_protocols import FIELD, PROTOCOLS
 
 def arguments() -> argparse.Namespace:
     """Reads the command line."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--protocol", choices=("core", *PROTOCOLS), default="core")
     parser.add_argument("--out", type=Path, default=Path("runs"))
     parser.add_argument("--tasks", nargs="*", help="default: all of the protocol")
@@ -60,35 +62,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument(
         "--seeds", type=int, help="at most so many; default: 5, or as the protocol says"
     )
-    parser.add_argument(
-        "--variants", nargs="*", help="field, small: run these, as for ablations"
-    )
-    parser.add_argument(
-        "--until", type=float, help="field, small: longest time of a run [s]"
-    )
-    parser.add_argument(
-        "--reach-evaluations",
-        action="store_true",
-        help="field, small: go on after --until to the number of evaluations",
-    )
-    parser.add_argument(
-        "--stop-after",
-        type=float,
-        default=math.inf,
-        help="field, small: stop all runs so many seconds after the command",
-    )
-    parser.add_argument(
-        "--paced",
-        action="store_true",
-        help="field, small: runs share a GPU; their clock is the number of "
-        "generations times the time of a generation alone",
-    )
-    parser.add_argument(
-        "--no-states",
-        action="store_true",
-        help="field, small: save no states, which takes time if they are large; who "
-        "continues a run begins it again",
-    )
+    _add_field_arguments(parser)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     parser.add_argument("--gpus", type=int, default=1)
@@ -111,6 +85,35 @@ def arguments() -> argparse.Namespace:
         help="carry out one run in this process, into this folder",
     )
     return checked(parser, parser.parse_args())
+
+
+def _add_field_arguments(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("of the protocols field and small")
+    group.add_argument("--variants", nargs="*", help="run these, as for ablations")
+    group.add_argument("--until", type=float, help="longest time of a run [s]")
+    group.add_argument(
+        "--reach-evaluations",
+        action="store_true",
+        help="go on after --until to the number of evaluations",
+    )
+    group.add_argument(
+        "--stop-after",
+        type=float,
+        default=math.inf,
+        help="stop all runs so many seconds after the command",
+    )
+    group.add_argument(
+        "--paced",
+        action="store_true",
+        help="runs share a GPU; their clock is the number of "
+        "generations times the time of a generation alone",
+    )
+    group.add_argument(
+        "--no-states",
+        action="store_true",
+        help="save no states, which takes time if they are large; who "
+        "continues a run begins it again",
+    )
 
 
 def checked(

@@ -216,7 +216,9 @@ def _band(
 
 def main() -> None:
     """Writes everything and prints the tables."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("runs", type=Path)
     parser.add_argument("--out", type=Path)
     parser.add_argument("--figures", type=Path)

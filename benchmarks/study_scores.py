@@ -164,7 +164,9 @@ def report(results: Results) -> str:
 
 def main() -> None:
     """Prints the tables, and writes them and the figures."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("runs", type=Path)
     parser.add_argument("--out", type=Path, help="Markdown file of the tables")
     parser.add_argument("--figures", type=Path)

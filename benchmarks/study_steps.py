@@ -79,7 +79,9 @@ def seconds(function: Callable[..., Any], *values: Any) -> float:
 
 def arguments() -> argparse.Namespace:
     """Reads the command line."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("task")
     parser.add_argument("--steps", type=int, default=100)
     parser.add_argument("--flows", nargs="*", default=["0,10,1"])

@@ -154,7 +154,9 @@ def survey(name: str) -> str:
 
 def main() -> None:
     """Writes the page."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--out", type=Path)
     parser.add_argument(
         "--names", nargs="+", default=list(newton_qd.tables.reward_offset)

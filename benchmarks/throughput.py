@@ -190,7 +190,9 @@ def lanes(name: str, options: argparse.Namespace) -> None:
 
 def main() -> None:
     """Print a table of speeds."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--env", default="ant_uni")
     parser.add_argument("--batches", type=int, nargs="+", default=[128, 1024])
     parser.add_argument("--steps", type=int, default=100)
