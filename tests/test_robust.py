@@ -84,6 +84,8 @@ def test_results_are_joined(
     steps = extra["transitions"]["obs"]
     assert steps.shape == (3, 2 * starts, 3)
     second = each[1][2]["transitions"]["obs"]
+    own = np.stack([d[:2] for _, d, _ in each], axis=1)
+    assert np.allclose(extra["episode_descriptors"][:2], own, atol=1e-6)
     # compiled, some processors round differently; other starts are far away
     assert np.allclose(steps[:, 2:4], second, atol=1e-6)
     assert not np.allclose(steps[:, :2], second, atol=1e-2)

@@ -71,10 +71,10 @@ def _make(context: EmitterContext, options: DCRLMEOptions) -> Any:
     from qdax.core.neuroevolution.buffers.buffer import DCRLTransition
     from qdax.core.neuroevolution.networks.networks import MLPDC
 
+    from newton_qd.qd.algorithms.each_episode import EachEpisode
     from newton_qd.qd.algorithms.network_emitter import OfParameters
 
     config, task = context.config, context.task
-    settings = {**dataclasses.asdict(options), **options.shares(config)}
     actor = MLPDC(
         layer_sizes=(*config.hidden, task.env.action_size),
         kernel_init=jax.nn.initializers.lecun_uniform(),
@@ -91,13 +91,20 @@ def _make(context: EmitterContext, options: DCRLMEOptions) -> Any:
             **{**steps, "rewards": rewards}, desc=unknown, desc_prime=unknown
         )
 
-    emitter = DCRLMEEmitter(
-        DCRLMEConfig(**settings),
-        context.policy.network,
-        actor,
-        task.env,
-        isoline(config),
-    )
+    def made(times: int) -> Any:
+        """Returns the emitter for generations so many times as large."""
+        shares = {name: times * size for name, size in options.shares(config).items()}
+        return DCRLMEEmitter(
+            DCRLMEConfig(**{**dataclasses.asdict(options), **shares}),
+            context.policy.network,
+            actor,
+            task.env,
+            isoline(config),
+        )
+
+    emitter: Any = made(1)
+    if config.starts > 1:
+        emitter = EachEpisode(emitter, made(config.starts), config.starts)
     return OfParameters(emitter, context.policy, convert)
 
 

@@ -45,9 +45,11 @@ def robust_scoring(
     Returns:
         Function with the arguments and results of ``score``. The fitness is ``-inf`` if
         that of any start is. Gradients are those of these fitnesses and descriptors.
-        Transitions of all starts follow each other, (N, starts T, ...). With
-        ``scatter``, the dictionary has the fitness without its price, ``unscattered``
-        (N,). The function raises ``ValueError`` for other entries of the dictionary.
+        Transitions of all starts follow each other, (N, starts T, ...), and beside them
+        are the descriptors of their episodes, ``episode_descriptors`` (N, starts, D).
+        With ``scatter``, the dictionary has the fitness without its price,
+        ``unscattered`` (N,). The function raises ``ValueError`` for other entries of
+        the dictionary.
 
     Raises:
         TypeError: ``score`` is not a function, or ``scatter`` is no ``Scatter``.
@@ -72,13 +74,16 @@ def robust_scoring(
         rows = jnp.where(bad[..., None], jnp.zeros_like(rows), rows)
         weights = _weights(rows, statistic)
         mixed = _weighted(weights, rows)
-        plain = jnp.where(bad, -jnp.inf, mixed[:, 0])
-        if scatter is None:
-            return plain, mixed[:, 1:], _joined(extra, weights, None)
-        fitness, slopes = _scattered(scatter, rows, weights)
-        fitness = jnp.where(bad, -jnp.inf, fitness)
-        joined = _joined(extra, weights, slopes) | {"unscattered": plain}
-        return fitness, mixed[:, 1:], joined
+        fitness = plain = jnp.where(bad, -jnp.inf, mixed[:, 0])
+        beside: ExtraScores = {}
+        slopes = None
+        if "transitions" in extra:
+            beside["episode_descriptors"] = jnp.moveaxis(rows[..., 1:], 0, 1)
+        if scatter is not None:
+            fitness, slopes = _scattered(scatter, rows, weights)
+            fitness = jnp.where(bad, -jnp.inf, fitness)
+            beside["unscattered"] = plain
+        return fitness, mixed[:, 1:], _joined(extra, weights, slopes) | beside
 
     return scored
 
