@@ -67,9 +67,9 @@ def shared(out: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def alone(out: Path) -> Iterator[None]:
-    """Waits until no other run uses the GPU and the cores of the machine.
+    """Waits until no other run uses the GPU.
 
-    Runs that ask for the GPU later wait, so its turn comes.
+    Runs that ask for the GPU later wait, so its turn comes. Those on other GPUs go on.
     """
     with _held(out, "turn", fcntl.LOCK_EX), _held(out, "lock", fcntl.LOCK_EX):
         yield

@@ -217,20 +217,28 @@ def _to_the_end(
     save = here.save if limits.states else lambda: None
     left = [stop for stop in here.stops if str(stop) not in done]
     saved = here.seconds(wall)
+
+    def shared() -> contextlib.AbstractContextManager[None]:
+        """While the pace of another run is measured, this one does nothing."""
+        return study_clock.shared(out) if clock == "paced" else contextlib.nullcontext()
+
     while left:
-        with study_clock.shared(out) if clock == "paced" else contextlib.nullcontext():
+        with shared():
             here.advance()
         evaluations = here.state.metrics[-1][1]
         seconds = here.seconds(wall)
         for stop in [x for x in left if x.reached(evaluations, seconds)]:
             left.remove(stop)
-            _write(protocol, here, stop, clock, out)
-            save()
+            with shared():
+                _write(protocol, here, stop, clock, out)
+                save()
         if time.monotonic() > limits.deadline and left:
-            save()
+            with shared():
+                save()
             return False
         if seconds - saved > _SAVED_EVERY:
-            save()
+            with shared():
+                save()
             saved = seconds
         late = seconds > limits.until and not any(x.unit == "s" for x in left)
         if late and not limits.reach:
