@@ -21,9 +21,11 @@ def draw_cells(key: jax.Array, wanted: jax.Array, count: int) -> jax.Array:
     Returns:
         (count,) cells.
     """
-    weights = (wanted | ~jnp.any(wanted)).astype(jnp.float32)
-    probabilities = weights / jnp.sum(weights)
-    return jax.random.choice(key, wanted.shape[0], (count,), p=probabilities)
+    wanted = wanted | ~jnp.any(wanted)
+    # whole numbers: sums of probabilities are rounded, and would let other cells in
+    number = jnp.cumsum(wanted.astype(jnp.int32))
+    drawn = jax.random.randint(key, (count,), 0, number[-1])
+    return jnp.searchsorted(number, drawn, side="right").astype(jnp.int32)
 
 
 def accepted_cells(
