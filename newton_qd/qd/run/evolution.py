@@ -1,4 +1,4 @@
-"""The loop over generations: progress, checkpoints, interrupts and results."""
+"""A run from its settings to its results: folder, checkpoints, interrupts."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import dataclasses
 import os
 import time
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from newton_qd.qd.run.archive import Archive
 from newton_qd.qd.run.checkpoint import Checkpoint
 from newton_qd.qd.run.folder import COLUMNS, EVENTS, RunFolder
 from newton_qd.qd.run.interrupt import StopFlag, graceful_stop
+from newton_qd.qd.run.loop import Saver, run_generations
 from newton_qd.qd.run.plot import archive_png
 from newton_qd.qd.run.progress import Progress
 from newton_qd.qd.run.reevaluation import Reevaluated
@@ -151,8 +152,8 @@ def evolve(
         if folder is not None and tensorboard:
             log = EventLog(folder.path / EVENTS, state.iteration + 1)
             watchers.append(stack.enter_context(log).write)
-        save = _Saver(search, folder, checkpoint_seconds)
-        state = _loop(search, state, config.iterations, watchers, stop, save)
+        save = Saver(search, folder, checkpoint_seconds)
+        state = run_generations(search, state, config.iterations, watchers, stop, save)
         result = _result(config, search.checkpoint(state), folder, begin)
         return _finished(result, search, task, folder, display, stop, begin)
 
@@ -305,47 +306,6 @@ def _open(
         f"resuming {folder.path} after generation {done} of {config.iterations}"
     )
     return checkpoint
-
-
-class _Saver:
-    """Writes checkpoints, with a shortest time between them."""
-
-    def __init__(
-        self, search: Search, folder: RunFolder | None, least_seconds: float
-    ) -> None:
-        self._search = search
-        self._folder = folder
-        self._least_seconds = least_seconds
-        self._saved_at = time.monotonic()
-
-    def sometimes(self, state: SearchState) -> None:
-        """Saves if the last checkpoint is old enough."""
-        if time.monotonic() - self._saved_at >= self._least_seconds:
-            self.now(state)
-
-    def now(self, state: SearchState) -> None:
-        """Saves, if there is a state and a folder."""
-        if self._folder is not None and state.iteration >= 0:
-            self._folder.save(self._search.checkpoint(state))
-        self._saved_at = time.monotonic()
-
-
-def _loop(
-    search: Search,
-    state: SearchState,
-    iterations: int,
-    watchers: Iterable[Callable[[int, dict[str, float]], None]],
-    stop: StopFlag,
-    save: _Saver,
-) -> SearchState:
-    """Runs until the last generation or a signal, and saves."""
-    while state.iteration < iterations and not stop.requested:
-        state = search.advance(state)
-        for watch in watchers:
-            watch(state.iteration, dict(zip(COLUMNS, state.metrics[-1], strict=True)))
-        save.sometimes(state)
-    save.now(state)
-    return state
 
 
 def _result(

@@ -1,0 +1,73 @@
+"""The loop over generations, with checkpoints between them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+
+from newton_qd.qd.run.folder import COLUMNS, RunFolder
+from newton_qd.qd.run.interrupt import StopFlag
+from newton_qd.qd.run.search import Search, SearchState
+
+
+class Saver:
+    """Writes checkpoints, with a shortest time between them."""
+
+    def __init__(
+        self, search: Search, folder: RunFolder | None, least_seconds: float
+    ) -> None:
+        """Begins with nothing saved.
+
+        Args:
+            search: Search that makes the checkpoints.
+            folder: Folder of the checkpoints; ``None``: nothing is saved.
+            least_seconds: Shortest time between two checkpoints [s].
+        """
+        self._search = search
+        self._folder = folder
+        self._least_seconds = least_seconds
+        self._saved_at = time.monotonic()
+
+    def sometimes(self, state: SearchState) -> None:
+        """Saves if the last checkpoint is old enough."""
+        if time.monotonic() - self._saved_at >= self._least_seconds:
+            self.now(state)
+
+    def now(self, state: SearchState) -> None:
+        """Saves, if there is a state and a folder."""
+        if self._folder is not None and state.iteration >= 0:
+            self._folder.save(self._search.checkpoint(state))
+        self._saved_at = time.monotonic()
+
+
+def run_generations(
+    search: Search,
+    state: SearchState,
+    iterations: int,
+    watchers: Iterable[Callable[[int, dict[str, float]], None]],
+    stop: StopFlag,
+    save: Saver,
+) -> SearchState:
+    """Runs until the last generation or a signal, and saves.
+
+    Args:
+        search: Search that makes the generations.
+        state: State to begin with.
+        iterations: The last generation.
+        watchers: Called with number and metrics of each generation.
+        stop: Flag that a signal sets.
+        save: Writes the checkpoints.
+
+    Returns:
+        The last state.
+
+    Raises:
+        SearchError: No individual of the initial population has finite scores.
+    """
+    while state.iteration < iterations and not stop.requested:
+        state = search.advance(state)
+        for watch in watchers:
+            watch(state.iteration, dict(zip(COLUMNS, state.metrics[-1], strict=True)))
+        save.sometimes(state)
+    save.now(state)
+    return state
