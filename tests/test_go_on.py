@@ -19,6 +19,7 @@ from point_runs import (
     point_task,
     reference,
     run,
+    snapshot,
 )
 
 from newton_qd import cli
@@ -53,6 +54,38 @@ def test_a_run_goes_on_beyond_its_end(reference: Path, tmp_path: Path) -> None:
         ConfigError, match=r"^iterations: got 5; allowed: 12 or more, as"
     ):
         run(SHORT, out=out, resume=True)
+
+
+def test_a_checkpoint_that_does_not_fit_changes_nothing(
+    reference: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: Any) -> None:
+        raise CheckpointError("it does not fit")
+
+    out = copy(reference, tmp_path)
+    (out / "corrected.json").write_text("{}")
+    before = snapshot(out)
+    monkeypatch.setattr(Search, "restore", refuse)
+    with pytest.raises(CheckpointError, match="it does not fit"):
+        run(SMALL.replace(iterations=14), out=out, resume=True)
+    assert snapshot(out) == before
+
+
+def test_an_algorithm_that_cannot_go_on_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = SMALL.replace(algorithm="me-es")
+    monkeypatch.setattr(Search, "advance", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        run(config, out=tmp_path)
+    before = snapshot(tmp_path)
+    for iterations, text in (
+        (20, r"got 20, but 'me-es' cannot go on beyond the end of a run; allowed: 12,"),
+        (5, "got 5; allowed: 12, as the run in"),
+    ):
+        with pytest.raises(ConfigError, match=f"^iterations: {text}"):
+            run(config.replace(iterations=iterations), out=tmp_path, resume=True)
+    assert snapshot(tmp_path) == before
 
 
 @pytest.mark.slow

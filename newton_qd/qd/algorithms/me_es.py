@@ -108,4 +108,5 @@ ME_ES = AlgorithmSpec(
     evaluations=_evaluations,
     smallest=2,
     double=False,
+    goes_on=False,  # the size of the novelty archive
 )

@@ -75,6 +75,8 @@ class AlgorithmSpec(Generic[OptionsT]):
         initial_scale: Factor of the weights of the initial population.
         smallest: Smallest number of individuals of a generation.
         double: Whether the emitter runs in JAX's 64-bit mode.
+        goes_on: Whether a run goes on beyond its end. If not, its state depends on the
+            number of generations.
     """
 
     name: str
@@ -94,6 +96,7 @@ class AlgorithmSpec(Generic[OptionsT]):
     initial_scale: Callable[[OptionsT], float] = _unscaled
     smallest: int = 1
     double: bool = True
+    goes_on: bool = True
 
     def read_options(self, config: EvolveConfig) -> OptionsT:
         """Returns the options of a run, with the defaults of its environment.

@@ -264,9 +264,11 @@ def _first(
     """Returns the state at the start of this call.
 
     Raises:
+        CheckpointError: The checkpoint does not fit this version of the algorithm.
         ConfigError: The genotypes that the run starts from are missing.
     """
     checkpoint = None
+    resumed = folder is not None and folder.has_config
     if folder is not None:
         checkpoint = _open(folder, config, start, resume, display)
     if checkpoint is not None:
@@ -277,6 +279,8 @@ def _first(
         state = search.empty(start)
         if start is not None:
             display.note(f"starting from {len(start)} elites of another archive")
+    if folder is not None and resumed:
+        folder.go_on(config)  # not before its state is known to fit
     if state.iteration < config.iterations:
         display.note("compiling the physics and the rollout (longer on a first start)")
     return state

@@ -21,6 +21,7 @@ import numpy as np
 from newton_qd import checks
 from newton_qd.checks import Fact, message
 from newton_qd.files import temporary_name, write_atomically
+from newton_qd.qd.algorithms import algorithm_named
 from newton_qd.qd.config import (
     ConfigError,
     EvolveConfig,
@@ -190,15 +191,20 @@ class RunFolder:
             The settings of the run, and the facts of the machine that began it.
 
         Raises:
-            ConfigError: A setting differs from the run's.
+            ConfigError: A setting differs from the run's, or its algorithm does not go
+                on beyond the end of a run.
         """
         stored, facts = read_config(self.path / CONFIG)
+        goes_on = algorithm_named(config.algorithm).goes_on
         for name, old, new in stored.differences(config):
-            longer = name == "iterations" and config.iterations > stored.iterations
-            if longer:
-                continue
-            old = f"{old!r} or more" if name == "iterations" else repr(old)
-            raise self._other_run(name, old, new)
+            if name != "iterations":
+                raise self._other_run(name, repr(old), new)
+            if config.iterations < stored.iterations:
+                more = " or more" if goes_on else ""
+                raise self._other_run(name, f"{old!r}{more}", new)
+            if not goes_on:
+                why = f"but {config.algorithm!r} cannot go on beyond the end of a run"
+                raise self._other_run(name, repr(old), new, why)
         return stored, facts
 
     def compare_environment(self, env_name: str) -> None:
@@ -214,18 +220,22 @@ class RunFolder:
             if stored.env_name != env_name:
                 raise self._other_run("env_name", repr(stored.env_name), env_name)
 
-    def _other_run(self, name: str, old: str, new: object) -> ConfigError:
+    def _other_run(
+        self, name: str, old: str, new: object, why: str = ""
+    ) -> ConfigError:
         allowed = f"{old}, as the run in {self.path} has; or start a new run in "
-        return ConfigError(message(name, new, f"{allowed}another folder"))
+        return ConfigError(message(name, new, f"{allowed}another folder", why=why))
 
     def restore(
         self, config: EvolveConfig, facts: dict[str, object]
     ) -> tuple[Checkpoint | None, list[str]]:
         """Reads the state of a run that was stopped, or that goes on beyond its end.
 
+        It changes no file; see ``go_on``.
+
         Args:
             config: Settings that the run is expected to have. It may have more
-                generations, which is then written to the settings.
+                generations.
             facts: Facts of this machine.
 
         Returns:
@@ -236,7 +246,7 @@ class RunFolder:
             ConfigError: A setting differs from the run's.
             CheckpointError: The checkpoint is damaged or belongs to another run.
         """
-        stored, old_facts = self.compare(config)
+        _, old_facts = self.compare(config)
         warnings = []
         for name, old, new in changed_facts(old_facts, facts):
             if name == "x64":
@@ -252,10 +262,21 @@ class RunFolder:
             raise CheckpointError(
                 f"{path} belongs to a run with other settings than {CONFIG}"
             )
+        return checkpoint, warnings
+
+    def go_on(self, config: EvolveConfig) -> None:
+        """Writes the settings of a run that goes on beyond its end.
+
+        Args:
+            config: Settings with which the checkpoint was restored.
+
+        Raises:
+            ConfigError: A setting other than the number of generations differs.
+        """
+        stored, facts = self.compare(config)
         if stored != config:
             (self.path / REEVALUATED).unlink(missing_ok=True)  # of the earlier end
-            self.start(config, old_facts)
-        return checkpoint, warnings
+            self.start(config, facts)
 
     def save(self, checkpoint: Checkpoint) -> None:
         """Writes the checkpoint, then the metrics up to it."""
