@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from point_runs import SMALL, point_task
+from point_runs import SMALL, interrupt_after, point_task
 
 import newton_qd
 from newton_qd import cli
@@ -141,6 +141,28 @@ def test_a_terminal_gets_no_broken_words(monkeypatch: pytest.MonkeyPatch) -> Non
     lines = terminal.getvalue().splitlines()
     assert len(lines) > 3 and max(map(len, lines)) <= 40
     assert " ".join(lines) == plain.getvalue().rstrip("\n")
+
+
+@pytest.mark.usefixtures("sigint")
+def test_a_reader_that_leaves_does_not_end_a_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    out = tmp_path / "run"
+    arguments = [*POINT, "--out", out, "--resume"]
+    arguments.remove("--quiet")
+    with os.fdopen(writer, "w") as gone, monkeypatch.context() as patch:
+        patch.setattr(sys, "stdout", gone)
+        patch.setattr(sys, "stderr", gone)
+        with monkeypatch.context() as once:
+            interrupt_after(once, 1)
+            codes = [call(*arguments)]
+        codes.append(call(*arguments))
+        codes.append(call(*arguments, "--seed", 3))
+    assert codes == [cli.INTERRUPTED, cli.OK, cli.BAD_ARGUMENTS]
+    assert len((out / "metrics.csv").read_text().splitlines()) == 5
+    assert (out / "corrected.json").exists()
 
 
 @pytest.mark.slow

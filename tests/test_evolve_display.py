@@ -7,6 +7,7 @@ import io
 import numpy as np
 import pytest
 
+from newton_qd.cli.progress import Progress as Pages
 from newton_qd.qd.run import plot
 from newton_qd.qd.run.archive import Archive
 from newton_qd.qd.run.progress import Progress
@@ -108,6 +109,27 @@ def test_a_long_run_says_how_long(monkeypatch: pytest.MonkeyPatch) -> None:
         text = "a generation takes about 16 s: 4:34:27 for the 998 that are left\n"
         assert (text in stream.getvalue()) == told
         assert stream.getvalue().count("a generation takes") == told
+
+
+class Gone(Terminal):
+    """A stream whose reader has left."""
+
+    def write(self, text: str) -> int:
+        raise BrokenPipeError(32, "Broken pipe")
+
+
+def test_a_reader_that_leaves_ends_the_display_only(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    progress = Progress("ant_uni", 200, stream=Gone())
+    progress.update(0, ROW)
+    progress.note("a note")
+    progress.update(200, ROW)
+    progress.close()
+    monkeypatch.setattr("sys.stderr", Gone())
+    with Pages("frames") as shown:
+        shown(1, 2)
+    assert capsys.readouterr().out == ""
 
 
 def test_plain_lines_without_a_terminal() -> None:

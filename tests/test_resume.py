@@ -37,9 +37,11 @@ from point_runs import (
 from newton_qd import cli, files
 from newton_qd.qd.config import ConfigError, EvolveConfig, read_config
 from newton_qd.qd.run.archive import load_archive
-from newton_qd.qd.run.checkpoint import CheckpointError
+from newton_qd.qd.run.checkpoint import CheckpointError, load_checkpoint
 from newton_qd.qd.run.folder import RunFolder
 from newton_qd.qd.run.interrupt import INTERRUPTED, graceful_stop
+from newton_qd.qd.run.progress import Progress
+from newton_qd.qd.run.search import Search, SearchError
 
 __all__ = ["compile_once", "reference"]  # fixtures
 
@@ -70,6 +72,36 @@ def test_interrupt_saves_and_resumes_bit_by_bit(
     assert len((out / "metrics.csv").read_text().splitlines()) == generation + 2
     assert np.array_equal(load_archive(out).fitnesses, result.archive.fitnesses)
     assert not run(out=out, resume=True).interrupted
+    assert_same_results(out, reference)
+
+
+def test_an_error_after_a_generation_loses_nothing(
+    reference: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "run"
+    advance = Search.advance
+
+    def advance_or_fail(self: Search, state: Any) -> Any:
+        if state.iteration == 3:
+            raise SearchError("no memory")
+        return advance(self, state)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Search, "advance", advance_or_fail)
+        with pytest.raises(SearchError, match="no memory"):
+            run(out=out, checkpoint_seconds=1e9)
+    assert len((out / "metrics.csv").read_text().splitlines()) == 5
+    assert load_checkpoint(out / "checkpoint.bin").iteration == 3
+
+    def watch_and_fail(*_: Any) -> None:
+        raise OSError("no display")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Progress, "update", watch_and_fail)
+        with pytest.raises(OSError, match="no display"):
+            run(out=out, resume=True, checkpoint_seconds=1e9)
+    assert load_checkpoint(out / "checkpoint.bin").iteration == 4
+    run(out=out, resume=True)
     assert_same_results(out, reference)
 
 

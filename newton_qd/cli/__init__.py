@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import os
+import contextlib
 import sys
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from newton_qd.cli import algorithms, doctor, envs, evolve, runs, viewing
-from newton_qd.cli.arguments import BAD_ARGUMENTS, FAILED, OK, complain
+from newton_qd.cli.arguments import BAD_ARGUMENTS, FAILED, OK, abandon, complain
 from newton_qd.cli.modules import import_modules
 from newton_qd.cli.version import ShowVersion
 from newton_qd.errors import FaultError, MissingExtra, UnknownEnvironment
@@ -58,14 +58,15 @@ def main(
     runs.add_parsers(commands)
     viewing.add_parsers(commands)
     arguments = parser.parse_args(argv)
-    try:
+    code = OK
+    with contextlib.suppress(BrokenPipeError):  # as in: newton-qd envs | head
         code = _run(arguments, task_factory)
-        sys.stdout.flush()
-        return code
-    except BrokenPipeError:  # as in: newton-qd envs | head
-        # Python would complain at its end, when it flushes what nobody reads.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return OK
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except BrokenPipeError:
+            abandon(stream)
+    return code
 
 
 def _run(

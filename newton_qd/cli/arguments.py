@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from typing import TextIO, TypeAlias
 
@@ -26,10 +27,29 @@ def say(text: str, stream: TextIO | None = None) -> None:
 
     Args:
         text: One or more lines.
-        stream: Where to; ``None``: standard output.
+        stream: Where to; ``None``: standard output. Only there, a reader that has left
+            ends the command.
+
+    Raises:
+        BrokenPipeError: Nobody reads the standard output any more.
     """
     target: TextIO = sys.stdout if stream is None else stream
-    print(for_stream(text, target), file=target)
+    try:
+        print(for_stream(text, target), file=target)
+    except BrokenPipeError:
+        if stream is None:
+            raise
+        abandon(target)
+
+
+def abandon(stream: TextIO) -> None:
+    """Sends what is still written to a stream nowhere, because its reader has left.
+
+    Python would complain at its end, when it flushes what nobody reads.
+    """
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, stream.fileno())
+    os.close(nowhere)
 
 
 def warn_of_changes(facts: dict[str, object], when: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import shlex
 import sys
@@ -79,7 +80,8 @@ def run(
         )
     except SearchError as error:
         return complain(arguments, error, FAILED)
-    _report(result, out, arguments.modules)
+    with contextlib.suppress(BrokenPipeError):  # the exit code says it too
+        _report(result, out, arguments.modules)
     return INTERRUPTED if result.interrupted else OK
 
 

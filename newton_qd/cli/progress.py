@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import time
 from types import TracebackType
@@ -39,7 +40,7 @@ class Progress:
             return
         self._next = now + (0.2 if self._terminal else 10.0)
         text = f"{done} of {total} {self.what}"
-        print(text, end="\r" if self._terminal else "\n", file=sys.stderr, flush=True)
+        self._write(text + ("\r" if self._terminal else "\n"))
 
     def __exit__(
         self,
@@ -50,4 +51,9 @@ class Progress:
         """Clears the line."""
         del kind, error, trace
         if self._terminal:
-            print(end="\x1b[2K", file=sys.stderr, flush=True)
+            self._write("\x1b[2K")
+
+    def _write(self, text: str) -> None:
+        """Writes text. If nobody can read it, the command goes on."""
+        with contextlib.suppress(OSError):
+            print(end=text, file=sys.stderr, flush=True)

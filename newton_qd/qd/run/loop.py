@@ -48,7 +48,7 @@ def run_generations(
     stop: StopFlag,
     save: Saver,
 ) -> SearchState:
-    """Runs until the last generation or a signal, and saves.
+    """Runs until the last generation, a signal or an error, and saves.
 
     Args:
         search: Search that makes the generations.
@@ -65,9 +65,15 @@ def run_generations(
         SearchError: No individual of the initial population has finite scores.
     """
     while state.iteration < iterations and not stop.requested:
-        state = search.advance(state)
-        for watch in watchers:
-            watch(state.iteration, dict(zip(COLUMNS, state.metrics[-1], strict=True)))
+        try:
+            state = search.advance(state)
+            values = state.metrics[-1]
+            row: dict[str, float] = dict(zip(COLUMNS, values, strict=True))
+            for watch in watchers:
+                watch(state.iteration, row)
+        except Exception:
+            save.now(state)  # of the last whole generation
+            raise
         save.sometimes(state)
     save.now(state)
     return state

@@ -145,8 +145,14 @@ class Progress:
         return full * filled + empty * (width - filled)
 
     def _write(self, text: str) -> None:
-        self._stream.write(text)
-        self._stream.flush()
+        """Writes text. If nobody can read it, the display ends, but not the run."""
+        if not self._enabled:
+            return
+        try:
+            self._stream.write(text)
+            self._stream.flush()
+        except OSError:  # as in: newton-qd evolve ant_uni 2>&1 | head
+            self._enabled = False
 
 
 def _clock(seconds: float | None) -> str:
