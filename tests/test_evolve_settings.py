@@ -48,6 +48,16 @@ def test_bad_settings_are_named(settings: dict[str, Any], message: str) -> None:
         EvolveConfig().replace(**settings)
 
 
+@pytest.mark.parametrize("seconds", ["5", None, True, -1.0, float("nan")])
+def test_a_wrong_time_between_checkpoints_is_named(
+    seconds: Any, tmp_path: Path
+) -> None:
+    text = r"^checkpoint_seconds: got .*; allowed: numbers from 0$"
+    with pytest.raises(ConfigError, match=text):
+        run(SMALL, out=tmp_path / "run", checkpoint_seconds=seconds)
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_grid_must_fit_the_descriptor(tmp_path: Path) -> None:
     out = tmp_path / "run"
     with pytest.raises(

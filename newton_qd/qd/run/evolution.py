@@ -104,8 +104,8 @@ def evolve(
             ``None``: a random population.
         progress: Whether to show progress on standard error.
         tensorboard: Whether to write the metrics for TensorBoard too.
-        checkpoint_seconds: Shortest time between two checkpoints [s]. It does not
-            change the result.
+        checkpoint_seconds: Shortest time between two checkpoints [s]; infinite: one
+            at the end. It does not change the result.
         devices: Number of devices that share each evaluation. It does not change the
             result. ``None``: only the default device.
         device: Device of the whole run, such as ``"cpu"``, ``"gpu"`` or ``"gpu:1"``;
@@ -126,6 +126,10 @@ def evolve(
     begin = time.monotonic()
     allowed = "an EvolveConfig, such as EvolveConfig(env_name='ant_uni')"
     checks.instance("config", config, EvolveConfig, allowed, error=ConfigError)
+    seconds = checkpoint_seconds
+    checks.number(
+        "checkpoint_seconds", seconds, least=0, endless=True, error=ConfigError
+    )
     algorithm_named(config.algorithm).read_options(config)
     mesh = _mesh(devices, resume)
     chosen = _device(device, devices)
