@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ import newton_qd
 from newton_qd import cli
 from newton_qd.qd.config import EvolveConfig, config_to_json
 from newton_qd.qd.run.archive import load_archive
+from newton_qd.qd.run.search import Search
 from newton_qd.qd.scoring.task import Task
 
 TESTS = Path(__file__).resolve().parent
@@ -141,6 +143,32 @@ def test_a_terminal_gets_no_broken_words(monkeypatch: pytest.MonkeyPatch) -> Non
     lines = terminal.getvalue().splitlines()
     assert len(lines) > 3 and max(map(len, lines)) <= 40
     assert " ".join(lines) == plain.getvalue().rstrip("\n")
+
+
+@pytest.mark.usefixtures("sigint")
+def test_a_signal_during_the_reevaluation(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    saved: list[str] = []
+    reevaluate = Search.reevaluate
+
+    def interrupted(self: Search, *arguments: Any, **options: Any) -> Any:
+        saved.extend(entry.name for entry in out.iterdir())
+        os.kill(os.getpid(), signal.SIGINT)
+        return reevaluate(self, *arguments, **options)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Search, "reevaluate", interrupted)
+        arguments = [*POINT, "--iterations", 1, "--out", out]
+        assert call(*arguments) == cli.INTERRUPTED
+    assert {"archive.npz", "archive.png"} <= set(saved)
+    assert not (out / "corrected.json").exists()
+    text = "interrupted during the re-evaluation, the archive is saved; continue with:"
+    printed = capsys.readouterr().out
+    assert text in printed and f"--resume --out {out}" in printed
+    assert call("evolve", "--resume", "--quiet", "--out", out) == cli.OK
+    assert (out / "corrected.json").exists()
 
 
 @pytest.mark.usefixtures("sigint")

@@ -133,6 +133,8 @@ def _report(result: EvolveResult, out: Path, modules: Sequence[str]) -> None:
                 f"after generation {result.iteration} of {config.iterations}, "
                 "everything up to it is saved"
             )
+        if result.iteration == config.iterations:
+            when = "during the re-evaluation, the archive is saved"
         own = "".join(f" --module {shlex.quote(name)}" for name in modules)
         say(f"interrupted {when}; continue with:")
         print(f"  newton-qd evolve --resume --out {shlex.quote(str(out))}{own}")

@@ -49,7 +49,8 @@ class EvolveResult:
             (iteration + 1,).
         iteration: Generations that are finished; -1 if a signal came before the
             initial population.
-        interrupted: Whether a signal ended the run before its last generation.
+        interrupted: Whether a signal ended the run before its last generation or
+            during the re-evaluation.
         out: Results folder, if there is one.
         seconds: Duration of this call [s].
         reevaluated: Metrics of a finished run, from re-evaluated elites.
@@ -90,8 +91,8 @@ def evolve(
 ) -> EvolveResult:
     """Evolves an archive of policies with an algorithm of the MAP-Elites family.
 
-    SIGINT and SIGTERM end the run after the current generation. The state is saved, and
-    ``interrupted`` is true in the result.
+    SIGINT and SIGTERM end the run after the current generation, or end the
+    re-evaluation. The state is saved, and ``interrupted`` is true in the result.
 
     Args:
         config: Settings.
@@ -348,21 +349,25 @@ def _finished(
     stop: StopFlag,
     begin: float,
 ) -> EvolveResult:
-    """Adds the metrics of re-evaluated elites, and writes the last files."""
-    if not result.interrupted:
-        if result.config.reevaluations:
-            display.note("evaluating the elites again, for metrics without luck")
-        first = float(result.metrics["initial_fitness"][0])
-        again = search.reevaluate(
-            result.archive,
-            lambda: stop.requested,
-            untrained=first if np.isfinite(first) else None,
-        )
-        seconds = time.monotonic() - begin
-        result = dataclasses.replace(result, reevaluated=again, seconds=seconds)
+    """Writes the last files, and adds the metrics of re-evaluated elites."""
     if folder is not None and result.iteration >= 0:
         picture = archive_png(result.archive, result.config, task, result.iteration)
         folder.save_archive(result.archive, picture)
-    if folder is not None and result.reevaluated is not None:
-        folder.save_reevaluated(dataclasses.asdict(result.reevaluated))
-    return result
+    if result.interrupted or not result.config.reevaluations:
+        seconds = time.monotonic() - begin
+        return dataclasses.replace(result, seconds=seconds)
+    display.note("evaluating the elites again, for metrics without luck")
+    first = float(result.metrics["initial_fitness"][0])
+    again = search.reevaluate(
+        result.archive,
+        lambda: stop.requested,
+        untrained=first if np.isfinite(first) else None,
+    )
+    if folder is not None and again is not None:
+        folder.save_reevaluated(dataclasses.asdict(again))
+    return dataclasses.replace(
+        result,
+        reevaluated=again,
+        interrupted=again is None,
+        seconds=time.monotonic() - begin,
+    )
