@@ -39,12 +39,12 @@ class Seen(Exception):  # noqa: N818 - it only stops the command
         self.config = config
 
 
+def stop(config: EvolveConfig) -> Any:
+    raise Seen(config)
+
+
 def settings(*arguments: str) -> EvolveConfig:
     """The settings that arguments make."""
-
-    def stop(config: EvolveConfig) -> Any:
-        raise Seen(config)
-
     with pytest.raises(Seen) as seen:
         cli.main([*POINT, *arguments], task_factory=stop)
     return seen.value.config
@@ -83,6 +83,25 @@ def test_options_of_the_environment_on_the_command_line(
     found = dict(settings("--config", str(toml)).env_options)
     assert found["material"] == {"friction": 0.8}
     assert found["qdax_wrappers_kwargs"] == ({"minval": (-1, -1)},)
+
+
+def test_cells_replace_those_of_a_config(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # without --out, which has its own way
+    for base, cells in (
+        (SMALL, ("--centroids", "100")),
+        (SMALL.replace(grid=None, centroids=9), ("--grid", "3x5")),
+    ):
+        path = tmp_path / "config.json"
+        path.write_text(config_to_json(base, environment_facts()))
+        for out in ([], ["--out", "run"]):
+            arguments = ["evolve", "--quiet", "--config", str(path), *cells, *out]
+            with pytest.raises(Seen) as seen:
+                cli.main(arguments, task_factory=stop)
+            config = seen.value.config
+            expected = (None, 100) if base is SMALL else ((3, 5), None)
+            assert (config.grid, config.centroids) == expected
 
 
 def test_wrong_options_of_the_environment(

@@ -264,7 +264,7 @@ def settle(arguments: argparse.Namespace) -> tuple[EvolveConfig, Path]:
         warn_of_changes(facts, "when this config was written")
     out = arguments.out
     if out is None:
-        named = (base or _DEFAULTS).replace(**given)
+        named = _other_cells(base or _DEFAULTS, given).replace(**given)
         if base is None and "env_name" not in given:
             raise ConfigError(_UNNAMED)
         # the name becomes a folder, so it must not be a path
@@ -280,12 +280,7 @@ def settle(arguments: argparse.Namespace) -> tuple[EvolveConfig, Path]:
         why = "which holds no run"
         refused = message("out", Fact(out), "the results folder of a run", why=why)
         raise ConfigError(f"{refused}. To start a run there: {_UNNAMED}")
-    base = base or _DEFAULTS
-    # A grid replaces centroids of the config, and centroids replace its grid.
-    if "grid" in given:
-        base = base.replace(centroids=None)
-    if "centroids" in given:
-        base = base.replace(grid=None)
+    base = _other_cells(base or _DEFAULTS, given)
     if "options" in given:
         given["options"] = {**dict(base.options), **dict(given["options"])}
     if "randomize" in given:
@@ -293,6 +288,15 @@ def settle(arguments: argparse.Namespace) -> tuple[EvolveConfig, Path]:
     if "env_options" in given:
         given["env_options"] = _merged(dict(base.env_options), given["env_options"])
     return base.replace(**given), out
+
+
+def _other_cells(base: EvolveConfig, given: Mapping[str, Any]) -> EvolveConfig:
+    """Returns settings without the cells that given ones replace, of either kind."""
+    if "grid" in given:
+        base = base.replace(centroids=None)
+    if "centroids" in given:
+        base = base.replace(grid=None)
+    return base
 
 
 def _merged(
