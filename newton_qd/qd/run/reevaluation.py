@@ -20,7 +20,8 @@ class Reevaluated:
 
     An elite enters it with the medians of its descriptors and of its fitnesses over
     evaluations from different start states (Flageat and Cully 2020,
-    "Fast and stable MAP-Elites in noisy domains using deep grids").
+    "Fast and stable MAP-Elites in noisy domains using deep grids"). The descriptor of
+    an evaluation that is not finite does not count.
 
     Attributes:
         reevaluations: Evaluations of each elite.
@@ -87,6 +88,9 @@ def corrected_fitnesses(
 ) -> np.ndarray | None:
     """Returns the fitness (cells,) of each cell after the elites were evaluated again.
 
+    A fitness of ``-inf`` counts in the median of the fitnesses, but the descriptor of
+    such an evaluation has no meaning. An elite with no other evaluation is left out.
+
     Args:
         archive: Archive with at least one elite.
         score: Compiled scoring function; all elites share a start state in each call.
@@ -106,10 +110,31 @@ def corrected_fitnesses(
         fitnesses.append(np.asarray(fitness, np.float64))
         descriptors.append(np.asarray(descriptor, np.float64))
     fitness = np.median(fitnesses, axis=0)
-    cells = _cells(np.median(descriptors, axis=0), archive.centroids)
+    middle, known = _middle(np.stack(fitnesses), np.stack(descriptors))
+    cells = _cells(middle, archive.centroids)
     best = np.full(len(archive.centroids), -np.inf)
-    np.maximum.at(best, cells, fitness)
+    np.maximum.at(best, cells[known], fitness[known])
     return best
+
+
+def _middle(
+    fitnesses: np.ndarray, descriptors: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the median descriptor of each elite over its sound evaluations.
+
+    Args:
+        fitnesses: (K, N) fitnesses of K evaluations.
+        descriptors: (K, N, D) their descriptors.
+
+    Returns:
+        (N, D) medians, and (N,) whether the elite has a sound evaluation.
+    """
+    sound = np.isfinite(fitnesses) & np.all(np.isfinite(descriptors), axis=-1)
+    known = np.any(sound, axis=0)
+    middle = np.median(descriptors, axis=0)
+    for elite in np.flatnonzero(known & ~sound.all(axis=0)):
+        middle[elite] = np.median(descriptors[sound[:, elite], elite], axis=0)
+    return middle, known
 
 
 def _cells(descriptors: np.ndarray, centroids: np.ndarray) -> np.ndarray:
