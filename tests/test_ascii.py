@@ -232,6 +232,24 @@ def test_better_actions_follow_the_derivative() -> None:
     np.testing.assert_array_equal(improved(own, nothing, 0.05), own.actions)
 
 
+def rollout(weights: jax.Array, key: jax.Array) -> dict[str, jax.Array]:
+    """Transitions of policies that see the same observations."""
+    del key
+    obs = jnp.asarray(steps()["obs"][:1, :LENGTH])
+    actions = jax.vmap(jax.vmap(policy, (None, 0)), (0, None))(weights, obs[0])
+    zeros = jnp.zeros(actions.shape[:2])
+    shown = jnp.broadcast_to(obs, (len(weights), *obs.shape[1:]))
+    return {"obs": shown, "actions": actions, "rewards": zeros, "dones": zeros}
+
+
+@dataclasses.dataclass
+class Found:
+    """Gradients of episodes (N, 1, T, nu), and whether they overflowed (N, 1)."""
+
+    gradients: jax.Array
+    overflowed: jax.Array
+
+
 @pytest.mark.parametrize("samples", [None, 20])
 def test_exact_offspring_raise_the_return(samples: int | None) -> None:
     """The return is the sum of first actions, so its derivative is known."""
@@ -240,19 +258,6 @@ def test_exact_offspring_raise_the_return(samples: int | None) -> None:
     genotypes = jnp.asarray(genotypes).at[:, 1::2].set(0)
     cells = compute_euclidean_centroids((2, 2), [0.0, 0.0], [1.0, 1.0])
     held = MapElitesRepertoire.init(genotypes, fitnesses, places, cells, {})
-    obs = jnp.asarray(steps()["obs"][:1, :LENGTH])
-
-    def rollout(weights: jax.Array, key: jax.Array) -> dict[str, jax.Array]:
-        del key
-        actions = jax.vmap(jax.vmap(policy, (None, 0)), (0, None))(weights, obs[0])
-        zeros = jnp.zeros(actions.shape[:2])
-        shown = jnp.broadcast_to(obs, (len(weights), *obs.shape[1:]))
-        return {"obs": shown, "actions": actions, "rewards": zeros, "dones": zeros}
-
-    @dataclasses.dataclass
-    class Found:
-        gradients: jax.Array
-        overflowed: jax.Array
 
     def gradient(actions: jax.Array, key: jax.Array) -> Any:
         del key
@@ -282,6 +287,33 @@ def test_exact_offspring_raise_the_return(samples: int | None) -> None:
     assert (raised > 1e-3).all()
     # weights of the second action have no part in the return
     np.testing.assert_array_equal(gain[:, 1], 0)
+
+
+def test_parents_whose_derivative_overflowed_stay() -> None:
+    """Every second parent has no slopes; Adam would make steps of rounding errors."""
+    lost = jnp.array([[True], [False]] * 3)
+
+    def gradient(actions: jax.Array, key: jax.Array) -> Any:
+        del key
+        slopes = jnp.where(lost[..., None], 0, jnp.ones_like(actions))
+        return Found(slopes[:, None], lost)
+
+    made = ExactAsciiEmitter(
+        policy,
+        rollout,
+        gradient,
+        SETTINGS,
+        parents=6,
+        branches=2,
+        rates=(0.01, 0.03),
+    )
+    genotypes, fitnesses, places, _ = told()
+    cells = compute_euclidean_centroids((2, 2), [0.0, 0.0], [1.0, 1.0])
+    held = MapElitesRepertoire.init(genotypes, fitnesses, places, cells, {})
+    offspring, extra = compiled(made.emit)(held, None, jax.random.key(0))
+    np.testing.assert_array_equal(extra["overflowed"], lost[:, 0])
+    same = (offspring[:, None] == genotypes).all(axis=2).any(axis=1).reshape(6, 2)
+    np.testing.assert_array_equal(same, np.tile(lost, 2))
 
 
 @pytest.mark.parametrize(

@@ -304,6 +304,8 @@ class ExactAsciiEmitter(Emitter):
         branch = jax.vmap(vary, (None, None, 0, 0))
         offspring = jax.vmap(branch)(weights, better, rates, keys)
         overflowed = jnp.any(found.overflowed, axis=1)
+        # without slopes, Adam would make full steps of rounding errors
+        offspring = jnp.where(overflowed[:, None, None], weights[:, None], offspring)
         return offspring.reshape(-1, weights.shape[1]), {"overflowed": overflowed}
 
 
