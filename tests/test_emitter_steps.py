@@ -75,6 +75,26 @@ def test_steering_lands_in_empty_cells() -> None:
     assert np.all(lengths <= 0.1 * (1 + 1e-5))
 
 
+@pytest.mark.parametrize("large", [1.0, 1e14, 1e20, 1e38])
+def test_large_jacobians_give_short_steps(large: float) -> None:
+    """Squares of the largest ones are not finite in float32."""
+    draw = np.random.default_rng(0).normal
+    jacobian = (draw(size=(3, 2, SIZE)).clip(-3, 3) * large).astype(np.float32)
+    jacobian[1, 1] *= 1e-3
+    jacobian[2] = 0
+    error = draw(size=(3, 2)).astype(np.float32)
+    step = compiled(SteeringEmitter(1, max_step=9.0)._step)(jacobian, error)
+    exact = jacobian[:2].astype(np.float64)
+    gram = exact @ exact.swapaxes(1, 2)
+    damping = 1e-3 * np.trace(gram, axis1=1, axis2=2) / 2
+    gram += damping[:, None, None] * np.eye(2)
+    weights = np.linalg.solve(gram, error[:2, :, None])
+    expected = (exact.swapaxes(1, 2) @ weights)[..., 0]
+    # float32 has no digits below 1e-37
+    np.testing.assert_allclose(step[:2], expected, rtol=1e-3, atol=1e-4 / large + 1e-37)
+    np.testing.assert_array_equal(step[2], 0)
+
+
 def test_lines_climb_and_steer() -> None:
     emitter = GradientLineEmitter(
         along(score), parents=4, branches=3, shortest=0.1, longest=0.8

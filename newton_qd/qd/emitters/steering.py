@@ -13,6 +13,8 @@ from newton_qd.types import ExtraScores, PyTree, Repertoire, ScoringFunction
 
 # Keeps the system regular if no descriptor has a gradient.
 _TINY = 1e-12
+# A Jacobian with larger entries is scaled to this: sums of squares may overflow.
+_LARGE = 1e15
 
 
 class SteeringEmitter(EliteGradientEmitter):
@@ -102,10 +104,14 @@ class SteeringEmitter(EliteGradientEmitter):
         """Returns steps (N, size) against errors (N, D), for Jacobians (N, D, size)."""
         size = jacobian.shape[1]
         error = error.astype(jacobian.dtype)
+        largest = jnp.max(jnp.abs(jacobian), axis=(1, 2), keepdims=True)
+        large = largest > _LARGE
+        scale = jnp.where(large, _LARGE / jnp.where(large, largest, 1), 1)
+        jacobian = jacobian * scale
         gram = jnp.einsum("nds,nes->nde", jacobian, jacobian)
         damping = self._damping * jnp.trace(gram, axis1=1, axis2=2) / size + _TINY
         gram += damping[:, None, None] * jnp.eye(size, dtype=gram.dtype)
         weights = jnp.linalg.solve(gram, error[..., None])[..., 0]
-        step = jnp.einsum("nd,nds->ns", weights, jacobian)
+        step = jnp.einsum("nd,nds->ns", weights, jacobian) * scale[:, 0]
         length = jnp.linalg.norm(step, axis=1, keepdims=True)
         return step * (self._max_step / jnp.maximum(length, self._max_step))
