@@ -95,6 +95,17 @@ def test_large_jacobians_give_short_steps(large: float) -> None:
     np.testing.assert_array_equal(step[2], 0)
 
 
+def test_without_known_gradients_steering_starts_from_elites() -> None:
+    emitter = SteeringEmitter(8, max_step=1.0)
+    repertoire, state = begin(emitter)
+    changed = repertoire.replace(fitnesses=repertoire.fitnesses + 1)
+    assert not jnp.any(state.known(changed)) and changed.fitnesses[0, 0] == -jnp.inf
+    genotypes = emit(emitter, changed, state)
+    same = np.all(np.asarray(genotypes)[:, None] == changed.genotypes, axis=-1)
+    filled = np.asarray(changed.fitnesses[:, 0]) > -np.inf
+    assert np.all(np.any(same & filled, axis=1))
+
+
 def test_lines_climb_and_steer() -> None:
     emitter = GradientLineEmitter(
         along(score), parents=4, branches=3, shortest=0.1, longest=0.8

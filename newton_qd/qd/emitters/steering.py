@@ -73,7 +73,8 @@ class SteeringEmitter(EliteGradientEmitter):
 
         Returns:
             (batch_size, size) offspring and an empty dictionary. If gradients are not
-            finite, the offspring does not move.
+            finite, the offspring does not move. If no elite has known gradients, all
+            elites can be parents, and the first step is 0.
 
         Raises:
             GradientsError: The scoring function returns no gradients with the right
@@ -82,7 +83,9 @@ class SteeringEmitter(EliteGradientEmitter):
         target_key, score_key = jax.random.split(key)
         targets = empty_targets(repertoire, target_key, self._batch_size)
         known = emitter_state.known(repertoire)
-        parents = nearest_cells(repertoire.descriptors, known, targets)
+        filled = repertoire.fitnesses[:, 0] > -jnp.inf
+        wanted = jnp.where(jnp.any(known), known, filled)
+        parents = nearest_cells(repertoire.descriptors, wanted, targets)
         genotypes = repertoire.genotypes[parents]
         gradients = emitter_state.at(repertoire, parents)
         genotypes += self._step(
