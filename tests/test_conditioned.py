@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import types
 from typing import Any
 
 import jax
@@ -20,6 +21,7 @@ from test_actor_critic import SETTINGS, compiled
 from newton_qd.extractors import get_final_xy_position
 from newton_qd.qd.emitters import ActorCritic, ConditionedActorEmitter
 from newton_qd.qd.emitters.aims import AimedEnv, ConditionedPolicy, no_measure
+from newton_qd.qd.emitters.conditioned import _spread
 from newton_qd.qd.scoring.rollout import Policy, make_policy
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
@@ -143,6 +145,36 @@ def begun() -> tuple[Any, Any]:
     held = MapElitesRepertoire.init(genotypes, fitnesses, found, cells, {})
     state = parts()[1](jax.random.key(1), held, genotypes, fitnesses, found, {})
     return held, state
+
+
+@pytest.mark.parametrize(
+    ("fitnesses", "unit"),
+    [
+        ([1.0, 7.0, 3.0], np.std([1, 7, 3])),
+        ([1.0, -np.inf, 3.0], 1.0),
+        ([-np.inf, -np.inf, 3.0], 1e-6 * LENGTH),
+        ([-np.inf] * 3, 1e-6 * LENGTH),
+    ],
+)
+def test_the_unit_is_the_deviation_of_what_is_finite(
+    fitnesses: list[float], unit: float
+) -> None:
+    """Without the worlds, whose programs take long to compile."""
+    made: Any = emitter()
+    made._method = types.SimpleNamespace(episode_length=LENGTH, begin=lambda *_: None)
+    made._worlds = made._scale = lambda *_: None
+    cells = compute_euclidean_centroids((2, 2), [-1.0, -1.0], [3.0, 1.0])
+    genotypes = jnp.zeros((3, policy().size))
+    found = jnp.float32([[-0.5, -0.8], [0.4, 0.1], [2.9, 0.9]])
+    given = jnp.float32(fitnesses)
+    held = MapElitesRepertoire.init(genotypes, given, found, cells, {})
+    state = made.init(jax.random.key(1), held, genotypes, given, found, {})
+    np.testing.assert_allclose(state.unit, unit, rtol=1e-6)
+
+
+def test_an_archive_without_elites_has_no_spread() -> None:
+    assert float(_spread(jnp.full(4, -jnp.inf))) == 0
+    assert float(_spread(jnp.float32([2.0, -jnp.inf, 4.0]))) == 1
 
 
 @pytest.mark.slow

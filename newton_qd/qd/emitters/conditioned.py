@@ -153,7 +153,12 @@ class ConditionedActorEmitter(Emitter):
         fitnesses = fitnesses.reshape(-1)
         actor = self._policy.unconditioned(genotypes[jnp.argmax(fitnesses)])
         length = self._method.episode_length
-        unit = jnp.maximum(jnp.std(fitnesses) / length, 1e-6) * length
+        finite = jnp.isfinite(fitnesses)
+        kept = jnp.where(finite, fitnesses, 0)
+        some = _spread(jnp.where(finite, fitnesses, -jnp.inf))
+        # a mean with a mask is rounded in another way
+        spread = jnp.where(jnp.all(finite), jnp.std(kept), some)
+        unit = jnp.maximum(spread / length, 1e-6) * length
         logits = jnp.zeros((len(repertoire.centroids),), actor.dtype)
         worlds = self._worlds(repertoire, logits, unit, aim_key)
         aim = jnp.ones((1,), actor.dtype)
@@ -280,6 +285,8 @@ class ConditionedActorEmitter(Emitter):
 
 
 def _spread(fitnesses: jax.Array) -> jax.Array:
-    """Returns the standard deviation () of the fitness of the filled cells."""
+    """Returns the standard deviation () of the fitness of the filled cells, or 0."""
     filled = fitnesses > -jnp.inf
-    return jnp.std(jnp.where(filled, fitnesses, 0), where=filled)
+    # without a filled cell, this is the deviation of zeros
+    counted = filled | ~jnp.any(filled)
+    return jnp.std(jnp.where(filled, fitnesses, 0), where=counted)
