@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from point_runs import PointEnv, point_task
+from point_runs import SMALL, PointEnv, point_task
 from qdax.core.containers.mapelites_repertoire import (
     MapElitesRepertoire,
     compute_euclidean_centroids,
@@ -19,9 +19,11 @@ from qdax.core.containers.mapelites_repertoire import (
 from test_actor_critic import SETTINGS, compiled
 
 from newton_qd.extractors import get_final_xy_position
+from newton_qd.qd.config import ConfigError
 from newton_qd.qd.emitters import ActorCritic, ConditionedActorEmitter
 from newton_qd.qd.emitters.aims import AimedEnv, ConditionedPolicy, no_measure
 from newton_qd.qd.emitters.conditioned import _spread
+from newton_qd.qd.run.search import Search
 from newton_qd.qd.scoring.rollout import Policy, make_policy
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
@@ -287,3 +289,14 @@ def test_without_conditioning_copies_are_equal() -> None:
     worlds = made._worlds(held, state.logits, state.unit, jax.random.key(0))
     np.testing.assert_array_equal(worlds.target, 0)
     np.testing.assert_array_equal(worlds.weights[:, 1], 0)
+
+
+def test_a_network_of_ones_own_is_refused() -> None:
+    config = SMALL.replace(algorithm="me-conditioned")
+    own = dataclasses.replace(
+        point_task(config),
+        network=lambda key: jax.tree_util.Partial(jnp.dot, jnp.ones((2, 3))),
+    )
+    text = "algorithm: got 'me-conditioned', which needs the default network; allowed:"
+    with pytest.raises(ConfigError, match=text):
+        Search(config, own)

@@ -73,12 +73,21 @@ class ConditionedOptions(DifferentiableOptions, ActorCriticSettings):
 
 
 def _make(context: EmitterContext, options: ConditionedOptions) -> Any:
-    """MAP-Elites with the policies of an actor that is told the target descriptor."""
+    """MAP-Elites with the policies of an actor that is told the target descriptor.
+
+    Raises:
+        ConfigError: The task has a network of its own, or the options do not fit the
+            size of a generation.
+    """
     from newton_qd.qd.emitters import ActorCritic, ConditionedActorEmitter
     from newton_qd.qd.emitters.aims import AimedEnv, ConditionedPolicy, no_measure
     from newton_qd.qd.emitters.whitening import Whitening
 
     config = context.config
+    if context.task.network is not None:
+        why = "which needs the default network"
+        allowed = "a task whose network is None, or an algorithm that takes any network"
+        raise ConfigError(message("algorithm", config.algorithm, allowed, why=why))
     copies, between = options.numbers(config)
     task = differentiable(context.task, options, options.termination_width)
     env = AimedEnv(task, config.episode_length)
