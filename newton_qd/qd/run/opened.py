@@ -91,7 +91,7 @@ class Run:
             (iteration + 1,).
         reevaluated: Metrics of re-evaluated elites; ``None`` if there are none.
         start_key: Key of the reset that all evaluations of the run start with. It
-            follows from the seed.
+            follows from the seed. With ``new_starts``, generations have other keys.
     """
 
     path: Path
@@ -203,7 +203,8 @@ class Run:
             cell: Row of the archive, or (N,) rows; ``None``: all elites.
             keys: Key or (K,) keys of the reset. ``None``: the key of the run. Then
                 fitness and descriptor are bitwise those of the archive, on the same
-                kind of machine with the same versions.
+                kind of machine with the same versions. With ``new_starts`` they are
+                not, because each generation had start states of its own.
 
         Raises:
             IndexError: A cell does not exist.

@@ -372,7 +372,7 @@ class Search:
 
 
 def start_key(seed: int) -> jax.Array:
-    """Returns the key of the reset that all evaluations of a run start with."""
+    """Returns the key of a run's resets; ``new_starts`` folds a number into it."""
     return _keys(seed)[1]
 
 
