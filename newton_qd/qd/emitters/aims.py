@@ -71,7 +71,8 @@ class AimedEnv:
 
     for a target d, if the descriptor is the mean of the state descriptors m, or the
     final position p. A step is rewarded with :math:`w_1 r + w_2 T (|e_t| -
-    |e_{t+1}|)`. Summed over the episode, the second term is the distance between the
+    |e_{t+1}|)`. Summed over the episode, the second term is :math:`w_2 T (|e_0| -
+    |e_T|)`. For a mean, :math:`e_0` is 0, and :math:`|e_T|` is the distance between the
     episode's descriptor and the target. It has a gradient through the physics. The end
     of an episode by a fall costs as much as 30 steps away from the target; without
     that, a fall would be the way to come no further away.
