@@ -116,6 +116,18 @@ def test_what_is_not_finite_never_enters() -> None:
     assert bool(jnp.all(jnp.isfinite(found.thresholds)))
 
 
+def test_with_rate_one_the_threshold_is_the_mean_of_what_enters() -> None:
+    found = AnnealedRepertoire.init(
+        jnp.zeros((4, 1)),
+        jnp.float32([1, 2, 6, -2]),
+        jnp.full((4, 1), 0.1),
+        jnp.float32([[0.25], [0.75]]),
+        learning_rate=1.0,
+        threshold_min=-1.0,
+    )
+    np.testing.assert_array_equal(found.thresholds, [3, -1])
+
+
 @pytest.mark.parametrize(
     ("rate", "floor", "message"),
     [

@@ -117,7 +117,8 @@ class AnnealedRepertoire(MapElitesRepertoire, kw_only=True):
             centroids: (cells, D) centres of the cells.
             extra_scores: Their extra scores.
             learning_rate: Learning rate alpha in [0, 1]. With 1, the threshold is the
-                fitness of the last individual that entered. With 0, it never changes.
+                mean fitness of the individuals above it in the last batch with any.
+                With 0, it never changes.
             threshold_min: First threshold of every cell, in units of the fitness: the
                 lowest useful fitness.
             keys_extra_scores: Extra scores to store.
