@@ -37,8 +37,8 @@ class Limits:
         reach: Whether it goes on after that until it has its number of evaluations.
         deadline: ``time.monotonic()`` after which the run saves its state and ends.
         paced: Whether runs share a GPU, with generations as their clock.
-        states: Whether the state is saved. DCRL-ME has gigabytes of it, and a GPU that
-            is lent is idle meanwhile.
+        states: Whether the state is saved. DCRL-ME has gigabytes of it, and a run
+            stands still meanwhile.
     """
 
     until: float

@@ -175,12 +175,23 @@ Side = list[tuple[float, float, float, str, int]]
 """Middle, low and high of the corrected QD score, algorithm, and number of seeds."""
 
 
-def sides_of(results: Results, task: str, stop: str) -> tuple[Side, Side]:
-    """Returns our algorithms, with chosen variants, and all variants of others."""
+def sides_of(
+    results: Results, task: str, stop: str, rival: str | None = None
+) -> tuple[Side, Side]:
+    """Returns our algorithms, with chosen variants, and all variants of others.
+
+    Args:
+        results: The runs.
+        task: Their task.
+        stop: Their stop.
+        rival: The only other algorithm that counts; ``None``: all.
+    """
     sides: tuple[Side, Side] = [], []
     for (own, algorithm, at), runs in results.items():
-        other = algorithm.split("@")[0] not in OURS
+        name = algorithm.partition("@")[0]
+        other = name not in OURS
         counts = is_variant(algorithm) if other else "@" not in algorithm
+        counts &= not other or rival in (None, name)
         if (own, at) == (task, stop) and counts:
             found = [float(run.line["corrected_qd_score"]) for run in runs]
             scores = interval([np.asarray(found)])
@@ -188,14 +199,18 @@ def sides_of(results: Results, task: str, stop: str) -> tuple[Side, Side]:
     return sides
 
 
-def to_best_other(results: Results, task: str, stop: str) -> tuple | None:
+def to_best_other(
+    results: Results, task: str, stop: str, rival: str | None = None
+) -> tuple[float, str, int] | None:
     """Compares our best algorithm with the best other one; enough seeds count first.
+
+    The arguments are those of ``sides_of``.
 
     Returns:
         Their ratio, whether their intervals overlap, and the number of seeds of that
         which has fewer; or None if one side has no run.
     """
-    sides = sides_of(results, task, stop)
+    sides = sides_of(results, task, stop, rival)
     if not all(sides):
         return None
     ours, best = (max(_enough(side)) for side in sides)

@@ -84,17 +84,18 @@ def table(results: Results, stop: str) -> str:
     return "\n".join(rows)
 
 
-def overview(results: Results) -> str:
+def overview(results: Results, rival: str | None = None) -> str:
     """Markdown table: our ratio to the best other algorithm, by task and stop.
 
-    Those with enough seeds count first. Bold: the intervals do not overlap.
+    Those with enough seeds count first. With ``rival``, only this other algorithm
+    counts. Bold: the intervals do not overlap.
     """
     stops = sorted({key[2] for key in results}, key=lambda stop: (len(stop), stop))
     rows = [f"| task | {' | '.join(stops)} |", "|---" * (1 + len(stops)) + "|"]
     for task in sorted({key[0] for key in results}):
         cells = []
         for stop in stops:
-            found = to_best_other(results, task, stop)
+            found = to_best_other(results, task, stop, rival)
             if found is None:
                 cells.append("-")
                 continue
@@ -155,6 +156,7 @@ def published(results: Results) -> str:
 def report(results: Results) -> str:
     """Returns all tables."""
     parts = ["## Overview", overview(results)]
+    parts += ["## Overview against MAP-Elites alone", overview(results, "me")]
     for stop in dict.fromkeys(key[2] for key in sorted(results, key=lambda k: k[2])):
         parts += [f"## At {stop}", verdict(results, stop), table(results, stop)]
     if found := published(results):

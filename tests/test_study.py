@@ -231,6 +231,10 @@ def test_the_overview_prefers_enough_seeds() -> None:
         "| task | 20 s | 60 s | 250 s |",
         f"| {TASK} | **2.00** | 1.33 (1 of 3 seeds) | - |",
     ]
+    results[TASK, "dcrl-me", "20 s"] = runs("dcrl-me", 8.0, 3)
+    first = f"| {TASK} | **0.50** |", f"| {TASK} | **2.00** |"
+    for rival, start in zip((None, "me"), first, strict=True):
+        assert study_scores.overview(results, rival).splitlines()[2].startswith(start)
 
 
 def test_published_ratios_are_of_single_evaluations() -> None:
