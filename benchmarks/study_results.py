@@ -22,6 +22,11 @@ from newton_qd.qd.run import quality
 
 BEST_KNOWN = Path(__file__).resolve().parent / "study" / "best_known.csv"
 LEAST_SEEDS = 3  # below, an interval says nothing
+MEDIAN = "-median"
+"""End of the names of variants of DCRL-ME whose runs were made before a fix.
+
+Each episode was told the median descriptor of its individual. These runs count, too.
+"""
 
 
 Key = tuple[str, str, str]
@@ -71,7 +76,8 @@ def load(folder: Path) -> Results:
 def main_variants(kept: list[dict[str, str]]) -> dict[tuple[str, str, str], str]:
     """Returns the chosen variant, by task, algorithm and stop; no ablations.
 
-    A variant without a line is not chosen. Then the one with the most lines is taken.
+    A variant without a line is not chosen. Then the one with the most lines is taken,
+    of DCRL-ME with as many lines one that was told each episode's descriptor.
     """
     counts = Counter(
         (line["task"], line["algorithm"], line["stop"], line["variant"])
@@ -79,8 +85,12 @@ def main_variants(kept: list[dict[str, str]]) -> dict[tuple[str, str, str], str]
         if is_variant(line["variant"])
     )
     found = {}
+
+    def rank(key: tuple[str, ...]) -> tuple[int, bool]:
+        return counts[key], not key[3].endswith(MEDIAN)
+
     # later keys replace earlier ones
-    for *place, variant in sorted(counts, key=lambda key: counts[key]):
+    for *place, variant in sorted(counts, key=rank):
         task, algorithm, stop = place
         wanted = chosen(algorithm, task, at_evaluations="evaluations" in stop)
         there = (task, algorithm, stop, wanted) in counts
@@ -90,7 +100,8 @@ def main_variants(kept: list[dict[str, str]]) -> dict[tuple[str, str, str], str]
 
 def is_variant(name: str) -> bool:
     """Whether this is an algorithm or a variant of it, and no ablation."""
-    return name.partition("@")[2].isdigit() or "@" not in name
+    number = name.partition("@")[2].removesuffix(MEDIAN)
+    return number.isdigit() or "@" not in name
 
 
 def best_known() -> dict[str, float]:

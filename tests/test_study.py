@@ -184,6 +184,18 @@ def test_a_chosen_variant_has_the_name_where_it_came_so_far() -> None:
     }
 
 
+def test_runs_before_a_fix_have_the_name_only_if_there_are_more() -> None:
+    def name(*variants: str) -> str:
+        rows = [line("dcrl-me", 0, "20 s") | {"variant": name} for name in variants]
+        (found,) = study_results.main_variants(rows).values()
+        return found
+
+    before, after = "dcrl-me@5-median", "dcrl-me@5"
+    assert name(before, after) == name(after, before) == after
+    assert name(before, after, before) == before
+    assert study_results.is_variant(before)
+
+
 def test_a_number_of_evaluations_can_have_another_variant() -> None:
     main = study_runs.chosen("me-actor-critic", TASK)
     other = study_runs.chosen("me-actor-critic", TASK, at_evaluations=True)
