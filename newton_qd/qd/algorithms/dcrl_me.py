@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from newton_qd.checks import listed, message
@@ -13,6 +14,8 @@ from newton_qd.qd.config import ConfigError, EvolveConfig
 
 if TYPE_CHECKING:
     import jax
+
+    from newton_qd.qd.scoring.task import Task
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -59,27 +62,22 @@ class DCRLMEOptions(CriticOptions):
         return found
 
 
-def _make(context: EmitterContext, options: DCRLMEOptions) -> Any:
-    """DCRL-ME: critic and actor depend on the descriptor (Faldor et al. 2024)."""
+def conditioned_actor(config: EvolveConfig, task: Task) -> Any:
+    """Returns the network of an actor that depends on the descriptor."""
     import jax
-    import jax.numpy as jnp
-
-    from newton_qd import compat
-
-    compat.install()  # QDax's file imports environments that fail with today's JAX
-    from qdax.core.emitters.dcrl_me_emitter import DCRLMEConfig, DCRLMEEmitter
-    from qdax.core.neuroevolution.buffers.buffer import DCRLTransition
     from qdax.core.neuroevolution.networks.networks import MLPDC
 
-    from newton_qd.qd.algorithms.each_episode import EachEpisode
-    from newton_qd.qd.algorithms.network_emitter import OfParameters
-
-    config, task = context.config, context.task
-    actor = MLPDC(
+    return MLPDC(
         layer_sizes=(*config.hidden, task.env.action_size),
         kernel_init=jax.nn.initializers.lecun_uniform(),
-        final_activation=jnp.tanh,
+        final_activation=jax.numpy.tanh,
     )
+
+
+def transitions_of(task: Task) -> Callable[[dict[str, jax.Array]], Any]:
+    """Returns the function that makes QDax's transitions from steps of a task."""
+    import jax.numpy as jnp
+    from qdax.core.neuroevolution.buffers.buffer import DCRLTransition
 
     def convert(steps: dict[str, jax.Array]) -> Any:
         # Rewards are weighted by the distance of descriptors, so they must not be
@@ -91,13 +89,28 @@ def _make(context: EmitterContext, options: DCRLMEOptions) -> Any:
             **{**steps, "rewards": rewards}, desc=unknown, desc_prime=unknown
         )
 
+    return convert
+
+
+def _make(context: EmitterContext, options: DCRLMEOptions) -> Any:
+    """DCRL-ME: critic and actor depend on the descriptor (Faldor et al. 2024)."""
+    from newton_qd import compat
+
+    compat.install()  # QDax's file imports environments that fail with today's JAX
+    from qdax.core.emitters.dcrl_me_emitter import DCRLMEConfig, DCRLMEEmitter
+
+    from newton_qd.qd.algorithms.each_episode import EachEpisode
+    from newton_qd.qd.algorithms.network_emitter import OfParameters
+
+    config, task = context.config, context.task
+
     def made(times: int) -> Any:
         """Returns the emitter for generations so many times as large."""
         shares = {name: times * size for name, size in options.shares(config).items()}
         return DCRLMEEmitter(
             DCRLMEConfig(**{**dataclasses.asdict(options), **shares}),
             context.policy.network,
-            actor,
+            conditioned_actor(config, task),
             task.env,
             isoline(config),
         )
@@ -105,7 +118,7 @@ def _make(context: EmitterContext, options: DCRLMEOptions) -> Any:
     emitter: Any = made(1)
     if config.starts > 1:
         emitter = EachEpisode(emitter, made(config.starts), config.starts)
-    return OfParameters(emitter, context.policy, convert)
+    return OfParameters(emitter, context.policy, transitions_of(task))
 
 
 DCRL_ME = AlgorithmSpec(

@@ -65,3 +65,40 @@ class OfParameters:
                 "transitions": self._convert(extra["transitions"]),
             },
         }
+
+
+class Part:
+    """An emitter as a part of QDax's ``MultiEmitter``.
+
+    It is told about the offspring of all parts.
+
+    Args:
+        emitter: Emitter that takes what it is told by name.
+        batch_size: Individuals that it emits in one generation.
+    """
+
+    use_all_data = True
+
+    def __init__(self, emitter: OfParameters, batch_size: int) -> None:
+        self.batch_size = batch_size
+        self._emitter = emitter
+
+    def init(self, key: jax.Array, *told: PyTree) -> PyTree:
+        """Returns the state before the second generation."""
+        return self._emitter.init(key, **_named(told))
+
+    def emit(
+        self, repertoire: Repertoire, state: PyTree, key: jax.Array
+    ) -> tuple[jax.Array, ExtraScores]:
+        """Returns weights (N, size) and the emitter's data about them."""
+        return self._emitter.emit(repertoire, state, key)
+
+    def state_update(self, emitter_state: PyTree, *told: PyTree) -> PyTree:
+        """Learns from a generation."""
+        return self._emitter.state_update(emitter_state, **_named(told))
+
+
+def _named(told: tuple[PyTree, ...]) -> dict[str, PyTree]:
+    """Returns what a ``MultiEmitter`` tells its parts, with names."""
+    names = "repertoire", "genotypes", "fitnesses", "descriptors", "extra_scores"
+    return dict(zip(names, told, strict=True))
