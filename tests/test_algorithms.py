@@ -48,12 +48,6 @@ OPTIONS: dict[str, dict[str, Any]] = {
         **{"actors": 2, "branches": 1, "copies": 4, "updates": 1, "lifetime": 3},
         **{"worlds": 2, "window": 4, "batches": 2, "critic": (8,)},
     },
-    "dcrl-actor-critic": {
-        **{"actors": 2, "branches": 1, "copies": 4, "updates": 1, "lifetime": 3},
-        **{"worlds": 2, "window": 4, "batches": 2, "critic": (8,)},
-        **{"followers": 3, "injected": 2, "follow_steps": 2, "replay_steps": 2},
-        **{"replay_rows": 16, "replay_size": 1024},
-    },
     "ascii-me": {"epochs": 2},
     "ascii-me-exact": {"epochs": 2, "branches": 4, "window": 4},
     "me-conditioned": {"worlds": 2, "window": 4, "batches": 2, "critic": (8,)},
@@ -150,7 +144,7 @@ def test_a_stop_changes_nothing(
     # sixteen control steps of two actors.
     more = {"me-gradient": 2, "me-actor-critic": 1, "cma-mega": 2, "cma-maega": 2}
     # two parents, each once for its actions and once for the gradient
-    more |= {"ascii-me-exact": 4, "me-conditioned": 1, "dcrl-actor-critic": 1}
+    more |= {"ascii-me-exact": 4, "me-conditioned": 1}
     # two solution points, and the 64 control steps of their actors
     more |= {"cma-maega-actor-critic": 2 + 4}
     each = 16 + {"me-es": 1, **more}.get(name, 0)
@@ -231,11 +225,6 @@ def test_shares_of_a_batch_that_do_not_fit_are_refused() -> None:
             "steered: got 2.0; allowed: .* from 0 to 1",
         ),
         ("me-actor-critic", {}, r"copies: got \(.*, 8\); allowed: .*batch_size = 16"),
-        (
-            "dcrl-actor-critic",
-            {"actors": 1, "branches": 1, "copies": 6, "followers": 8, "injected": 4},
-            r"copies: got \(1, 1, 6\); allowed: at most batch_size - 12 = 4 as their",
-        ),
         (
             "me-conditioned",
             {"copies": 0.9, "between": 0.9},

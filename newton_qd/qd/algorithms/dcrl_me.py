@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from newton_qd.checks import listed, message
@@ -14,8 +13,6 @@ from newton_qd.qd.config import ConfigError, EvolveConfig
 
 if TYPE_CHECKING:
     import jax
-
-    from newton_qd.qd.scoring.task import Task
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -62,22 +59,27 @@ class DCRLMEOptions(CriticOptions):
         return found
 
 
-def conditioned_actor(config: EvolveConfig, task: Task) -> Any:
-    """Returns the network of an actor that depends on the descriptor."""
+def _make(context: EmitterContext, options: DCRLMEOptions) -> Any:
+    """DCRL-ME: critic and actor depend on the descriptor (Faldor et al. 2024)."""
     import jax
+    import jax.numpy as jnp
+
+    from newton_qd import compat
+
+    compat.install()  # QDax's file imports environments that fail with today's JAX
+    from qdax.core.emitters.dcrl_me_emitter import DCRLMEConfig, DCRLMEEmitter
+    from qdax.core.neuroevolution.buffers.buffer import DCRLTransition
     from qdax.core.neuroevolution.networks.networks import MLPDC
 
-    return MLPDC(
+    from newton_qd.qd.algorithms.each_episode import EachEpisode
+    from newton_qd.qd.algorithms.network_emitter import OfParameters
+
+    config, task = context.config, context.task
+    actor = MLPDC(
         layer_sizes=(*config.hidden, task.env.action_size),
         kernel_init=jax.nn.initializers.lecun_uniform(),
-        final_activation=jax.numpy.tanh,
+        final_activation=jnp.tanh,
     )
-
-
-def transitions_of(task: Task) -> Callable[[dict[str, jax.Array]], Any]:
-    """Returns the function that makes QDax's transitions from steps of a task."""
-    import jax.numpy as jnp
-    from qdax.core.neuroevolution.buffers.buffer import DCRLTransition
 
     def convert(steps: dict[str, jax.Array]) -> Any:
         # Rewards are weighted by the distance of descriptors, so they must not be
@@ -89,28 +91,13 @@ def transitions_of(task: Task) -> Callable[[dict[str, jax.Array]], Any]:
             **{**steps, "rewards": rewards}, desc=unknown, desc_prime=unknown
         )
 
-    return convert
-
-
-def _make(context: EmitterContext, options: DCRLMEOptions) -> Any:
-    """DCRL-ME: critic and actor depend on the descriptor (Faldor et al. 2024)."""
-    from newton_qd import compat
-
-    compat.install()  # QDax's file imports environments that fail with today's JAX
-    from qdax.core.emitters.dcrl_me_emitter import DCRLMEConfig, DCRLMEEmitter
-
-    from newton_qd.qd.algorithms.each_episode import EachEpisode
-    from newton_qd.qd.algorithms.network_emitter import OfParameters
-
-    config, task = context.config, context.task
-
     def made(times: int) -> Any:
         """Returns the emitter for generations so many times as large."""
         shares = {name: times * size for name, size in options.shares(config).items()}
         return DCRLMEEmitter(
             DCRLMEConfig(**{**dataclasses.asdict(options), **shares}),
             context.policy.network,
-            conditioned_actor(config, task),
+            actor,
             task.env,
             isoline(config),
         )
@@ -118,7 +105,7 @@ def _make(context: EmitterContext, options: DCRLMEOptions) -> Any:
     emitter: Any = made(1)
     if config.starts > 1:
         emitter = EachEpisode(emitter, made(config.starts), config.starts)
-    return OfParameters(emitter, context.policy, transitions_of(task))
+    return OfParameters(emitter, context.policy, convert)
 
 
 DCRL_ME = AlgorithmSpec(

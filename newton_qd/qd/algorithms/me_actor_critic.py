@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from newton_qd.checks import message
 from newton_qd.qd.algorithms.gradient_options import initial_scale
@@ -11,9 +11,6 @@ from newton_qd.qd.algorithms.learning import LearningOptions, learning_method
 from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext
 from newton_qd.qd.algorithms.variation import with_isoline
 from newton_qd.qd.config import ConfigError, EvolveConfig
-
-if TYPE_CHECKING:  # importing a list of algorithms imports no JAX
-    from newton_qd.qd.emitters import ActorCriticEmitter
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -53,22 +50,15 @@ _MAZES = ("antmaze", "antmaze_u", "antmaze_big", "antmaze_hardest", "humanoid_ma
 _STEERED = {"steered": 1.0, "fitness": 0.0, **_LONG}
 
 
-def actors_of(
-    context: EmitterContext, options: ActorCriticOptions, room: int
-) -> ActorCriticEmitter:
-    """Returns the emitter of the actors.
-
-    Args:
-        context: What the run gives to its algorithm.
-        options: Options of the actors.
-        room: Individuals of a generation that may be offspring of actors.
+def _make(context: EmitterContext, options: ActorCriticOptions) -> Any:
+    """MAP-Elites with the policies of actors that learn over short horizons.
 
     Raises:
-        ConfigError: The actors have more offspring.
+        ConfigError: The actors have more offspring than a generation can contain.
     """
     from newton_qd.qd.emitters import ActorCriticEmitter
 
-    task, method = learning_method(context, options)
+    config, (task, method) = context.config, learning_method(context, options)
     emitter = ActorCriticEmitter(
         method,
         task.env.reset(context.reset_key),
@@ -81,32 +71,19 @@ def actors_of(
         lifetime=options.lifetime,
         measures=task.descriptor_length,
     )
-    if emitter.batch_size > room:
+    if emitter.batch_size > config.batch_size:
         given = options.actors, options.branches, options.copies
-        others = context.config.batch_size - room
-        less = f" - {others}" * (others > 0)
-        allowed = f"at most batch_size{less} = {room} as their product"
-        raise ConfigError(message("options: actors, branches, copies", given, allowed))
-    return emitter
+        allowed = f"at most batch_size = {config.batch_size} as their product"
+        name = "options: actors, branches, copies"
+        raise ConfigError(message(name, given, allowed))
+    return with_isoline(emitter, config)
 
 
-def _make(context: EmitterContext, options: ActorCriticOptions) -> Any:
-    """MAP-Elites with the policies of actors that learn over short horizons.
-
-    Raises:
-        ConfigError: The actors have more offspring than a generation can contain.
-    """
-    config = context.config
-    return with_isoline(actors_of(context, options, config.batch_size), config)
-
-
-def gradients(config: EvolveConfig, options: ActorCriticOptions) -> int:
-    """Returns the differentiated episodes of a generation."""
+def _gradients(config: EvolveConfig, options: ActorCriticOptions) -> int:
     return options.episodes(config)
 
 
-def evaluations(config: EvolveConfig, options: ActorCriticOptions) -> int:
-    """Returns the episodes of a generation, with those that are differentiated."""
+def _evaluations(config: EvolveConfig, options: ActorCriticOptions) -> int:
     return config.batch_size + options.episodes(config)
 
 
@@ -118,7 +95,7 @@ ME_ACTOR_CRITIC = AlgorithmSpec(
     make=_make,
     options=ActorCriticOptions,
     tuned={"ant_omni": _LONG, **dict.fromkeys(_MAZES, _STEERED)},
-    evaluations=evaluations,
-    gradients=gradients,
+    evaluations=_evaluations,
+    gradients=_gradients,
     initial_scale=initial_scale,
 )
