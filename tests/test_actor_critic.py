@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import inspect
 from typing import Any
 
 import jax
@@ -50,8 +51,11 @@ def method(measure: Any = reading, **changes: Any) -> ActorCritic:
 
 
 def learner(way: ActorCritic, aim: tuple[float, ...] = (1.0, 0.0, 0.0)) -> Any:
-    first = jax.vmap(PointEnv().reset)(jax.random.split(jax.random.key(0), 4))
-    return way.begin(jax.random.key(1), jnp.zeros(SIZE), jnp.array(aim), first)
+    def begin(aim: jax.Array) -> Any:
+        first = jax.vmap(PointEnv().reset)(jax.random.split(jax.random.key(0), 4))
+        return way.begin(jax.random.key(1), jnp.zeros(SIZE), aim, first)
+
+    return compiled(begin)(np.array(aim, np.float32))
 
 
 def learned(way: ActorCritic, aim: tuple[float, ...], updates: int = 60) -> Any:
@@ -240,14 +244,26 @@ def parts(measure: Any = reading) -> tuple[ActorCriticEmitter, Any, Any, Any]:
     return made, compiled(made.init), compiled(made.emit), compiled(made.state_update)
 
 
+@functools.cache
+def initial() -> tuple[MapElitesRepertoire, tuple[jax.Array, ...]]:
+    """Repertoire, genotypes, fitnesses and descriptors of the first actors."""
+
+    def begin() -> Any:
+        cells = compute_euclidean_centroids((4, 4), [-2.0, -2.0], [2.0, 2.0])
+        genotypes = 0.1 * jax.random.normal(jax.random.key(0), (16, SIZE), jnp.float32)
+        # a program inside of another one has no options of its own
+        fitnesses, found = jax.vmap(inspect.unwrap(play))(genotypes)
+        given = genotypes, fitnesses, found
+        return MapElitesRepertoire.init(*given, cells, {}), given
+
+    return compiled(begin)()
+
+
 def generations(number: int, measure: Any = reading) -> list[tuple[Any, Any, Any]]:
     """State, individuals and what is told of them, of each generation."""
     _, init, emit, update = parts(measure)
-    cells = compute_euclidean_centroids((4, 4), [-2.0, -2.0], [2.0, 2.0])
-    genotypes = 0.1 * jax.random.normal(jax.random.key(0), (16, SIZE), jnp.float32)
-    fitnesses, found = jax.vmap(play)(genotypes)
-    repertoire = MapElitesRepertoire.init(genotypes, fitnesses, found, cells, {})
-    state = init(jax.random.key(1), repertoire, genotypes, fitnesses, found, {})
+    repertoire, given = initial()
+    state = init(jax.random.key(1), repertoire, *given, {})
     rows = []
     for generation in range(number):
         offspring, told = emit(repertoire, state, jax.random.key(generation))
@@ -271,9 +287,8 @@ def test_individuals_are_actors_and_what_lies_between_them_and_elites() -> None:
 
 def test_a_single_copy_is_the_actor_itself() -> None:
     state = generations(1)[0][0]
-    archive = MapElitesRepertoire.init_default(
-        jnp.zeros(SIZE), compute_euclidean_centroids((4, 4), [-2.0, -2.0], [2.0, 2.0])
-    )
+    cells = compute_euclidean_centroids((4, 4), [-2.0, -2.0], [2.0, 2.0])
+    archive = compiled(MapElitesRepertoire.init_default)(jnp.zeros(SIZE), cells)
     offspring, _ = compiled(emitter(copies=1).emit)(archive, state, jax.random.key(0))
     np.testing.assert_array_equal(offspring, state.snapshots.reshape(-1, SIZE))
 

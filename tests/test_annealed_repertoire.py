@@ -117,13 +117,14 @@ def test_what_is_not_finite_never_enters() -> None:
 
 
 def test_with_rate_one_the_threshold_is_the_mean_of_what_enters() -> None:
-    found = AnnealedRepertoire.init(
-        jnp.zeros((4, 1)),
-        jnp.float32([1, 2, 6, -2]),
-        jnp.full((4, 1), 0.1),
-        jnp.float32([[0.25], [0.75]]),
-        learning_rate=1.0,
-        threshold_min=-1.0,
+    init = functools.partial(
+        AnnealedRepertoire.init, learning_rate=1.0, threshold_min=-1.0
+    )
+    found = jax.jit(init)(
+        np.zeros((4, 1), np.float32),
+        np.array([1, 2, 6, -2], np.float32),
+        np.full((4, 1), 0.1, np.float32),
+        np.array([[0.25], [0.75]], np.float32),
     )
     np.testing.assert_array_equal(found.thresholds, [3, -1])
 

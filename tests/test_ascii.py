@@ -54,8 +54,15 @@ def steps(seed: int = 0) -> dict[str, np.ndarray]:
     return found
 
 
+@functools.cache
+def behaviors() -> Any:
+    """From transitions, as NumPy's: JAX would compile every slice of it."""
+    found = compiled(lambda x: behavior_of(x, LENGTH, DISCOUNT))
+    return lambda x: jax.device_get(found(x))
+
+
 def seen(seed: int = 0) -> Behavior:
-    return compiled(lambda x: behavior_of(x, LENGTH, DISCOUNT))(steps(seed))
+    return behaviors()(steps(seed))
 
 
 def test_returns_are_sums_of_later_rewards() -> None:
@@ -177,8 +184,9 @@ def begun() -> tuple[AsciiEmitter, Any, Any]:
     )
     genotypes, fitnesses, places, _ = told()
     cells = compute_euclidean_centroids((2, 2), [0.0, 0.0], [1.0, 1.0])
-    held = MapElitesRepertoire.init(genotypes, fitnesses, places, cells, {})
-    return made, held, made.init(jax.random.key(0), held, *told())
+    archive = compiled(MapElitesRepertoire.init)
+    held = archive(genotypes, fitnesses, places, cells, {})
+    return made, held, compiled(made.init)(jax.random.key(0), held, *told())
 
 
 @pytest.mark.slow
@@ -207,8 +215,9 @@ def test_elites_keep_their_behavior() -> None:
     made, held, state = begun()
     genotypes, fitnesses, places, extra = told(1)
     fitnesses = fitnesses.at[0].set(-50.0)  # loses against the elite of its cell
-    held = held.add(genotypes, places, fitnesses, {})
-    after = made.state_update(state, held, genotypes, fitnesses, places, extra)
+    held = compiled(held.add)(genotypes, places, fitnesses, {})
+    update = compiled(made.state_update)
+    after = update(state, held, genotypes, fitnesses, places, extra)
     cells = [int(np.argmin(np.square(held.centroids - x).sum(1))) for x in places]
     np.testing.assert_array_equal(after.elites.obs[cells[0]], seen().obs[0])
     np.testing.assert_array_equal(after.elites.obs[cells[1]], seen(1).obs[1])
@@ -222,14 +231,15 @@ def test_better_actions_follow_the_derivative() -> None:
     slopes = np.random.default_rng(2).normal(size=(2, LENGTH, 2)).astype(np.float32)
     slopes[0, 3] *= 1e20
     slopes[1, 5:] = 0  # after the end
-    found = improved(own, jnp.asarray(slopes), 0.05) - own.actions
+    improve = compiled(improved)
+    found = np.asarray(improve(own, slopes, 0.05)) - own.actions
     lengths = np.linalg.norm(found, axis=-1)
     assert lengths.max() <= 0.05 * (1 + 1e-3) and lengths[0, 3] > 0.049
     cosine = np.sum(found * slopes / np.abs(slopes).max((1, 2), keepdims=True), -1)
     assert (cosine >= 0).all() and np.isfinite(found).all()
     np.testing.assert_array_equal(found[1, 5:], 0)
     nothing = jnp.zeros((2, LENGTH, 2))
-    np.testing.assert_array_equal(improved(own, nothing, 0.05), own.actions)
+    np.testing.assert_array_equal(improve(own, nothing, 0.05), own.actions)
 
 
 def rollout(weights: jax.Array, key: jax.Array) -> dict[str, jax.Array]:

@@ -149,6 +149,23 @@ def begun() -> tuple[Any, Any]:
     return held, state
 
 
+@functools.cache
+def begun_without_worlds() -> Any:
+    """First state for an archive's fitnesses; the worlds take long to compile."""
+    made: Any = emitter()
+    made._method = types.SimpleNamespace(episode_length=LENGTH, begin=lambda *_: None)
+    made._worlds = made._scale = lambda *_: None
+
+    def begin(fitnesses: jax.Array) -> Any:
+        cells = compute_euclidean_centroids((2, 2), [-1.0, -1.0], [3.0, 1.0])
+        genotypes = jnp.zeros((3, policy().size))
+        found = jnp.float32([[-0.5, -0.8], [0.4, 0.1], [2.9, 0.9]])
+        held = MapElitesRepertoire.init(genotypes, fitnesses, found, cells, {})
+        return made.init(jax.random.key(1), held, genotypes, fitnesses, found, {})
+
+    return compiled(begin)
+
+
 @pytest.mark.parametrize(
     ("fitnesses", "unit"),
     [
@@ -161,16 +178,7 @@ def begun() -> tuple[Any, Any]:
 def test_the_unit_is_the_deviation_of_what_is_finite(
     fitnesses: list[float], unit: float
 ) -> None:
-    """Without the worlds, whose programs take long to compile."""
-    made: Any = emitter()
-    made._method = types.SimpleNamespace(episode_length=LENGTH, begin=lambda *_: None)
-    made._worlds = made._scale = lambda *_: None
-    cells = compute_euclidean_centroids((2, 2), [-1.0, -1.0], [3.0, 1.0])
-    genotypes = jnp.zeros((3, policy().size))
-    found = jnp.float32([[-0.5, -0.8], [0.4, 0.1], [2.9, 0.9]])
-    given = jnp.float32(fitnesses)
-    held = MapElitesRepertoire.init(genotypes, given, found, cells, {})
-    state = made.init(jax.random.key(1), held, genotypes, given, found, {})
+    state = begun_without_worlds()(np.array(fitnesses, np.float32))
     np.testing.assert_allclose(state.unit, unit, rtol=1e-6)
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 import pytest
 from emitter_problems import (
@@ -18,6 +19,7 @@ from emitter_problems import (
     begin,
     broken,
     centroids,
+    compiled,
     emit,
     score,
     start,
@@ -53,11 +55,12 @@ def test_missing_gradients_are_named(name: str) -> None:
 
 
 def test_errors_name_what_is_wrong() -> None:
-    fitnesses, descriptors, extra = score(start(), jax.random.key(0))
+    found = compiled(score)(start(), jax.random.key(0))
+    fitnesses, descriptors, extra = jax.device_get(found)
     read = functools.partial(read_scores, start(), fitnesses, descriptors)
     with pytest.raises(GradientsError, match="extra_scores: got nothing"):
         read(None)
-    swapped = {"gradients": jnp.swapaxes(extra["gradients"], 1, 2)}
+    swapped = {"gradients": np.swapaxes(extra["gradients"], 1, 2)}
     with pytest.raises(GradientsError, match=r"\(16, 20, 3\).*swap the last two axes"):
         read(swapped)
     with pytest.raises(GradientsError, match=r"got shape \(16, 19, 3\)"):
@@ -74,9 +77,10 @@ def test_errors_name_what_is_wrong() -> None:
     with pytest.raises(ValueError, match=r"got 2 columns; allowed: 1 \+ D = 3 columns"):
         emitter = GradientVariationEmitter(4, optax.sgd(1.0), directions=[(1, 0)])
         emit(emitter, *begin(emitter))
-    # Values are known outside jit only.
+    # Values are known outside jit only; what finds them may be compiled.
+    scoring = compiled(broken)
     search = algorithm(
-        CMAMEGAEmitter(broken, sigma_g=1.0, start=jnp.ones(SIZE)), broken
+        CMAMEGAEmitter(scoring, sigma_g=1.0, start=jnp.ones(SIZE)), scoring
     )
     with pytest.raises(GradientsError, match="not finite"):
         search.init(start(), centroids(), jax.random.key(0))

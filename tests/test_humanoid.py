@@ -211,7 +211,8 @@ def test_reset_noise_is_on_the_joints_alone() -> None:
     for noise in (q[:, 7:] - humanoid().system.rest_q[7:], v[:, 6:]):
         assert np.all(np.abs(noise) <= 0.01 + 1e-6)
         assert np.all(np.abs(noise).max(axis=0) > 0.009)
-    lowest = jax.vmap(lambda q: physics.lowest_contact(humanoid().system, q))(state.q)
+    lowest_contact = functools.partial(physics.lowest_contact, humanoid().system)
+    lowest = jax.jit(jax.vmap(lowest_contact))(state.q)
     np.testing.assert_allclose(lowest, 0.0, atol=1e-6)
 
 
@@ -221,31 +222,40 @@ def test_first_observation_has_no_torques() -> None:
     assert float(state.reward) == float(state.done) == 0.0
 
 
-def at_height(env: Humanoid, height: float) -> State:
+@functools.cache
+def raised(env: Humanoid) -> Callable[[float], State]:
     """The state one step after the torso is put at a height."""
-    state = env.fixed_state()
-    start = state.pipeline_state
-    raised = dataclasses.replace(start, q=start.q.at[2].set(height))
-    return jax.jit(env.step)(
-        state.replace(pipeline_state=raised), jnp.zeros(17, np.float32)
-    )
+
+    def after(height: jax.Array) -> State:
+        state = env.fixed_state()
+        start = state.pipeline_state
+        high = dataclasses.replace(start, q=start.q.at[2].set(height))
+        state = state.replace(pipeline_state=high)
+        return env.step(state, jnp.zeros(17, np.float32))
+
+    return jax.jit(after)
+
+
+@functools.cache
+def lasting() -> Humanoid:
+    """A fall does not end its episodes."""
+    return Humanoid(terminate_when_unhealthy=False, healthy_reward=2.0)
 
 
 @pytest.mark.parametrize(("height", "healthy"), [(1.5, True), (2.2, False)])
 def test_unhealthy_heights_end_the_episode(height: float, healthy: bool) -> None:
-    ends = at_height(humanoid(), height)
+    ends = raised(humanoid())(height)
     assert bool(ends.done) is not healthy
     assert float(ends.metrics["reward_alive"]) == 5.0
-    lasting = Humanoid(terminate_when_unhealthy=False, healthy_reward=2.0)
-    goes_on = at_height(lasting, height)
+    goes_on = raised(lasting())(height)
     assert float(goes_on.done) == 0.0
     assert float(goes_on.metrics["reward_alive"]) == (2.0 if healthy else 0.0)
 
 
 def test_a_low_torso_ends_the_episode() -> None:
     high = Humanoid(healthy_z_range=(1.6, 2.1))
-    assert float(at_height(high, 1.5).done) == 1.0
-    assert float(at_height(high, 1.8).done) == 0.0
+    assert float(raised(high)(1.5).done) == 1.0
+    assert float(raised(high)(1.8).done) == 0.0
 
 
 def test_weights_and_positions_can_be_chosen() -> None:
