@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -126,33 +128,42 @@ def test_reward_and_metrics(rolled: tuple[State, State, np.ndarray]) -> None:
     assert np.any(contact > 0)
 
 
-def at_height(env: Ant, height: float) -> State:
+@functools.cache
+def raised(env: Ant) -> Callable[[float], State]:
     """The state one step after the torso is put at a height, without gravity's time."""
-    state = env.fixed_state()
-    start = state.pipeline_state
-    raised = dataclasses.replace(start, q=start.q.at[2].set(height))
-    return jax.jit(env.step)(
-        state.replace(pipeline_state=raised), jnp.zeros(8, np.float32)
-    )
+
+    def after(height: jax.Array) -> State:
+        state = env.fixed_state()
+        start = state.pipeline_state
+        high = dataclasses.replace(start, q=start.q.at[2].set(height))
+        state = state.replace(pipeline_state=high)
+        return env.step(state, jnp.zeros(8, np.float32))
+
+    return jax.jit(after)
+
+
+@functools.cache
+def lasting() -> Ant:
+    """A fall does not end its episodes."""
+    return Ant(terminate_when_unhealthy=False, healthy_reward=2.0)
 
 
 @pytest.mark.parametrize(
     ("height", "healthy"), [(0.9, True), (1.1, False), (2.0, False)]
 )
 def test_unhealthy_heights_end_the_episode(height: float, healthy: bool) -> None:
-    ends = at_height(ANT, height)
+    ends = raised(ANT)(height)
     assert bool(ends.done) is not healthy
     assert float(ends.metrics["reward_survive"]) == 1.0
-    lasting = Ant(terminate_when_unhealthy=False, healthy_reward=2.0)
-    goes_on = at_height(lasting, height)
+    goes_on = raised(lasting())(height)
     assert float(goes_on.done) == 0.0
     assert float(goes_on.metrics["reward_survive"]) == (2.0 if healthy else 0.0)
 
 
 def test_a_low_torso_ends_the_episode() -> None:
     high = Ant(healthy_z_range=(0.6, 1.0))
-    assert float(at_height(high, 0.55).done) == 1.0
-    assert float(at_height(high, 0.8).done) == 0.0
+    assert float(raised(high)(0.55).done) == 1.0
+    assert float(raised(high)(0.8).done) == 0.0
 
 
 def test_weights_scale_the_costs() -> None:

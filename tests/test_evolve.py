@@ -160,7 +160,8 @@ def brute_force(env: PointEnv, act_and_step: Any, genotype: Any, key: Any) -> tu
 def test_scoring_agrees_with_a_plain_loop() -> None:
     task = point_task(SMALL)
     policy = make_policy(task.env, SMALL.hidden)
-    genotypes = 3 * jax.vmap(policy.init)(jax.random.split(jax.random.key(3), 24))
+    draw = jax.jit(jax.vmap(policy.init))
+    genotypes = 3 * np.asarray(draw(jax.random.split(jax.random.key(3), 24)))
     key = jax.random.key(4)
     score = jax.jit(make_scoring_function(task, policy, SMALL.episode_length))
     fitnesses, descriptors, _ = score(genotypes, key)

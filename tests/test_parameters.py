@@ -43,7 +43,7 @@ def inputs(system: System, worlds: int = WORLDS) -> tuple[PhysicsState, jax.Arra
     states = random_states(system, np.random.default_rng(0), worlds)
     q, v, control = (jnp.asarray(x, system.dtype) for x in states)
     start = functools.partial(physics.initial_state, system)
-    return jax.vmap(start)(q, v), control
+    return jax.jit(jax.vmap(start))(q, v), control
 
 
 def close(found: Any, expected: Any) -> bool:
@@ -322,11 +322,12 @@ def test_transformations_agree(x64: None) -> None:
     def value(params: Params, q: jax.Array, v: jax.Array, u: jax.Array) -> jax.Array:
         return weigh(q, v, u, params)
 
-    arguments = (params, state.q, state.v, control)
+    # as NumPy's: JAX would compile every slice of it
+    arguments = jax.device_get((params, state.q, state.v, control))
     inner = jax.jit(jax.vmap(jax.grad(value)))(*arguments)
     outer = jax.jit(jax.grad(lambda *x: jax.vmap(value)(*x).sum()))(*arguments)
     pairs = jax.tree.map(lambda x: x.reshape(2, 2, *x.shape[1:]), arguments)
-    nested = jax.jit(jax.vmap(jax.vmap(jax.grad(value))))(*pairs)
+    nested = jax.device_get(jax.jit(jax.vmap(jax.vmap(jax.grad(value))))(*pairs))
     again = jax.jit(jax.vmap(jax.grad(jax.checkpoint(value))))(*arguments)
     flat = jax.tree.map(lambda x: x.reshape(4, *x.shape[2:]), nested)
     for found in (outer, flat, again):
@@ -336,7 +337,8 @@ def test_transformations_agree(x64: None) -> None:
     all_worlds = jax.vmap(value, (None, 0, 0, 0))
     shared = jax.jit(jax.grad(lambda *x: all_worlds(*x).sum()))(one, *arguments[1:])
     each = jax.jit(jax.vmap(jax.grad(value), (None, 0, 0, 0)))(one, *arguments[1:])
-    assert close(shared, jax.tree.map(lambda x: x.sum(axis=0), each))
+    total = jax.tree.map(lambda x: x.sum(axis=0), jax.device_get(each))
+    assert close(shared, total)
 
 
 def test_gravity_in_free_flight(x64: None) -> None:
