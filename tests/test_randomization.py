@@ -185,8 +185,9 @@ def test_environments_without_parameters() -> None:
     env = make("pointmaze", "batch")
     state, action = reset(env)(KEY), jnp.zeros((3, 2), np.float32)
     assert env.default_params is None
+    advance = jax.jit(env.step)
     assert same(
-        env.step(state, action, env.default_params), env.step(state, action, None)
+        advance(state, action, env.default_params), advance(state, action, None)
     )
     params = randomize_params(KEY, make("ant_uni"), 3)
     with pytest.raises(ValueError, match=r"params: got PhysicsParams\(.*None"):

@@ -118,7 +118,13 @@ def test_joints_are_flat_arrays_too(batch: BraxState) -> None:
     assert jax.tree.structure(again) == jax.tree.structure(angles)
     humanoid: Any = newton_qd.create("humanoid", brax_views=True)
     qp = humanoid.sys.default_qp()
-    flat = jnp.concatenate([joint.angle_vel(qp)[0] for joint in humanoid.sys.joints])
+
+    @jax.jit
+    def all_angles(qp: Any) -> jax.Array:
+        joints = humanoid.sys.joints
+        return jnp.concatenate([joint.angle_vel(qp)[0] for joint in joints])
+
+    flat = all_angles(qp)
     settings = humanoid.sys.config.joints
     counts = [len(joint.angle_limit) for joint in settings]
     assert counts == sorted(counts) and sum(counts) == humanoid.sys.num_joint_dof
