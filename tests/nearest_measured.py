@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from unoptimized import leave_unoptimized
 
 from newton_qd.physics.buffers import build_model
 from newton_qd.physics.precision import Variant, build_kernels
@@ -53,6 +54,7 @@ def measuring(folder: Path, boxes: bool) -> Any:
     for name in ("add", "mul", "component"):
         setattr(module, name, getattr(nearest, name, None) or nearest.mul)
     spec.loader.exec_module(module)
+    leave_unoptimized(module)
     return module.measure
 
 

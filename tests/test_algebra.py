@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import warp as wp
+from unoptimized import leave_unoptimized
 
 from newton_qd.physics.precision import Variant, build_kernels
 
@@ -75,6 +76,7 @@ def applied(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
         for function in functions().values()
     ]
     spec.loader.exec_module(module)
+    leave_unoptimized(module)
     made = {}
     for n, (name, function) in enumerate(functions().items()):
         made[name] = getattr(module, f"apply_{n}")

@@ -17,6 +17,7 @@ import warp as wp
 from coupled_bodies import coupled_system
 from hexapod import hexapod
 from physics_helpers import report
+from unoptimized import leave_unoptimized
 
 from newton_qd.physics import buffers
 from newton_qd.physics.model import build_system
@@ -63,6 +64,7 @@ class Solve:
         assert spec is not None and spec.loader is not None
         module = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(module)
+        leave_unoptimized(module)
         self.kernel = module.solve_once
         self.fill(np.random.default_rng(0))
 

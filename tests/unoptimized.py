@@ -1,0 +1,16 @@
+"""Kernels that only tests have, and that they run for a moment.
+
+Warp's compiler takes half as long without optimization; what a kernel computes stays
+the same, bit by bit. The kernels of the package are optimized in tests, as for users.
+"""
+
+from __future__ import annotations
+
+from types import ModuleType
+
+import warp as wp
+
+
+def leave_unoptimized(module: ModuleType) -> None:
+    """Compiles the kernels of a module fast from now on."""
+    wp.set_module_options({"optimization_level": 0}, module)
