@@ -86,7 +86,7 @@ def main_variants(kept: list[dict[str, str]]) -> dict[tuple[str, str, str], str]
     )
     found = {}
 
-    def rank(key: tuple[str, ...]) -> tuple[int, bool]:
+    def rank(key: tuple[str, str, str, str]) -> tuple[int, bool]:
         return counts[key], not key[3].endswith(MEDIAN)
 
     # later keys replace earlier ones
