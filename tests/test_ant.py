@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from torso_heights import raised
 
 from newton_qd import physics
 from newton_qd.envs.ant import Ant
@@ -126,20 +126,6 @@ def test_reward_and_metrics(rolled: tuple[State, State, np.ndarray]) -> None:
     reward = velocity[..., 0] + 1 - control - contact
     np.testing.assert_allclose(after.reward, reward, rtol=1e-5, atol=1e-5)
     assert np.any(contact > 0)
-
-
-@functools.cache
-def raised(env: Ant) -> Callable[[float], State]:
-    """The state one step after the torso is put at a height, without gravity's time."""
-
-    def after(height: jax.Array) -> State:
-        state = env.fixed_state()
-        start = state.pipeline_state
-        high = dataclasses.replace(start, q=start.q.at[2].set(height))
-        state = state.replace(pipeline_state=high)
-        return env.step(state, jnp.zeros(8, np.float32))
-
-    return jax.jit(after)
 
 
 @functools.cache

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any
@@ -12,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from physics_helpers import random_states
+from torso_heights import raised
 
 from newton_qd import physics
 from newton_qd.envs.base import State
@@ -220,20 +220,6 @@ def test_first_observation_has_no_torques() -> None:
     state = jax.jit(humanoid().reset)(jax.random.key(0))
     assert not np.asarray(state.obs[210:]).any()
     assert float(state.reward) == float(state.done) == 0.0
-
-
-@functools.cache
-def raised(env: Humanoid) -> Callable[[float], State]:
-    """The state one step after the torso is put at a height."""
-
-    def after(height: jax.Array) -> State:
-        state = env.fixed_state()
-        start = state.pipeline_state
-        high = dataclasses.replace(start, q=start.q.at[2].set(height))
-        state = state.replace(pipeline_state=high)
-        return env.step(state, jnp.zeros(17, np.float32))
-
-    return jax.jit(after)
 
 
 @functools.cache

@@ -1,7 +1,7 @@
 """Kernels that only tests have, and that they run for a moment.
 
-Warp's compiler takes half as long without optimization; what a kernel computes stays
-the same, bit by bit. The kernels of the package are optimized in tests, as for users.
+Warp's compiler takes half as long without optimization. The kernels of the package are
+optimized in tests, as for users.
 """
 
 from __future__ import annotations
