@@ -55,7 +55,7 @@ def ratios(results: Results, stops: list[str], path: Path) -> None:
     """Plots our ratio to the best other algorithm, by task and stop.
 
     A filled mark: the intervals do not overlap. Tasks with the highest ratios are at
-    the top.
+    the top. A stop without a ratio is left out.
     """
     import matplotlib as mpl
 
@@ -68,6 +68,7 @@ def ratios(results: Results, stops: list[str], path: Path) -> None:
         for stop in stops
         if (one := to_best_other(results, task, stop))
     }
+    stops = [stop for stop in stops if any(key[1] == stop for key in found)]
     highest: dict[str, float] = {}
     for (task, _), (ratio, *_rest) in found.items():
         highest[task] = max(ratio, highest.get(task, 0.0))

@@ -304,9 +304,13 @@ def test_the_report_compares_corrected_archives(
     assert "| 1.02 | apart |" in content
     assert "| hopper_uni | me | 3 | 51 (51 to 51) | 0.0625 (0.0625 to" in content
     assert interval([np.array([1.0, 1.0])]) == (1.0, 1.0, 1.0)
-    study_figure.ratios(results, [stop], tmp_path / "figures" / "ratios.png")
-    study_figure.distribution(results, stop, tmp_path / "figures" / "ccdf.png")
-    assert len(list((tmp_path / "figures").iterdir())) == 2
+    figures = tmp_path / "figures"
+    study_figure.ratios(results, [stop], figures / "ratios.png")
+    # a stop that nothing reached has no place in the legend
+    study_figure.ratios(results, [stop, "1000 s"], figures / "again.png")
+    assert (figures / "again.png").read_bytes() == (figures / "ratios.png").read_bytes()
+    study_figure.distribution(results, stop, figures / "ccdf.png")
+    assert (figures / "ccdf.png").exists()
 
 
 @pytest.mark.parametrize(
