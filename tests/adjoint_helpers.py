@@ -9,7 +9,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from contract import BOXES
 from physics_helpers import beside_a_wall, random_states
 
@@ -45,11 +44,6 @@ def simulated() -> dict[str, str]:
         if not isinstance(base, type) or issubclass(base, PhysicsEnv):
             found[name] = (spec.robot or ROBOTS[spec.base_name]).urdf
     return found
-
-
-def marked(names: Any, quick: tuple[str, ...]) -> list[Any]:
-    slow = pytest.mark.slow
-    return [pytest.param(n, marks=() if n in quick else slow) for n in names]
 
 
 @functools.cache

@@ -22,7 +22,6 @@ from adjoint_helpers import (
     along,
     inputs_of,
     make,
-    marked,
     norms,
     readings,
     simulated,
@@ -44,14 +43,12 @@ from newton_qd.robots import ANT, HALFCHEETAH, RobotSpec
 # on which the readings of a step depend 1e5 times less than their size
 DISTANCES = (1e-3, 1e-4, 1e-5, 1e-6)
 
-EVERY = marked(simulated(), ())
 # of each robot the task that came last, with its wrappers
-EACH_ROBOT = marked(
-    {urdf: n for n, urdf in simulated().items()}.values(), ("hopper_uni",)
-)
+EACH_ROBOT = list({urdf: name for name, urdf in simulated().items()}.values())
 
 
-@pytest.mark.parametrize("name", EVERY)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", simulated())
 def test_a_step_of_every_environment(x64: None, name: str) -> None:
     """Along a random direction of every input: relative error below 1e-6."""
     env = make(name)
@@ -89,6 +86,7 @@ def close(found: Any, expected: Any) -> None:
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=atol, err_msg=part)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EACH_ROBOT)
 def test_every_transformation_gives_the_same(x64: None, name: str) -> None:
     """Three steps in a scan; batched, nested, unrolled, remat, alone, Jacobian."""

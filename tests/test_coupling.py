@@ -102,6 +102,7 @@ def test_directional_derivatives(
     assert errors.max() < bound
 
 
+@pytest.mark.slow  # compiles the adjoint
 @TREES
 def test_worlds_that_do_not_touch_ignore_their_neighbours(
     x64: None, tmp_path: Path, free: bool
