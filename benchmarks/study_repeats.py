@@ -21,7 +21,7 @@ from statistics import fmean
 import numpy as np
 from study_protocols import OURS
 from study_report import interval
-from study_results import compared, is_variant, main_variants
+from study_results import LEAST_SEEDS, compared, is_variant, main_variants
 from study_runs import TUNING_SEED, lines
 
 Seeds = dict[int, list[float]]
@@ -101,13 +101,19 @@ def ratios(runs: Runs, main: set[tuple[str, str]]) -> str:
                 sides[other][name] = seeds
         if not all(sides):
             continue
-        ours, best = (max(side, key=lambda name: _middle(side[name])) for side in sides)
+        ours, best = (_best(side) for side in sides)
         pair = sides[0][ours], sides[1][best]
         if all(len(scores) == 1 for seeds in pair for scores in seeds.values()):
             continue
         cells = [_compared(*pair, *picks) for picks in PICKS.values()]
         rows.append(f"| {task} | {ours} | {best} | {' | '.join(cells)} |")
     return "\n".join(rows)
+
+
+def _best(side: dict[str, Seeds]) -> str:
+    """The variant with the highest score; those with enough seeds count first."""
+    enough = [name for name in side if len(side[name]) >= LEAST_SEEDS]
+    return max(enough or side, key=lambda name: _middle(side[name]))
 
 
 def _middle(seeds: Seeds) -> float:

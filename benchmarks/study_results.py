@@ -224,11 +224,11 @@ def to_best_other(
     sides = sides_of(results, task, stop, rival)
     if not all(sides):
         return None
-    ours, best = (max(_enough(side)) for side in sides)
+    ours, best = (max(enough(side)) for side in sides)
     seeds = min(ours[4], best[4])
     return *compared(ours[:3], best[:3], seeds), seeds
 
 
-def _enough(side: Side) -> Side:
+def enough(side: Side) -> Side:
     """Those with enough seeds, or all if none has."""
     return [one for one in side if one[4] >= LEAST_SEEDS] or side

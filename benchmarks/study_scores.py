@@ -22,6 +22,7 @@ from study_results import (
     Scored,
     common,
     compared,
+    enough,
     load,
     normalized,
     note_best,
@@ -110,7 +111,8 @@ def overview(results: Results, rival: str | None = None) -> str:
 def verdict(results: Results, stop: str) -> str:
     """Markdown table: our best algorithm and the best other one of each task.
 
-    Ours has the chosen variant. Others have the one that is best here.
+    Ours has the chosen variant. Others have the one that is best here, of those with
+    enough seeds, if there are any.
     """
     rows = [
         "| task | our best: corrected QD score | best other | ratio | intervals |",
@@ -120,7 +122,7 @@ def verdict(results: Results, stop: str) -> str:
         sides = sides_of(results, task, stop)
         if not all(sides):
             continue
-        ours, best = (max(side) for side in sides)
+        ours, best = (max(enough(side)) for side in sides)
         seeds = min(ours[4], best[4])
         ratio, word = compared(ours[:3], best[:3], seeds)
         cells = [f"{x[3]} {x[0]:,.0f}" for x in (ours, best)]

@@ -225,7 +225,7 @@ def test_the_best_variant_of_others_is_compared() -> None:
     assert rows == [f"| {TASK} | me-actor-critic 4 | me@1 3 | 1.33 | too few seeds |"]
 
 
-def test_the_overview_prefers_enough_seeds() -> None:
+def test_enough_seeds_count_first() -> None:
     def runs(algorithm: str, score: float, seeds: int) -> list[study_results.Scored]:
         row = line(algorithm, 0, "20 s", corrected_qd_score=score)
         return [study_results.Scored(0, row, np.empty(0), np.empty(0))] * seeds
@@ -243,6 +243,8 @@ def test_the_overview_prefers_enough_seeds() -> None:
         "| task | 20 s | 60 s | 250 s |",
         f"| {TASK} | **2.00** | 1.33 (1 of 3 seeds) | - |",
     ]
+    row = study_scores.verdict(results, "20 s").splitlines()[2]
+    assert row.endswith("| me 2 (2 to 2) | 2.00 | apart |")
     results[TASK, "dcrl-me", "20 s"] = runs("dcrl-me", 8.0, 3)
     first = f"| {TASK} | **0.50** |", f"| {TASK} | **2.00** |"
     for rival, start in zip((None, "me"), first, strict=True):

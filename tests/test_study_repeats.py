@@ -89,3 +89,13 @@ def test_tasks_without_runs_made_again_are_left_out(loaded: Loaded) -> None:
 def test_an_unknown_stop_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"'61 s' has no runs.*'60 s'"):
         study_repeats.load(tmp_path, tmp_path / "again.csv", "61 s")
+
+
+def test_enough_seeds_count_first(tmp_path: Path) -> None:
+    one = ("me@1", 0, 99.0)
+    runs = [(name, seed, 12.0) for name in (OURS, OTHER) for seed in range(3)]
+    write(tmp_path / "runs.csv", one, *runs)
+    write(tmp_path / "again.csv", (OURS, 0, 12.0))
+    loaded = study_repeats.load(tmp_path, tmp_path / "again.csv", "60 s")
+    row = study_repeats.ratios(*loaded).splitlines()[2]
+    assert row.startswith(f"| hopper_uni | {OURS} | {OTHER} | 1.00 (overlap)")
