@@ -384,7 +384,7 @@ def test_ci_runs_the_test_command_of_the_readme() -> None:
     script = (ROOT / ".ci" / "run").read_text(encoding="utf-8").splitlines()
     assert command in script
     # what the README leaves out runs too
-    assert "pytest -n auto -m slow || failed=$?" in script
+    assert 'pytest -n auto -m "slow and not optimized" || failed=$?' in script
     mark = r"mark\.optimized"
     files = f"$(grep -l '{mark}' tests/test_*.py)"
     assert f"pytest -n auto --optimized -m optimized {files}" in script

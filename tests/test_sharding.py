@@ -197,18 +197,19 @@ def evolved(name, algorithm="me", options=(), **arguments):
 
 @pytest.mark.slow
 def test_an_archive_does_not_depend_on_the_number_of_devices(devices: Devices) -> None:
-    tasks: list[tuple[str, str, dict[str, Any]]] = [
-        ("ant_uni", "me", {}),
-        ("pointmaze", "pga-me", CRITIC),
-        ("pointmaze", "me-es", {"num_optimizer_steps": 2}),
+    # compiling takes the time, and what an algorithm adds is the same on every mesh
+    tasks: list[tuple[tuple[Any, ...], tuple[int, ...]]] = [
+        (("ant_uni", "me", {}), (1, 3, 4)),
+        (("pointmaze", "pga-me", CRITIC), (3,)),
+        (("pointmaze", "me-es", {"num_optimizer_steps": 2}), (3,)),
     ]
     code = f"""
 answer = []
-for task in {tasks!r}:
+for task, counts in {tasks!r}:
     alone = evolved(*task)
-    answer += [evolved(*task, devices=count) == alone for count in (1, 3, 4)]
+    answer += [evolved(*task, devices=count) == alone for count in counts]
 """
-    assert devices.answer(EVOLVE + code) == [True] * 9
+    assert devices.answer(EVOLVE + code) == [True] * 5
 
 
 @pytest.mark.slow
@@ -322,32 +323,30 @@ start, one = reset(keys), jax.jit(env.reset)(keys[0])
 found = (start, step(start, actions), slope(start, actions))
 expected = jax.tree.leaves(jax.block_until_ready(found))
 long = jax.tree.leaves(whole(start, plans, weights, keys[3]))
-for count in (2, 4):
+for count, entered in ((2, False), (4, True)):
     mesh = jax.make_mesh((count,), ("b",), devices=jax.devices()[:count])
     assert mesh.axis_types == (jax.sharding.AxisType.Explicit,)
     axis = NamedSharding(mesh, PartitionSpec("b"))
     own_keys, own_actions = jax.device_put((keys, actions), axis)
-    for context in (contextlib.nullcontext(), mesh):
-        with jax.set_mesh(mesh) if context is mesh else context:
-            start = reset(own_keys)
-            jax.block_until_ready(start)
-            before = launched()
-            after = jax.block_until_ready(step(start, own_actions))
-            each = launched() - before
-            assert each.tolist() == [count, 8], each
-            found = jax.tree.leaves((start, after, slope(start, own_actions)))
-            for axes, state, action in (
-                ((0, None), start, actions[0]),
-                ((None, 0), one, own_actions),
-            ):
-                shared = jax.jit(jax.vmap(env.step, axes))(state, action)
-                jax.block_until_ready((shared, found))
-            if (context is mesh) == (count == 4):
-                given = *jax.device_put((plans, weights), axis), keys[3]
-                given = jax.tree.leaves(whole(start, *given))
-                for a, b in zip(long, given, strict=True):
-                    assert b.sharding.spec[0] == "b", b.sharding
-                    np.testing.assert_array_equal(a, b)
+    with jax.set_mesh(mesh) if entered else contextlib.nullcontext():
+        start = reset(own_keys)
+        jax.block_until_ready(start)
+        before = launched()
+        after = jax.block_until_ready(step(start, own_actions))
+        each = launched() - before
+        assert each.tolist() == [count, 8], each
+        found = jax.tree.leaves((start, after, slope(start, own_actions)))
+        for axes, state, action in (
+            ((0, None), start, actions[0]),
+            ((None, 0), one, own_actions),
+        ):
+            shared = jax.jit(jax.vmap(env.step, axes))(state, action)
+            jax.block_until_ready((shared, found))
+        given = *jax.device_put((plans, weights), axis), keys[3]
+        given = jax.tree.leaves(whole(start, *given))
+        for a, b in zip(long, given, strict=True):
+            assert b.sharding.spec[0] == "b", b.sharding
+            np.testing.assert_array_equal(a, b)
     for a, b in zip(expected, found, strict=True):
         assert b.sharding.spec[0] == "b", b.sharding
         np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6)
