@@ -182,6 +182,7 @@ def derivatives(
     return np.asarray(gradient), np.asarray(ahead - behind) / (2 * distance)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robot", [ANT, HOPPER], ids=lambda robot: robot.name)
 def test_gradient_of_a_step(x64: None, robot: RobotSpec) -> None:
     """Every number of every parameter against differences, in and out of contact."""

@@ -24,7 +24,7 @@ from newton_qd.wrappers import FeetContactWrapper
 WORLDS, STEPS = 50, 16
 # The others are in tests/test_control_envs.py and tests/test_pointmaze.py.
 LEGGED = ("ant", "halfcheetah", "hopper", "humanoid", "quadruped", "walker2d")
-QUICK = ("ant_uni", "halfcheetah_uni", "hopper_uni", "walker2d_uni", "humanoid_uni")
+QUICK = ("ant_uni", "hopper_uni", "walker2d_uni", "humanoid_uni")
 NAMES = [
     pytest.param(name, marks=() if name in QUICK else pytest.mark.slow)
     for name in newton_qd.registered_envs()
