@@ -15,6 +15,7 @@ import dataclasses
 import fcntl
 import os
 import statistics
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -57,28 +58,30 @@ def now() -> tuple[float, float]:
 
 
 @contextlib.contextmanager
-def shared(out: Path) -> Iterator[None]:
+def shared() -> Iterator[None]:
     """Waits until no run needs the GPU for itself; others may use it meanwhile."""
-    with _held(out, "turn", fcntl.LOCK_SH):
+    with _held("turn", fcntl.LOCK_SH):
         pass
-    with _held(out, "lock", fcntl.LOCK_SH):
+    with _held("lock", fcntl.LOCK_SH):
         yield
 
 
 @contextlib.contextmanager
-def alone(out: Path) -> Iterator[None]:
-    """Waits until no other run uses the GPU.
+def alone() -> Iterator[None]:
+    """Waits until no other run uses the GPU, also one of another folder of runs.
 
     Runs that ask for the GPU later wait, so its turn comes. Those on other GPUs go on.
     """
-    with _held(out, "turn", fcntl.LOCK_EX), _held(out, "lock", fcntl.LOCK_EX):
+    with _held("turn", fcntl.LOCK_EX), _held("lock", fcntl.LOCK_EX):
         yield
 
 
 @contextlib.contextmanager
-def _held(out: Path, name: str, kind: int) -> Iterator[None]:
+def _held(name: str, kind: int) -> Iterator[None]:
+    """Holds a lock of the GPU, whose file is the same for all commands of a user."""
     gpu = os.environ.get("CUDA_VISIBLE_DEVICES", "")
-    with (out / f"gpu{gpu}.{name}").open("w", encoding="utf-8") as file:
+    path = Path(tempfile.gettempdir()) / f"newton_qd-{os.getuid()}-gpu{gpu}.{name}"
+    with path.open("w", encoding="utf-8") as file:
         fcntl.flock(file, kind)
         yield
 
@@ -112,7 +115,7 @@ def pace(
     found = known_pace(out, run)
     if found is not None:
         return found
-    with alone(out):
+    with alone():
         found = known_pace(out, run)  # of another seed that was faster
         if found is not None:
             return found

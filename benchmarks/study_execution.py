@@ -195,12 +195,12 @@ def execute(
     if device == "cpu":
         here = Progress(protocol, run, out, limits.until)
         return _to_the_end(protocol, here, done, out, limits, "processor")
-    with study_clock.shared(out):
+    with study_clock.shared():
         here = Progress(protocol, run, out, limits.until)
     if limits.paced:
         here.find_pace(out)
         return _to_the_end(protocol, here, done, out, limits, "paced")
-    with study_clock.alone(out):
+    with study_clock.alone():
         return _to_the_end(protocol, here, done, out, limits, "wall")
 
 
@@ -220,7 +220,7 @@ def _to_the_end(
 
     def shared() -> contextlib.AbstractContextManager[None]:
         """While the pace of another run is measured, this one does nothing."""
-        return study_clock.shared(out) if clock == "paced" else contextlib.nullcontext()
+        return study_clock.shared() if clock == "paced" else contextlib.nullcontext()
 
     while left:
         with shared():

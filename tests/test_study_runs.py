@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import tempfile
 import threading
 from pathlib import Path
 from types import SimpleNamespace
@@ -41,6 +42,12 @@ SETTINGS = {"me-actor-critic@1": {"options": {"copies": 2, "worlds": 4, "window"
 RUN = Run("hopper_uni", "me-actor-critic@1", 3)
 
 
+@pytest.fixture(autouse=True)
+def own_locks(tmp_path: Path, monkeypatch: Any) -> None:
+    """No other test waits for the locks of this one."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+
+
 def execute(out: Path, deadline: float = np.inf) -> bool:
     out.mkdir(exist_ok=True)
     limits = study_execution.Limits(60.0, deadline=deadline)
@@ -60,19 +67,19 @@ def test_a_variant_changes_settings_of_its_parent(monkeypatch: Any) -> None:
     assert found["me@3"] == {**found["me@2"], "iso_sigma": 0.1}
 
 
-def test_a_clock_starts_when_no_other_run_uses_the_gpu(tmp_path: Path) -> None:
+def test_a_clock_starts_when_no_other_run_uses_the_gpu() -> None:
     order = []
 
     def run() -> None:
-        with study_clock.alone(tmp_path):
+        with study_clock.alone():
             order.append("clock")
 
     def later() -> None:
-        with study_clock.shared(tmp_path):
+        with study_clock.shared():
             order.append("another")
 
     waiting = [threading.Thread(target=run), threading.Thread(target=later)]
-    with study_clock.shared(tmp_path), study_clock.shared(tmp_path):
+    with study_clock.shared(), study_clock.shared():
         for thread in waiting:
             thread.start()
             thread.join(timeout=0.2)
@@ -81,6 +88,25 @@ def test_a_clock_starts_when_no_other_run_uses_the_gpu(tmp_path: Path) -> None:
         thread.join(timeout=10)
     # who asks later waits, or else the clock would never start
     assert order == ["compiled", "clock", "another"]
+
+
+def test_a_pace_waits_for_runs_of_other_folders(
+    tmp_path: Path, monkeypatch: Any
+) -> None:
+    monkeypatch.setattr(study_clock, "LEAST_SECONDS", 0.0)
+    ended = threading.Event()
+
+    def measured() -> None:
+        run = Run("hopper_uni", "me@1", 0)
+        study_clock.pace(tmp_path, run, lambda: None, "H200", "abc")
+        ended.set()
+
+    other = threading.Thread(target=measured)
+    with study_clock.shared():  # of a run whose folder is not known here
+        other.start()
+        assert not ended.wait(timeout=0.3)
+    assert ended.wait(timeout=10)
+    other.join()
 
 
 def test_a_pace_is_measured_once(tmp_path: Path, monkeypatch: Any) -> None:
