@@ -50,6 +50,15 @@ def settings(*arguments: str) -> EvolveConfig:
     return seen.value.config
 
 
+def test_the_backend_of_a_run_is_that_of_its_device(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Also with ``--device cpu`` on a machine with a GPU, JAX's own choice."""
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    with jax.default_device(jax.devices("cpu")[0]):
+        assert environment_facts()["backend"] == "cpu"
+
+
 def test_options_of_the_environment_on_the_command_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -273,13 +273,18 @@ def check_integers(name: str, values: object) -> None:
 
 
 def environment_facts() -> dict[str, object]:
-    """Returns versions and machine data that a bit-exact repetition of a run needs."""
+    """Returns versions and machine data that a bit-exact repetition of a run needs.
+
+    The backend is that of the device on which new arrays are: within
+    ``jax.default_device(...)``, it may be another one than JAX's own choice.
+    """
     import jax
 
+    (device,) = jax.device_put(0.0).devices()
     return {
         "python": platform.python_version(),
         "machine": platform.machine(),
-        "backend": jax.default_backend(),
+        "backend": device.platform,
         "x64": bool(jax.config.read("jax_enable_x64")),
         "packages": package_versions(),
     }
