@@ -21,6 +21,7 @@ from emitter_problems import (
     start,
 )
 from qdax.core.containers.mapelites_repertoire import (
+    MapElitesRepertoire,
     get_cells_indices,
 )
 
@@ -167,6 +168,57 @@ def test_points_restart_from_elites(
     restarted = np.asarray(ages) == 0
     assert np.all(np.asarray(elite)[restarted])
     np.testing.assert_array_equal(np.all(np.asarray(mean) == 0, axis=1), restarted)
+
+
+class Watched(CMAMEGAEmitter):
+    """Keeps the keys that it hands out."""
+
+    keys: list[jax.Array]
+
+    def _begun(
+        self, points: Any, descriptor_length: int, key: jax.Array, old: Any
+    ) -> Any:
+        self.keys.append(key)
+        return super()._begun(points, descriptor_length, key, old)
+
+    def _moved(self, state: Any, means: jax.Array, key: jax.Array) -> Any:
+        self.keys.append(key)
+        return super()._moved(state, means, key)
+
+    def _scored(self, points: Any, optimizer: Any, key: jax.Array) -> Any:
+        self.keys.append(key)
+        return super()._scored(points, optimizer, key)
+
+
+def test_no_two_draws_share_a_key(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of an arborescence, from the first generation to the next state's key."""
+    emitter = Watched(score, sigma_g=0.5, batch_size=8)
+    select = MapElitesRepertoire.select
+
+    def watched(repertoire: Any, key: jax.Array, *arguments: Any) -> Any:
+        emitter.keys.append(key)
+        return select(repertoire, key, *arguments)
+
+    monkeypatch.setattr(MapElitesRepertoire, "select", watched)
+
+    def run(genotypes: jax.Array) -> list[jax.Array]:
+        emitter.keys = []
+        fitnesses, descriptors, extra = score(genotypes, jax.random.key(0))
+        repertoire = MapElitesRepertoire.init(
+            genotypes, fitnesses, descriptors, centroids()
+        )
+        state = emitter.init(
+            jax.random.key(1), repertoire, genotypes, fitnesses, descriptors, extra
+        )
+        offspring, _ = emitter.emit(repertoire, state, jax.random.key(2))
+        fitnesses, descriptors, _ = score(offspring, jax.random.key(0))
+        following = emitter.state_update(
+            state, repertoire, offspring, fitnesses, descriptors
+        )
+        return [*emitter.keys, state.key, following.key]
+
+    keys = {tuple(jax.random.key_data(key).tolist()) for key in compiled(run)(start())}
+    assert len(keys) == 3 + 4 + 2  # in ``init``, in ``state_update``, and of the states
 
 
 def test_emitting_and_updating_agree() -> None:

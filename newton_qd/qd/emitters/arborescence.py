@@ -149,7 +149,8 @@ class ArborescenceEmitter(Emitter, abc.ABC):
         """
         del fitnesses, extra_scores
         size, dtype = check_genotypes(genotypes).shape[1], genotypes.dtype
-        points_key, score_key, sample_key, state_key = jax.random.split(key, 4)
+        keys = jax.random.split(key, 5)
+        points_key, score_key, sample_key, state_key, begin_key = keys
         if self._start is None:
             points = repertoire.select(points_key, self._num_emitters).genotypes
         else:
@@ -162,7 +163,7 @@ class ArborescenceEmitter(Emitter, abc.ABC):
             )
         state = self._state(
             repertoire,
-            self._fresh(points, descriptors.shape[-1], state_key, None),
+            self._fresh(points, descriptors.shape[-1], begin_key, None),
             (state_key, score_key, sample_key),
             restarts=jnp.zeros((), jnp.int32),
             rejected=jnp.zeros((), jnp.int32),
@@ -229,15 +230,16 @@ class ArborescenceEmitter(Emitter, abc.ABC):
             state.bars[cells].reshape(shape)[:, 1:],
             finite.reshape(shape)[:, 1:],
         )
-        points, optimizer = self._moved(state, cma_es.mean)
+        keys = jax.random.split(state.key, 6)
+        key, elite_key, score_key, sample_key, begin_key, move_key = keys
+        points, optimizer = self._moved(state, cma_es.mean, move_key)
         strategy = self._strategy(descriptors.shape[-1])
         age = state.age + 1
         restart = flat | ~state.finite | jax.vmap(strategy.stopped)(cma_es)
         restart |= self._given_up(improved, age)
 
-        key, elite_key, score_key, sample_key = jax.random.split(state.key, 4)
         elites = repertoire.select(elite_key, self._num_emitters).genotypes
-        fresh = self._fresh(elites, descriptors.shape[-1], elite_key, optimizer)
+        fresh = self._fresh(elites, descriptors.shape[-1], begin_key, optimizer)
         search = select(restart, fresh, (points, cma_es, optimizer, age))
         return self._state(
             repertoire,
@@ -285,13 +287,17 @@ class ArborescenceEmitter(Emitter, abc.ABC):
         del descriptor_length, key, old
         return jax.vmap(self._optimizer.init)(points)
 
-    def _moved(self, state: PyTree, means: jax.Array) -> tuple[jax.Array, Any]:
+    def _moved(
+        self, state: PyTree, means: jax.Array, key: jax.Array
+    ) -> tuple[jax.Array, Any]:
         """Returns all points (E, size) after a step, and what moves them.
 
         Args:
             state: State before the step.
             means: (E, 1 + D) means of the coefficients.
+            key: Random key, for subclasses.
         """
+        del key
         return jax.vmap(self._climb)(
             state.points, state.gradients, means, state.optimizer
         )

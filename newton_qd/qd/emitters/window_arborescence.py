@@ -122,11 +122,10 @@ class WindowArborescenceEmitter(CMAMAEGAEmitter):
         return jax.lax.scan(learn, actors, jax.random.split(key, updates))[0]
 
     def _moved(
-        self, state: ArborescenceState | PyTree, means: jax.Array
+        self, state: ArborescenceState | PyTree, means: jax.Array, key: jax.Array
     ) -> tuple[jax.Array, Climbers]:
         climbers = state.optimizer
         walkers = dataclasses.replace(climbers.walkers, aim=normalize(means))
-        key = jax.random.fold_in(state.key, 1)
         walkers = self._updated(walkers, climbers.scale, key, self._walks)
         points = jax.vmap(self._method.whitening.plain)(walkers.weights, climbers.scale)
         return points, dataclasses.replace(climbers, walkers=walkers)
