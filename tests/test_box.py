@@ -280,6 +280,7 @@ def test_directional_derivatives(
 # What boxes hold
 
 
+@pytest.mark.slow  # compiles a kernel of its own
 @pytest.mark.parametrize("rpy", ["0 0 0", "0 0 0.5"])
 def test_ball_rests_on_a_box(x64: None, tmp_path: Path, rpy: str) -> None:
     scene = box_scene(tmp_path, "1 1 0.4", "2 0 0.2", rpy)
@@ -324,6 +325,7 @@ def test_ball_never_passes_a_box_wall(tmp_path: Path) -> None:
     assert hit.mean() > 0.9
 
 
+@pytest.mark.slow  # the same kernel
 def test_rod_never_passes_a_box_wall(x64: None, tmp_path: Path) -> None:
     """Thrown at it like a spear, at up to 10 m/s: its centre stays before it."""
     system = rod_system(tmp_path, "0.2 4 2", "0 0 1")

@@ -199,6 +199,7 @@ def coupled(
     return solved_impulse(system, h, low, vn, free, compliance, solves=2)
 
 
+@pytest.mark.slow  # compiles the adjoint
 @pytest.mark.parametrize(("steps", "bound"), [(1, 1e-6), (8, 1e-4)])
 def test_directional_derivatives(cheetah: System, steps: int, bound: float) -> None:
     inputs = pressed_feet(cheetah, np.random.default_rng(0), 30)
