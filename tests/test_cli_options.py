@@ -53,7 +53,7 @@ def settings(*arguments: str) -> EvolveConfig:
 def test_the_backend_of_a_run_is_that_of_its_device(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Also with ``--device cpu`` on a machine with a GPU, JAX's own choice."""
+    """Also of ``evolve(..., device="cpu")`` where JAX's own choice is a GPU."""
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     with jax.default_device(jax.devices("cpu")[0]):
         assert environment_facts()["backend"] == "cpu"
