@@ -37,6 +37,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
         ({"centroids": 10, "grid": (5, 5)}, "grid, centroids: got .*one of"),
         ({"iso_sigma": float("nan")}, "iso_sigma"),
         ({"line_sigma": -0.1}, "line_sigma: got -0.1; allowed: finite number"),
+        ({"tournament": 0}, "tournament: got 0; allowed: integers from 1 to 1000"),
         ({"env_name": ""}, "env_name"),
         ({"algorithm": 3}, "algorithm: got 3; allowed: text"),
         ({"options": 3}, "options: got 3; allowed: names with values"),

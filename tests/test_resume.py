@@ -294,6 +294,7 @@ CHANGES = {
     "grid": (4, 5),
     "iso_sigma": 0.1,
     "line_sigma": 0.1,
+    "tournament": 2,
     "algorithm": "cma-me",
     "reevaluations": 2,
     "env_options": {"healthy_reward": 2.0},

@@ -116,6 +116,7 @@ def _add_setting_arguments(parser: argparse.ArgumentParser) -> None:
         ("episode_length", int, "control steps of one evaluation"),
         ("iso_sigma", float, "standard deviation of the isotropic variation"),
         ("line_sigma", float, "standard deviation of the step to a second parent"),
+        ("tournament", int, "elites of which the fittest is a second parent"),
         ("reevaluations", int, "evaluations of each elite at the end; 0: none"),
         ("starts", int, "start states from which each individual is evaluated"),
     ):

@@ -17,6 +17,7 @@ from newton_qd.checks import Fact, listed, message
 
 FORMAT = 1
 MAX_CELLS = 1_000_000
+MAX_TOURNAMENT = 1000
 DEFAULT_GRIDS = {1: (64,), 2: (32, 32), 3: (9, 9, 9), 4: (5, 5, 5, 5)}
 """Default number of cells per descriptor dimension."""
 
@@ -58,6 +59,8 @@ class EvolveConfig:
             units of policy weights [-].
         line_sigma: Standard deviation of the step towards the second parent,
             relative to the distance of the parents [-].
+        tournament: Elites that are drawn for the second parent, which is the fittest of
+            them; 1: it is drawn uniformly, as in MAP-Elites.
         reevaluations: Evaluations of each elite at the end of the run, for metrics
             without luck; 0: none.
         algorithm: Name of one of ``newton_qd.qd.algorithms.ALGORITHMS``.
@@ -94,6 +97,7 @@ class EvolveConfig:
     centroids: int | None = None
     iso_sigma: float = 0.02
     line_sigma: float = 0.2
+    tournament: int = 1
     reevaluations: int = 32
     algorithm: str = "me"
     options: tuple[tuple[str, Any], ...] = ()
@@ -129,6 +133,7 @@ class EvolveConfig:
         check_integer("seed", self.seed, 0, 2**32 - 1)
         check_integer("iterations", self.iterations, 0)
         check_integer("batch_size", self.batch_size, 1)
+        check_integer("tournament", self.tournament, 1, MAX_TOURNAMENT)
         check_integer("starts", self.starts, 1)
         if self.statistic not in STATISTICS:
             raise ConfigError(message("statistic", self.statistic, listed(STATISTICS)))

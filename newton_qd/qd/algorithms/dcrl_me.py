@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from newton_qd.checks import listed, message
 from newton_qd.qd.algorithms.critic_options import CriticOptions
 from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext
-from newton_qd.qd.algorithms.variation import isoline
+from newton_qd.qd.algorithms.variation import isoline, with_own_isoline
 from newton_qd.qd.config import ConfigError, EvolveConfig
 
 if TYPE_CHECKING:
@@ -94,13 +94,14 @@ def _make(context: EmitterContext, options: DCRLMEOptions) -> Any:
     def made(times: int) -> Any:
         """Returns the emitter for generations so many times as large."""
         shares = {name: times * size for name, size in options.shares(config).items()}
-        return DCRLMEEmitter(
+        emitter = DCRLMEEmitter(
             DCRLMEConfig(**{**dataclasses.asdict(options), **shares}),
             context.policy.network,
             actor,
             task.env,
             isoline(config),
         )
+        return with_own_isoline(emitter, config)
 
     emitter: Any = made(1)
     if config.starts > 1:

@@ -8,7 +8,7 @@ from typing import Any
 from newton_qd.checks import message
 from newton_qd.qd.algorithms.critic_options import CriticOptions, require_batch_size
 from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext
-from newton_qd.qd.algorithms.variation import isoline
+from newton_qd.qd.algorithms.variation import isoline, with_own_isoline
 from newton_qd.qd.config import ConfigError
 
 
@@ -53,6 +53,7 @@ def _make(context: EmitterContext, options: PGAMEOptions) -> Any:
         context.task.env,
         isoline(context.config),
     )
+    emitter = with_own_isoline(emitter, context.config)
     return OfParameters(emitter, context.policy, lambda steps: QDTransition(**steps))
 
 

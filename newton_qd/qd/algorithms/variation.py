@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from qdax.core.emitters.emitter import Emitter
+    from qdax.core.emitters.multi_emitter import MultiEmitter
 
     from newton_qd.types import Genotype, RNGKey
 
@@ -28,6 +29,12 @@ def isoline(
 
 def isoline_emitter(config: EvolveConfig, batch_size: int) -> Emitter:
     """Returns the emitter of iso+line variations of MAP-Elites."""
+    if config.tournament > 1:
+        from newton_qd.qd.emitters.tournament import TournamentEmitter
+
+        return TournamentEmitter(
+            isoline(config), batch_size=batch_size, tournament=config.tournament
+        )
     from qdax.core.emitters.standard_emitters import MixingEmitter
 
     return MixingEmitter(
@@ -49,6 +56,20 @@ def with_isoline(emitter: Emitter, config: EvolveConfig) -> Emitter:
 
     rest = config.batch_size - emitter.batch_size
     return MultiEmitter((emitter, isoline_emitter(config, rest))) if rest else emitter
+
+
+def with_own_isoline(emitter: MultiEmitter, config: EvolveConfig) -> MultiEmitter:
+    """Returns an emitter of QDax with the iso+line variations of a run.
+
+    QDax's emitters with a critic make their own, which have no tournament.
+
+    Args:
+        emitter: Emitter whose last part are iso+line variations.
+        config: Settings of the run.
+    """
+    *others, last = emitter.emitters
+    emitter.emitters = (*others, isoline_emitter(config, last.batch_size))
+    return emitter
 
 
 def _no_mutation(genotypes: Genotype, key: RNGKey) -> Genotype:
