@@ -123,7 +123,7 @@ def test_without_tuning_chosen_variants_run_and_are_reported() -> None:
         tasks=[TASK], algorithms=["me", "me-actor-critic"], seeds=1, until=60
     )
     found = [run.variant for run in study_runs.planned(FIELD, choice)]
-    assert found == ["me@5", "me-actor-critic@21"]
+    assert found == ["me@5", "me-actor-critic@24"]
     found = [run.variant for run in study_runs.planned(SMALL, choice)]
     assert found == ["me@0", "me-actor-critic@0"]
 
