@@ -28,10 +28,16 @@ from newton_qd.qd.algorithms.gradient_options import (
     DifferentiableOptions,
     differentiable,
 )
-from newton_qd.qd.emitters.actor_critic_learner import ActorCritic, measure_of
+from newton_qd.qd.emitters.actor_critic_learner import (
+    ActorCritic,
+    Learner,
+    measure_of,
+)
 from newton_qd.qd.emitters.actor_critic_settings import ActorCriticSettings
 from newton_qd.qd.emitters.whitening import Whitening
 from newton_qd.qd.scoring.networks import policy_for
+from newton_qd.qd.scoring.rollout import Policy
+from newton_qd.qd.scoring.task import Task
 
 SETTINGS = ActorCriticSettings(
     worlds=64, window=32, rate=2e-3, discount=0.99, actor_trace=0.95, epochs=4
@@ -55,10 +61,25 @@ def walk(env: Any, act: Any, key: jax.Array) -> tuple[jax.Array, jax.Array, jax.
     return jnp.sum(rewards * up), up.sum(), last[0]
 
 
-def returns(
-    env_name: str, settings: ActorCriticSettings, updates: int, every: int, seed: int
-) -> list:
-    """What the actor's policy does after each ``every`` updates: see ``walk``."""
+@dataclasses.dataclass(frozen=True)
+class Trial:
+    """An actor at the start of its learning, and what it learns with."""
+
+    task: Task
+    policy: Policy
+    method: ActorCritic
+    scale: tuple[jax.Array, jax.Array]
+    actor: Learner
+    test_key: jax.Array
+    key: jax.Array
+
+    def plain(self, actor: Learner) -> jax.Array:
+        """Returns the weights of an actor, for plain observations."""
+        return self.method.whitening.plain(actor.weights, self.scale)
+
+
+def begun(env_name: str, settings: ActorCriticSettings, seed: int) -> Trial:
+    """Returns a new actor that maximizes the return."""
     config = EvolveConfig(env_name=env_name, episode_length=LENGTH, hidden=(64, 64))
     task = differentiable(
         make_task(config), DifferentiableOptions(), settings.termination_width
@@ -77,15 +98,25 @@ def returns(
     scale = jax.jit(method.scale)(keys[1], worlds)
     aim = jnp.zeros(1 + task.descriptor_length).at[0].set(1)
     actor = method.begin(keys[2], policy.init(keys[3]), aim, worlds)
-    update = jax.jit(method.update)
+    return Trial(task, policy, method, scale, actor, keys[4], keys[5])
+
+
+def returns(
+    env_name: str, settings: ActorCriticSettings, updates: int, every: int, seed: int
+) -> list:
+    """What the actor's policy does after each ``every`` updates: see ``walk``."""
+    trial = begun(env_name, settings, seed)
+    env, act, actor = trial.task.env, trial.policy.of_weights, trial.actor
+    update = jax.jit(trial.method.update)
     try_out = jax.jit(
-        lambda weights: walk(task.env, lambda o: policy.of_weights(weights, o), keys[4])
+        lambda weights: walk(env, lambda o: act(weights, o), trial.test_key)
     )
     found = []
     for number in range(updates + 1):
         if number % every == 0:
-            found.append(try_out(white.plain(actor.weights, scale)))
-        actor, _ = update(actor, scale, jax.random.fold_in(keys[5], number))
+            found.append(try_out(trial.plain(actor)))
+        key = jax.random.fold_in(trial.key, number)
+        actor, _ = update(actor, trial.scale, key)
     return found
 
 
