@@ -21,9 +21,9 @@ from newton_qd.qd.config import (
     ConfigError,
     EvolveConfig,
     config_to_json,
-    environment_facts,
     read_config,
 )
+from newton_qd.qd.facts import environment_facts
 from newton_qd.qd.run.evolution import evolve
 from newton_qd.qd.scoring.task import make_task
 from newton_qd.scenes import MAZE

@@ -7,7 +7,7 @@ import os
 import sys
 from typing import TextIO, TypeAlias
 
-from newton_qd.qd.config import changed_facts, environment_facts
+from newton_qd.qd.facts import changed_facts, environment_facts
 from newton_qd.qd.run.progress import for_stream
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"

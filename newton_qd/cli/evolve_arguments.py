@@ -151,6 +151,11 @@ def _add_setting_arguments(parser: argparse.ArgumentParser) -> None:
         "or material.friction=0.8; may be repeated",
     )
     _add_start_arguments(group)
+    _add_policy_and_cell_arguments(group)
+
+
+def _add_policy_and_cell_arguments(group: argparse._ArgumentGroup) -> None:
+    """Adds the size of the policy, and the cells of the archive."""
     group.add_argument(
         "--hidden",
         type=widths,

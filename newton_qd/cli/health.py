@@ -42,7 +42,7 @@ def _cores() -> int:
 
 def _packages() -> dict[str, str | None]:
     """Returns the versions of the packages that results depend on."""
-    from newton_qd.qd.config import package_versions
+    from newton_qd.qd.facts import package_versions
 
     return package_versions()
 

@@ -6,7 +6,7 @@ import argparse
 import platform
 from typing import Any
 
-from newton_qd.qd.config import package_versions
+from newton_qd.qd.facts import package_versions
 
 
 class ShowVersion(argparse.Action):

@@ -25,12 +25,12 @@ from newton_qd.qd.algorithms import algorithm_named
 from newton_qd.qd.config import (
     ConfigError,
     EvolveConfig,
-    changed_facts,
     config_to_json,
     read_config,
     same_run,
     settings_text,
 )
+from newton_qd.qd.facts import changed_facts
 from newton_qd.qd.run.archive import ARCHIVE, DAMAGE, Archive, archive_bytes
 from newton_qd.qd.run.checkpoint import (
     Checkpoint,
