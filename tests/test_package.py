@@ -60,7 +60,16 @@ LEAVES: dict[str, set[str]] = {
     "__main__": {"cli"},
 }
 # The rooms of `qd`: a module may import those of its own room and those before it.
-ROOMS = ("extras", "config", "scoring", "emitters", "algorithms", "run", "__init__")
+ROOMS = (
+    "extras",
+    "facts",
+    "config",
+    "scoring",
+    "emitters",
+    "algorithms",
+    "run",
+    "__init__",
+)
 MOVED = {"actor_critic", "gradient_options", "ribs", "sharding"}  # old names
 # Where a package that is not of the standard library may be imported.
 EVERYWHERE = {"jax", "numpy", "newton_qd"}
