@@ -16,7 +16,11 @@ from point_runs import PointEnv
 import newton_qd
 from newton_qd.envs.base import Env, PhysicsEnv
 from newton_qd.envs.limits import within
-from newton_qd.gradients import with_smooth_termination
+from newton_qd.gradients import (
+    Episode,
+    GradientOptions,
+    with_smooth_termination,
+)
 from newton_qd.qd.emitters.actor_critic_learner import ActorCritic
 from newton_qd.qd.emitters.actor_critic_settings import ActorCriticSettings
 from newton_qd.wrappers.maze import MazeWrapper
@@ -201,6 +205,46 @@ def test_an_actor_sees_that_a_fall_is_near(start: float) -> None:
     blind, seeing = (cliff_gradient(width, start) for width in (None, 0.1))
     assert not np.any(blind)
     assert seeing[0] < -0.1 and seeing[1] == 0
+
+
+@pytest.mark.parametrize("push", [0.05, 0.4])
+def test_an_episode_sees_that_its_end_is_near(push: float) -> None:
+    """Against the derivative in closed form: a step is worth 1, until the cliff."""
+    plan = np.full((6, 2), push, np.float32)
+    x = np.cumsum(0.3 * plan[:, 0])
+    fallen = np.append(False, np.cumsum(x > 0.5)[:-1] > 0)
+    counted = np.sum(~fallen)
+    rest = np.maximum(counted - 1 - np.arange(6), 0)  # steps after each step
+    slopes = np.array([logistic(v) * logistic(-v) for v in (x - 0.5) / 0.1]) / 0.1
+    expected = -0.3 * np.cumsum((slopes * rest)[::-1])[::-1]
+    for width, expected_ in ((None, 0 * expected), (0.1, expected)):
+        episode = Episode(Cliff(width), episode_length=6)
+        start = Cliff(width)._state(jnp.zeros(2), jnp.zeros(()))
+        found = episode.gradient(plan[None], start)
+        assert found.fitnesses[0] == counted
+        slope = found.gradients[0, 0]
+        np.testing.assert_allclose(slope[:, 0], expected_, rtol=2e-5, atol=1e-7)
+        assert not slope[:, 1].any()
+
+
+def test_a_plan_sees_that_its_end_is_near() -> None:
+    """All physics in one call, and in steps: the same gradient."""
+    env = newton_qd.create("hopper_uni", auto_reset=False)
+    plan = 0.1 * jnp.ones((1, 60, 3))  # falls after about 40 steps
+    key = jax.random.key(0)
+
+    def found(env: Env, every: int | None) -> Any:
+        options = GradientOptions(checkpoint_every=every)
+        episode = Episode(env, episode_length=60, options=options)
+        return episode.gradient(plan, key)
+
+    smooth = with_smooth_termination(env, WIDTH)
+    blind, once, steps = found(env, None), found(smooth, None), found(smooth, 30)
+    np.testing.assert_array_equal(blind.fitnesses, once.fitnesses)
+    np.testing.assert_array_equal(once.fitnesses, steps.fitnesses)
+    scale = np.abs(once.gradients).max()
+    np.testing.assert_allclose(once.gradients, steps.gradients, atol=1e-4 * scale)
+    assert np.abs(once.gradients - blind.gradients).max() > 0.1 * scale
 
 
 @pytest.mark.parametrize("width", [0.0, -1.0, 1e-39, math.nan, math.inf, True, "0.05"])

@@ -25,7 +25,13 @@ from newton_qd.gradients.mixed import (
     check_mixture,
     mixed_gradients,
 )
-from newton_qd.gradients.outcome import Outcome, at_fault, finished, transition
+from newton_qd.gradients.outcome import (
+    Outcome,
+    Tally,
+    at_fault,
+    finished,
+    transition,
+)
 from newton_qd.gradients.plans import run_plan
 from newton_qd.gradients.scores import gradient_scores, scores
 from newton_qd.moved import moved_name
@@ -73,7 +79,9 @@ class Episode:
     of ``jax.jit``, the first call of a method compiles it. An episode is immutable. It
     compares and hashes by identity, so it can be a static argument of jitted functions.
     A call runs one world. It is differentiable with respect to the genotype, the
-    initial state and the physical parameters of the world. The other methods take N
+    initial state and the physical parameters of the world, and sees the end of the
+    episode where ``done`` has a gradient: see
+    :func:`~newton_qd.gradients.with_smooth_termination`. The other methods take N
     genotypes, a pytree with leaves (N, ...). All N episodes have the same start.
 
         episode = Episode(env, policy, extractor, episode_length=100)
@@ -172,14 +180,15 @@ class Episode:
             rows["action"] = self._plan(parameters)
         no = jnp.zeros((), bool)
         likes = [x for x in jax.tree.leaves((parameters, first, params)) if x.size]
-        carry = split_as(likes, (first, jnp.zeros((), dtype), no, no))
-        (_, fitness, _, bad), (readings, over, taken) = scan_keeping(
+        carry = split_as(likes, (first, Tally.zero(dtype), no))
+        (_, tally, bad), (readings, over, taken) = scan_keeping(
             functools.partial(self._advance, parameters, carry[0], params),
             carry,
             rows,
             steps,
             self.options.checkpoint_every,
         )
+        fitness = tally.fitness
         return finished(self.descriptor_extractor, fitness, readings, over, bad, taken)
 
     @compiled_once
@@ -364,11 +373,11 @@ class Episode:
         parameters: PyTree,
         first: StateLike,
         params: Params,
-        carry: tuple[Any, jax.Array, jax.Array, jax.Array],
+        carry: tuple[Any, Tally, jax.Array],
         row: dict[str, jax.Array],
     ) -> tuple[tuple, tuple]:
-        """Runs one control step; carries state, fitness, end of the episode, faults."""
-        begin, fitness, over, bad = carry
+        """Runs one control step; carries the state, the fitness so far, and faults."""
+        begin, tally, bad = carry
         state = begin
         if "factor" in row:
             state = passed_back(state, row["factor"], self.options.clip)
@@ -381,14 +390,11 @@ class Episode:
         state = step(state, action) if params is None else step(state, action, params)
         state = split_as([begin.reward], state)
         steps = transition(begin, action, state) if self.transitions else {}
-        # This sum is in time order. A reduction over time would depend on the batch
-        # size.
-        fitness = jnp.where(over, fitness, fitness + state.reward)
+        over, tally = tally.over, tally.add(state.reward, state.done)
         bad = bad | (~over & at_fault(state))
         reading = None
         if self.descriptor_extractor is not None:
             reading = begin.info["state_descriptor"]
-        ended = state.done > 0
         if self.transitions:
-            state = select(ended, first, state)
-        return (state, fitness, over | ended, bad), (reading, over, steps)
+            state = select(state.done > 0, first, state)
+        return (state, tally, bad), (reading, over, steps)

@@ -11,7 +11,52 @@ from newton_qd.envs.state import at_fault
 from newton_qd.extractors import Trajectories
 from newton_qd.types import Action, DescriptorExtractor, StateLike
 
-__all__ = ["Outcome", "at_fault", "finished", "transition"]
+__all__ = ["Outcome", "Tally", "at_fault", "finished", "transition"]
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Tally:
+    r"""The fitness of an episode so far.
+
+    The fitness is
+
+    .. math:: \sum_t r_t \prod_{s<t} (1 - d_s),
+
+    summed up to the first ``done``. Where ``done`` has a gradient, the fitness has it
+    too: the more likely an end is, the less count the rewards after it.
+
+    Attributes:
+        fitness: () sum of the rewards so far.
+        going: () 1 before the first ``done``, else 0.
+    """
+
+    fitness: jax.Array
+    going: jax.Array
+
+    @staticmethod
+    def zero(dtype: jnp.dtype) -> Tally:
+        """Returns the tally before the first step."""
+        return Tally(jnp.zeros((), dtype), jnp.ones((), dtype))
+
+    @property
+    def over(self) -> jax.Array:
+        """() whether the episode has ended."""
+        return self.going == 0
+
+    def add(self, reward: jax.Array, done: jax.Array) -> Tally:
+        """Returns the tally after one more step.
+
+        The sum is in time order. A reduction over time would depend on the batch size.
+
+        Args:
+            reward: () reward of the step.
+            done: () 1 if the step ends the episode, else 0.
+        """
+        over = self.over
+        # after the end, a reward may be NaN
+        gained = self.going * jnp.where(over, 0, reward)
+        return Tally(self.fitness + gained, self.going * (1 - done))
 
 
 @jax.tree_util.register_dataclass

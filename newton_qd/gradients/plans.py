@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from newton_qd.envs.env import Env
-from newton_qd.gradients.outcome import at_fault
+from newton_qd.gradients.outcome import Tally, at_fault
 from newton_qd.physics.explicit_mesh import split_as
 from newton_qd.types import Params
 
@@ -36,13 +36,11 @@ def run_plan(
     over = jnp.concatenate([none, ended[:-1]])
     bad = jnp.any(~over & jax.vmap(at_fault)(states))
 
-    # This sum is in time order. A reduction over time would depend on the batch size.
-    def add(total: jax.Array, row: tuple) -> tuple[jax.Array, None]:
-        over, reward = row
-        return jnp.where(over, total, total + reward), None
+    def add(tally: Tally, row: tuple[jax.Array, jax.Array]) -> tuple[Tally, None]:
+        return tally.add(*row), None
 
-    zero = split_as([states.reward], jnp.zeros_like(states.reward[0]))
-    fitness, _ = jax.lax.scan(add, zero, (over, states.reward))
+    zero = split_as([states.reward], Tally.zero(states.reward.dtype))
+    fitness = jax.lax.scan(add, zero, (states.reward, states.done))[0].fitness
     if not described:
         return fitness, None, over, bad
     begin, after = (x.info["state_descriptor"] for x in (first, states))

@@ -57,9 +57,10 @@ def with_smooth_termination(env: Env, width: float) -> Env:
     """Returns the environment with a ``done`` that has a gradient.
 
     Values stay the same: ``done`` is 0 or 1. Its gradient is that of a smooth step, in
-    the environments that end an episode when height or pitch leave their limits. So a
-    learning method can see from ``1 - done`` that a fall is near. In other
-    environments, this changes nothing. A robot of your own computes its limits with
+    the environments that end an episode when height or pitch leave their limits. So
+    the gradient of an :class:`~newton_qd.gradients.Episode` sees that a fall is near,
+    and a learning method sees it from ``1 - done``. In other environments, this changes
+    nothing. A robot of your own computes its limits with
     ``newton_qd.envs.limits.within``.
 
     Args:
