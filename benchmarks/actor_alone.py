@@ -120,16 +120,16 @@ def returns(
     return found
 
 
-def changed(text: str) -> tuple[str, Any]:
-    """A setting and its value, from ``name=value``."""
+def changed(text: str, kind: type = ActorCriticSettings) -> tuple[str, Any]:
+    """A setting of a dataclass and its value, from ``name=value``."""
     name, equals, value = text.partition("=")
-    names = [field.name for field in dataclasses.fields(ActorCriticSettings)]
+    names = [field.name for field in dataclasses.fields(kind)]
     if name not in names or not equals:
         allowed = f"name=value with one of {', '.join(names)}"
         raise argparse.ArgumentTypeError(f"got {text!r}; allowed: {allowed}")
     try:
         found = json.loads(value)
-        ActorCriticSettings(**{name: found})
+        kind(**{name: found})
     except (ValueError, TypeError) as error:  # a JSON error is a ValueError
         raise argparse.ArgumentTypeError(f"{text!r}: {error}") from error
     return name, found

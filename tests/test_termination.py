@@ -247,6 +247,11 @@ def test_a_plan_sees_that_its_end_is_near() -> None:
     assert np.abs(once.gradients - blind.gradients).max() > 0.1 * scale
 
 
+def test_another_environment_stays_as_it_is() -> None:
+    env: Any = PointEnv()
+    assert with_smooth_termination(env, WIDTH) is env
+
+
 @pytest.mark.parametrize("width", [0.0, -1.0, 1e-39, math.nan, math.inf, True, "0.05"])
 def test_a_wrong_width_is_refused(width: Any) -> None:
     env = newton_qd.create("hopper_uni")

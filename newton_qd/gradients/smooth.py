@@ -81,4 +81,4 @@ def with_smooth_termination(env: Env, width: float) -> Env:
             changed.termination_width = float(width)
         return changed
 
-    return env.with_base(change)
+    return env.with_base(change) if isinstance(env, Env) else env

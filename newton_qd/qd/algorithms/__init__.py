@@ -21,6 +21,7 @@ from newton_qd.qd.algorithms.cma_mega import CMA_MEGA
 from newton_qd.qd.algorithms.dcrl_me import DCRL_ME
 from newton_qd.qd.algorithms.me import ME
 from newton_qd.qd.algorithms.me_actor_critic import ME_ACTOR_CRITIC
+from newton_qd.qd.algorithms.me_ascent import ME_ASCENT
 from newton_qd.qd.algorithms.me_conditioned import ME_CONDITIONED
 from newton_qd.qd.algorithms.me_es import ME_ES
 from newton_qd.qd.algorithms.me_gradient import ME_GRADIENT
@@ -46,6 +47,7 @@ ALGORITHMS: tuple[AlgorithmSpec[Any], ...] = (
     ME_ES,
     ASCII_ME,
     ME_GRADIENT,
+    ME_ASCENT,
     ASCII_ME_EXACT,
     ME_ACTOR_CRITIC,
     ME_CONDITIONED,

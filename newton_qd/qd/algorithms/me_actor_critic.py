@@ -6,6 +6,7 @@ import dataclasses
 from typing import Any
 
 from newton_qd.checks import message
+from newton_qd.qd.algorithms.climbing import ClimbingOptions, ascent_emitter
 from newton_qd.qd.algorithms.gradient_options import initial_scale
 from newton_qd.qd.algorithms.learning import LearningOptions, learning_method
 from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext
@@ -14,7 +15,7 @@ from newton_qd.qd.config import ConfigError, EvolveConfig
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ActorCriticOptions(LearningOptions):
+class ActorCriticOptions(LearningOptions, ClimbingOptions):
     """Options of MAP-Elites with actors that learn with gradients of the physics.
 
     Attributes:
@@ -37,9 +38,10 @@ class ActorCriticOptions(LearningOptions):
     lifetime: int = 10
 
     def episodes(self, config: EvolveConfig) -> int:
-        """Returns the control steps of a generation's updates, counted in episodes."""
+        """Returns the differentiated control steps of a generation, in episodes."""
         updates = self.actors * self.branches * self.updates
-        return -(-updates * self.worlds * self.window // config.episode_length)
+        learnt = -(-updates * self.worlds * self.window // config.episode_length)
+        return learnt + self.climbing_episodes
 
 
 # To walk far in any direction takes many updates.
@@ -76,7 +78,10 @@ def _make(context: EmitterContext, options: ActorCriticOptions) -> Any:
         allowed = f"at most batch_size = {config.batch_size} as their product"
         name = "options: actors, branches, copies"
         raise ConfigError(message(name, given, allowed))
-    return with_isoline(emitter, config)
+    if not options.climbers:
+        return with_isoline(emitter, config)
+    rest = config.batch_size - emitter.batch_size
+    return with_isoline(emitter, config, ascent_emitter(context, options, rest))
 
 
 def _gradients(config: EvolveConfig, options: ActorCriticOptions) -> int:

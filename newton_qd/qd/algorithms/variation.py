@@ -45,17 +45,21 @@ def isoline_emitter(config: EvolveConfig, batch_size: int) -> Emitter:
     )
 
 
-def with_isoline(emitter: Emitter, config: EvolveConfig) -> Emitter:
+def with_isoline(emitter: Emitter, config: EvolveConfig, *others: Emitter) -> Emitter:
     """Completes a generation with iso+line variations.
 
     Args:
         emitter: Emitter of a part of a generation.
         config: Settings of the run.
+        *others: Emitters of other parts.
     """
     from qdax.core.emitters.multi_emitter import MultiEmitter
 
-    rest = config.batch_size - emitter.batch_size
-    return MultiEmitter((emitter, isoline_emitter(config, rest))) if rest else emitter
+    parts = [emitter, *others]
+    rest = config.batch_size - sum(part.batch_size for part in parts)
+    if rest:
+        parts.append(isoline_emitter(config, rest))
+    return MultiEmitter(tuple(parts)) if len(parts) > 1 else emitter
 
 
 def with_own_isoline(emitter: MultiEmitter, config: EvolveConfig) -> MultiEmitter:

@@ -3,6 +3,7 @@
 - ``ActorCriticEmitter``: policies of actors that learn over short horizons with
   ``ActorCritic``
 - ``ConditionedActorEmitter``: policies of one such actor that is told the descriptor
+- ``AscentEmitter``: elites that climb along the gradient of their return, step by step
 - ``AsciiEmitter``: parents move towards the better actions of other individuals
 - ``ExactAsciiEmitter``: the same with the gradient of the physics
 - ``OMGMEGAEmitter``: random steps along the gradients of elites
@@ -15,11 +16,11 @@
 - ``GradientVariationEmitter``: elites climb their fitness, or move along descriptors
 - ``SteeringEmitter``: elites move towards empty cells
 
-The emitters with actors, ``ExactAsciiEmitter`` and ``GradientLineEmitter`` evaluate
-gradients themselves. ``AsciiEmitter`` reads ``extra_scores["transitions"]``. All others
-read ``extra_scores["gradients"]``, see ``scoring/gradient_scores.py``. All emitters
-work with ``jax.jit`` and ``jax.lax.scan``, and together with QDax's emitters in its
-``MultiEmitter``.
+The emitters with actors, ``AscentEmitter``, ``ExactAsciiEmitter`` and
+``GradientLineEmitter`` evaluate gradients themselves. ``AsciiEmitter`` reads
+``extra_scores["transitions"]``. All others read ``extra_scores["gradients"]``, see
+``scoring/gradient_scores.py``. All emitters work with ``jax.jit`` and ``jax.lax.scan``,
+and together with QDax's emitters in its ``MultiEmitter``.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from newton_qd.qd.emitters.actor_critic import ActorCriticEmitter
     from newton_qd.qd.emitters.actor_critic_learner import ActorCritic
     from newton_qd.qd.emitters.actor_critic_settings import ActorCriticSettings
+    from newton_qd.qd.emitters.ascent import AscentEmitter
     from newton_qd.qd.emitters.ascii import AsciiEmitter, ExactAsciiEmitter
     from newton_qd.qd.emitters.behaviors import Interpolation
     from newton_qd.qd.emitters.cma_maega import CMAMAEGAEmitter
@@ -50,6 +52,7 @@ __all__ = [
     "ActorCritic",
     "ActorCriticEmitter",
     "ActorCriticSettings",
+    "AscentEmitter",
     "AsciiEmitter",
     "CMAMAEGAEmitter",
     "CMAMEGAEmitter",
@@ -69,6 +72,7 @@ _HOME = {
     "ActorCritic": "newton_qd.qd.emitters.actor_critic_learner",
     "ActorCriticEmitter": "newton_qd.qd.emitters.actor_critic",
     "ActorCriticSettings": "newton_qd.qd.emitters.actor_critic_settings",
+    "AscentEmitter": "newton_qd.qd.emitters.ascent",
     "AsciiEmitter": "newton_qd.qd.emitters.ascii",
     "CMAMAEGAEmitter": "newton_qd.qd.emitters.cma_maega",
     "CMAMEGAEmitter": "newton_qd.qd.emitters.cma_mega",

@@ -1,0 +1,192 @@
+"""Elites that climb: their gradient, their steps, and where they begin."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from emitter_problems import begin, compiled, values
+from point_runs import SMALL, PointEnv, point_task, run
+
+from newton_qd.gradients import Episode
+from newton_qd.qd.algorithms.me_ascent import MEAscentOptions
+from newton_qd.qd.algorithms.options import read_options
+from newton_qd.qd.config import ConfigError
+from newton_qd.qd.emitters import AscentEmitter
+from newton_qd.qd.emitters.ascent import limited_mean, mean_slope
+from newton_qd.qd.run.search import Search
+
+
+def uphill(weights: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Gradient of the sphere; the first climber loses it."""
+    del key
+    slopes = jax.vmap(jax.grad(lambda x: values(x)[0]))(weights)
+    lost = jnp.arange(len(weights)) == 0
+    return jnp.where(lost[:, None], 0, slopes), lost
+
+
+def climbing(**changes: Any) -> AscentEmitter:
+    given = {"climbers": 6, "lifetime": 3, "shortest": 0.1, "longest": 0.4, **changes}
+    return AscentEmitter(uphill, **given)
+
+
+def test_long_gradients_count_with_the_median_norm() -> None:
+    rng = np.random.default_rng(0)
+    gradients = rng.normal(size=(5, 3, 4)).astype(np.float32)
+    gradients[0] *= 1e30  # the square of its norm overflows
+    gradients[1, 0] = 0
+    gradients[:, 2] = 0
+    expected = np.zeros((3, 4))
+    for policy in range(3):
+        rows = gradients[:, policy].astype(np.float64)
+        norms = np.linalg.norm(rows, axis=1)
+        limit = np.median(norms)
+        for row, norm in zip(rows, norms, strict=True):
+            expected[policy] += row * (min(1, limit / norm) if norm else 0) / 5
+    found = np.asarray(limited_mean(jnp.asarray(gradients)))
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+    np.testing.assert_array_equal(found[2], 0)
+
+
+def policy(weights: jax.Array, obs: jax.Array) -> jax.Array:
+    return weights.reshape(2, 3) @ obs
+
+
+def test_the_gradient_is_that_of_the_mean_return() -> None:
+    """With two worlds of the same norm, the limit does not matter."""
+    episode = Episode(PointEnv(), policy, episode_length=4)
+    weights = 0.1 * jax.random.normal(jax.random.key(0), (3, 6))
+    weights = weights.at[2, 2].set(2.0)  # far right: a fault
+    key = jax.random.key(1)
+    slopes, lost = jax.jit(mean_slope(episode, 2))(weights, key)
+    found = jax.vmap(episode.gradient, (None, 0))(weights, jax.random.split(key, 2))
+    norms = np.linalg.norm(found.gradients[:, :, 0], axis=-1)
+    shares = np.minimum(1, norms.mean(0) / np.where(norms > 0, norms, 1))
+    expected = (shares[..., None] * found.gradients[:, :, 0]).mean(0)
+    np.testing.assert_allclose(slopes, expected, rtol=1e-5, atol=1e-6)
+    assert list(lost) == [False, False, True] and not slopes[2].any()
+
+
+def test_a_climber_makes_steps_of_one_length_with_momentum() -> None:
+    emitter = climbing(lifetime=1000, momentum=0.5)
+    repertoire, state = begin(emitter)
+    update = compiled(emitter.state_update)
+    elites = np.asarray(repertoire.genotypes)[
+        np.asarray(repertoire.fitnesses)[:, 0] > -np.inf
+    ]
+    begun, none = compiled(emitter.emit)(repertoire, state, jax.random.key(0))
+    assert all(np.any(np.all(x == elites, axis=1)) for x in np.asarray(begun))
+    assert not none["overflowed"].any()
+    # the first update starts the first climber again, which has no gradient here
+    state = update(state, repertoire)
+    x, motion = np.asarray(state.weights), np.asarray(state.motion)
+    sizes = np.asarray(state.steps)
+    assert np.all((sizes >= 0.1) & (sizes <= 0.4)) and len(set(sizes)) == 6
+    for _ in range(2):
+        slopes = np.asarray(uphill(jnp.asarray(x), jax.random.key(0))[0])
+        norms = np.linalg.norm(slopes, axis=1, keepdims=True)
+        motion = 0.5 * motion + 0.5 * slopes / np.where(norms > 0, norms, 1)
+        norms = np.linalg.norm(motion, axis=1, keepdims=True)
+        x = x + sizes[:, None] * motion / np.where(norms > 0, norms, 1)
+        state = update(state, repertoire)
+        emitted, lost = compiled(emitter.emit)(repertoire, state, jax.random.key(0))
+        np.testing.assert_allclose(emitted, x, rtol=1e-4, atol=1e-5)
+        assert list(lost["overflowed"]) == [True] + 5 * [False]
+
+
+def test_climbers_begin_again_one_after_the_other() -> None:
+    emitter = climbing()
+    repertoire, state = begin(emitter)
+    update = compiled(emitter.state_update)
+    state = update(state, repertoire)
+    sizes = [np.asarray(state.steps)]
+    for _ in range(6):
+        state = update(state, repertoire)
+        sizes.append(np.asarray(state.steps))
+        fresh = sizes[-1] != sizes[-2]
+        assert fresh.sum() == 2
+        # a fresh climber is one step away from an elite
+        away = np.asarray(state.weights)[:, None] - np.asarray(repertoire.genotypes)
+        filled = np.asarray(repertoire.fitnesses)[:, 0] > -np.inf
+        nearest = np.linalg.norm(away[:, filled], axis=-1).min(axis=1)
+        moved = np.arange(6) > 0  # the first has no gradient
+        own = fresh & moved
+        np.testing.assert_allclose(nearest[own], sizes[-1][own], rtol=1e-4)
+    ages = [(a != b) for a, b in zip(sizes[1:], sizes, strict=False)]
+    assert all(sum(age[i] for age in ages) == 2 for i in range(6))
+
+
+def test_climbers_rise() -> None:
+    emitter = climbing(lifetime=1000, shortest=0.02, longest=0.05)
+    repertoire, state = begin(emitter)
+    update = compiled(emitter.state_update)
+    before = jax.vmap(values)(state.weights)[1:, 0]
+    for _ in range(8):
+        state = update(state, repertoire)
+    assert np.all(jax.vmap(values)(state.weights)[1:, 0] > before)
+
+
+@pytest.mark.parametrize(
+    ("given", "text"),
+    [
+        ({"climbers": 0}, "climbers: got 0; allowed: .* from 1"),
+        ({"lifetime": 0}, "lifetime: got 0; allowed: .* from 1"),
+        ({"shortest": 0.5}, r"longest: got \(0.5, 0.4\); allowed: 0 < shortest"),
+        ({"momentum": 1.0}, "momentum: got 1.0; allowed: .* below 1"),
+    ],
+)
+def test_wrong_climbers_are_refused(given: dict[str, Any], text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        climbing(**given)
+
+
+def test_an_episode_needs_start_states() -> None:
+    episode = Episode(PointEnv(), policy, episode_length=4)
+    with pytest.raises(ValueError, match=r"worlds: got 0; allowed: .* from 1"):
+        mean_slope(episode, 0)
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"climbers": 0}, "options: climbers: got 0; allowed: .* from 1"),
+        ({"climb_steps": 0}, "options: climb_steps: got 0; allowed: .* from 1"),
+        ({"climb_worlds": 0}, "options: climb_worlds: got 0; allowed: .* from 1"),
+        ({"climb_shortest": 0.2}, r"options: climb_shortest, .*got \(0.2, 0.05\)"),
+        ({"climb_momentum": 1.0}, "options: climb_momentum: got 1.0; .* below 1"),
+    ],
+)
+def test_wrong_options_are_refused(options: dict[str, Any], text: str) -> None:
+    config = SMALL.replace(algorithm="me-ascent", options=options)
+    with pytest.raises(ConfigError, match=text):
+        read_options(MEAscentOptions, config)
+
+
+ACTORS = {
+    **{"actors": 1, "branches": 1, "copies": 4, "updates": 1},
+    **{"worlds": 2, "window": 4, "batches": 2, "critic": (8,)},
+}
+
+
+def test_climbers_are_a_part_of_a_generation() -> None:
+    """Beside those of the actors; the rest are iso+line variations."""
+    options: Any = {**ACTORS, "climbers": 5, "climb_worlds": 2}
+    config = SMALL.replace(algorithm="me-actor-critic", options=options)
+    generation: Any = Search(config, point_task(config))._generation
+    parts = generation.emitter.emitters
+    assert [part.batch_size for part in parts] == [4, 5, 7]
+    config = config.replace(options={**options, "climbers": 13})
+    with pytest.raises(ConfigError, match=r"climbers: got 13; .* most 12, the rest"):
+        Search(config, point_task(config)).empty()
+
+
+def test_a_run_counts_what_is_differentiated() -> None:
+    config = SMALL.replace(algorithm="me-ascent", iterations=3)
+    options: Any = {"climbers": 16, "climb_worlds": 3}
+    metrics = run(dataclasses.replace(config, options=options)).metrics
+    np.testing.assert_array_equal(np.diff(metrics["evaluations"]), 16 + 16 * 3)
+    assert metrics["qd_score"][-1] > metrics["qd_score"][0]
