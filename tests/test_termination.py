@@ -227,6 +227,35 @@ def test_an_episode_sees_that_its_end_is_near(push: float) -> None:
         assert not slope[:, 1].any()
 
 
+class Ended(PointEnv):
+    """Ends at the third step with some done; later done and reward are not finite."""
+
+    def __init__(self, done: Any) -> None:
+        self.done = done
+
+    def step(self, state: Any, action: jax.Array) -> Any:
+        after = super().step(state, action)
+        count = state.info["count"] + 1
+        over = jnp.where(count > 3, jnp.nan, (count == 3) * self.done)
+        one = jnp.where(count > 3, jnp.nan, jnp.ones_like(after.reward))
+        info = {**after.info, "count": count}
+        return dataclasses.replace(after, reward=one, done=over, info=info)
+
+
+@pytest.mark.parametrize("done", [1.0, 2.0, 0.5, np.float32(1)])
+def test_an_end_is_any_done_above_zero(done: Any) -> None:
+    """What comes after the end does not count, whatever it is."""
+    with jax.enable_x64(True):
+        env = Ended(jnp.asarray(done))
+        first = env._state(jnp.zeros(2, np.float32), jnp.zeros((), np.float32))
+        info, begun = {**first.info, "count": 0}, jnp.zeros_like(env.done)
+        first = dataclasses.replace(first, done=begun, info=info)
+        plan = jnp.zeros((1, 6, 2), np.float32)
+        found = Episode(env, episode_length=6).gradient(plan, first)
+        assert found.fitnesses[0] == 3 and not found.faulty[0]
+        assert not found.gradients.any()
+
+
 def test_a_plan_sees_that_its_end_is_near() -> None:
     """All physics in one call, and in steps: the same gradient."""
     env = newton_qd.create("hopper_uni", auto_reset=False)

@@ -24,7 +24,8 @@ class Tally:
     .. math:: \sum_t r_t \prod_{s<t} (1 - d_s),
 
     summed up to the first ``done``. Where ``done`` has a gradient, the fitness has it
-    too: the more likely an end is, the less count the rewards after it.
+    too: the nearer a step is to an end, the less count the rewards after it. Rewards
+    after the end count as 0, so the step that ends the episode adds no slope.
 
     Attributes:
         fitness: () sum of the rewards so far.
@@ -51,12 +52,15 @@ class Tally:
 
         Args:
             reward: () reward of the step.
-            done: () 1 if the step ends the episode, else 0.
+            done: () above 0 if the step ends the episode, else 0.
         """
-        over = self.over
-        # after the end, a reward may be NaN
+        over, dtype = self.over, self.going.dtype
+        # after the end, both may be NaN
         gained = self.going * jnp.where(over, 0, reward)
-        return Tally(self.fitness + gained, self.going * (1 - done))
+        slope = jnp.where(over, 0, done).astype(dtype)
+        # 0 or 1, with the gradient of done
+        ends = (slope > 0).astype(dtype) + (slope - jax.lax.stop_gradient(slope))
+        return Tally(self.fitness + gained, self.going * (1 - ends))
 
 
 @jax.tree_util.register_dataclass
