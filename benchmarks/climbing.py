@@ -29,7 +29,7 @@ from study_execution import Progress
 from study_protocols import FIELD
 
 from newton_qd.qd.algorithms.climbing import ascent_emitter
-from newton_qd.qd.algorithms.me_ascent import MEAscentOptions
+from newton_qd.qd.algorithms.me_ascent import ME_ASCENT, MEAscentOptions
 from newton_qd.qd.algorithms.spec import EmitterContext
 from newton_qd.qd.config import EvolveConfig
 from newton_qd.qd.scoring.robust import run_scoring
@@ -98,11 +98,15 @@ def main() -> None:
     base = np.sum(found + task.reward_offset * config.episode_length)
     print(f"{found.size} elites, QD score {base:,.0f}, best {found.max():,.0f}\n")
     marks = [n for n in (1, 2, 4, 8, 16, 32, 64) if n <= args.steps]
-    print("| " + " | ".join(["settings", *map(str, marks), "time [s]"]) + " |")
+    print(
+        "| " + " | ".join(["settings", *map(str, marks), "processor time [s]"]) + " |"
+    )
     print("|---" * (len(marks) + 2) + "|", flush=True)
     for settings in args.settings:
         values = {"climb_steps": 10**6, **dict(settings)}
-        options = MEAscentOptions(climbers=args.climbers, **values)
+        values = {"climbers": args.climbers, **values}
+        asked = config.replace(algorithm="me-ascent", options=values)
+        options = ME_ASCENT.read_options(asked)
         begin = time.process_time()
         scores = list(gains(context, begun, options, args.steps))
         cells = [", ".join(f"{k}={v:g}" for k, v in settings) or "defaults"]

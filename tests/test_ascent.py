@@ -22,16 +22,15 @@ from newton_qd.qd.run.search import Search
 
 
 def uphill(weights: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Gradient of the sphere; the first climber loses it."""
+    """Gradient of the sphere; it is never lost."""
     del key
     slopes = jax.vmap(jax.grad(lambda x: values(x)[0]))(weights)
-    lost = jnp.arange(len(weights)) == 0
-    return jnp.where(lost[:, None], 0, slopes), lost
+    return slopes, jnp.zeros(len(weights), bool)
 
 
 def climbing(**changes: Any) -> AscentEmitter:
-    given = {"climbers": 6, "lifetime": 3, "shortest": 0.1, "longest": 0.4, **changes}
-    return AscentEmitter(uphill, **given)
+    given = {"climbers": 6, "lifetime": 3, "shortest": 0.1, "longest": 0.4}
+    return AscentEmitter(**{"slope": uphill, **given, **changes})
 
 
 def test_long_gradients_count_with_the_median_norm() -> None:
@@ -47,9 +46,22 @@ def test_long_gradients_count_with_the_median_norm() -> None:
         limit = np.median(norms)
         for row, norm in zip(rows, norms, strict=True):
             expected[policy] += row * (min(1, limit / norm) if norm else 0) / 5
-    found = np.asarray(limited_mean(jnp.asarray(gradients)))
+    sound = jnp.ones((5, 3), bool)
+    found = np.asarray(limited_mean(jnp.asarray(gradients), sound))
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
     np.testing.assert_array_equal(found[2], 0)
+
+
+def test_only_sound_gradients_count() -> None:
+    """One of three, and two of three: the longer one is shortened to the other."""
+    gradients = jnp.array([[3.0, 4.0], [0.0, 10.0], [0.0, 0.0]])[:, None]
+    for sound, expected in (
+        ([True, False, False], [3.0, 4.0]),
+        ([True, True, False], [1.5, 4.5]),
+        ([False, False, False], [0.0, 0.0]),
+    ):
+        found = limited_mean(gradients, jnp.array(sound)[:, None])
+        np.testing.assert_allclose(found[0], expected, rtol=1e-6)
 
 
 def policy(weights: jax.Array, obs: jax.Array) -> jax.Array:
@@ -57,7 +69,7 @@ def policy(weights: jax.Array, obs: jax.Array) -> jax.Array:
 
 
 def test_the_gradient_is_that_of_the_mean_return() -> None:
-    """With two worlds of the same norm, the limit does not matter."""
+    """Of two worlds, the longer gradient is shortened to the other."""
     episode = Episode(PointEnv(), policy, episode_length=4)
     weights = 0.1 * jax.random.normal(jax.random.key(0), (3, 6))
     weights = weights.at[2, 2].set(2.0)  # far right: a fault
@@ -65,7 +77,7 @@ def test_the_gradient_is_that_of_the_mean_return() -> None:
     slopes, lost = jax.jit(mean_slope(episode, 2))(weights, key)
     found = jax.vmap(episode.gradient, (None, 0))(weights, jax.random.split(key, 2))
     norms = np.linalg.norm(found.gradients[:, :, 0], axis=-1)
-    shares = np.minimum(1, norms.mean(0) / np.where(norms > 0, norms, 1))
+    shares = np.minimum(1, norms.min(0) / np.where(norms > 0, norms, 1))
     expected = (shares[..., None] * found.gradients[:, :, 0]).mean(0)
     np.testing.assert_allclose(slopes, expected, rtol=1e-5, atol=1e-6)
     assert list(lost) == [False, False, True] and not slopes[2].any()
@@ -80,8 +92,7 @@ def test_a_climber_makes_steps_of_one_length_with_momentum() -> None:
     ]
     begun, none = compiled(emitter.emit)(repertoire, state, jax.random.key(0))
     assert all(np.any(np.all(x == elites, axis=1)) for x in np.asarray(begun))
-    assert not none["overflowed"].any()
-    # the first update starts the first climber again, which has no gradient here
+    assert not none["climbers_overflowed"].any()
     state = update(state, repertoire)
     x, motion = np.asarray(state.weights), np.asarray(state.motion)
     sizes = np.asarray(state.steps)
@@ -93,9 +104,26 @@ def test_a_climber_makes_steps_of_one_length_with_momentum() -> None:
         norms = np.linalg.norm(motion, axis=1, keepdims=True)
         x = x + sizes[:, None] * motion / np.where(norms > 0, norms, 1)
         state = update(state, repertoire)
-        emitted, lost = compiled(emitter.emit)(repertoire, state, jax.random.key(0))
+        emitted = compiled(emitter.emit)(repertoire, state, jax.random.key(0))[0]
         np.testing.assert_allclose(emitted, x, rtol=1e-4, atol=1e-5)
-        assert list(lost["overflowed"]) == [True] + 5 * [False]
+
+
+def test_a_lost_climber_begins_again() -> None:
+    def lossy(weights: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        slopes, lost = uphill(weights, key)
+        lost = lost.at[2].set(True)
+        return jnp.where(lost[:, None], 0, slopes), lost
+
+    emitter = climbing(slope=lossy, lifetime=1000)
+    repertoire, state = begin(emitter)
+    update = compiled(emitter.state_update)
+    sizes = []
+    for _ in range(3):
+        state = update(state, repertoire)
+        lost = emitter.emit(repertoire, state, jax.random.key(0))[1]
+        assert list(np.flatnonzero(lost["climbers_overflowed"])) == [2]
+        sizes.append(np.asarray(state.steps))
+    assert list(np.flatnonzero(sizes[2] != sizes[1])) == [2]
 
 
 def test_climbers_begin_again_one_after_the_other() -> None:
@@ -113,9 +141,7 @@ def test_climbers_begin_again_one_after_the_other() -> None:
         away = np.asarray(state.weights)[:, None] - np.asarray(repertoire.genotypes)
         filled = np.asarray(repertoire.fitnesses)[:, 0] > -np.inf
         nearest = np.linalg.norm(away[:, filled], axis=-1).min(axis=1)
-        moved = np.arange(6) > 0  # the first has no gradient
-        own = fresh & moved
-        np.testing.assert_allclose(nearest[own], sizes[-1][own], rtol=1e-4)
+        np.testing.assert_allclose(nearest[fresh], sizes[-1][fresh], rtol=1e-4)
     ages = [(a != b) for a, b in zip(sizes[1:], sizes, strict=False)]
     assert all(sum(age[i] for age in ages) == 2 for i in range(6))
 
@@ -124,10 +150,11 @@ def test_climbers_rise() -> None:
     emitter = climbing(lifetime=1000, shortest=0.02, longest=0.05)
     repertoire, state = begin(emitter)
     update = compiled(emitter.state_update)
-    before = jax.vmap(values)(state.weights)[1:, 0]
+    state = update(state, repertoire)  # the first climber begins again
+    before = jax.vmap(values)(state.weights)[:, 0]
     for _ in range(8):
         state = update(state, repertoire)
-    assert np.all(jax.vmap(values)(state.weights)[1:, 0] > before)
+    assert np.all(jax.vmap(values)(state.weights)[:, 0] > before)
 
 
 @pytest.mark.parametrize(
@@ -135,13 +162,25 @@ def test_climbers_rise() -> None:
     [
         ({"climbers": 0}, "climbers: got 0; allowed: .* from 1"),
         ({"lifetime": 0}, "lifetime: got 0; allowed: .* from 1"),
-        ({"shortest": 0.5}, r"longest: got \(0.5, 0.4\); allowed: 0 < shortest"),
+        ({"lifetime": 2**40}, "lifetime: got 1099511627776; allowed: .* 1073741824"),
+        ({"shortest": 0.0}, r"shortest: got 0.0; allowed: .* above 0"),
+        ({"shortest": 0.5}, r"longest: got 0.4; allowed: .* from 0.5"),
+        ({"longest": float("inf")}, r"longest: got inf; allowed: finite"),
         ({"momentum": 1.0}, "momentum: got 1.0; allowed: .* below 1"),
     ],
 )
 def test_wrong_climbers_are_refused(given: dict[str, Any], text: str) -> None:
     with pytest.raises(ValueError, match=text):
         climbing(**given)
+
+
+def test_wrong_types_are_refused() -> None:
+    with pytest.raises(TypeError, match="slope: got 3; allowed: a function"):
+        climbing(slope=3)
+    with pytest.raises(TypeError, match="longest: got 'a'; allowed"):
+        climbing(longest="a")
+    with pytest.raises(TypeError, match="episode: got None; allowed: an Episode"):
+        mean_slope(None, 2)  # pyright: ignore[reportArgumentType]
 
 
 def test_an_episode_needs_start_states() -> None:
@@ -156,7 +195,9 @@ def test_an_episode_needs_start_states() -> None:
         ({"climbers": 0}, "options: climbers: got 0; allowed: .* from 1"),
         ({"climb_steps": 0}, "options: climb_steps: got 0; allowed: .* from 1"),
         ({"climb_worlds": 0}, "options: climb_worlds: got 0; allowed: .* from 1"),
-        ({"climb_shortest": 0.2}, r"options: climb_shortest, .*got \(0.2, 0.05\)"),
+        ({"climb_steps": 2**40}, "options: climb_steps: got 1099511627776; allowed"),
+        ({"climb_shortest": 0.2}, r"options: climb_longest: got 0.05; .* from 0.2"),
+        ({"climb_termination_width": 1e-9}, "options: climb_termination_width: got"),
         ({"climb_momentum": 1.0}, "options: climb_momentum: got 1.0; .* below 1"),
     ],
 )
@@ -180,7 +221,9 @@ def test_climbers_are_a_part_of_a_generation() -> None:
     parts = generation.emitter.emitters
     assert [part.batch_size for part in parts] == [4, 5, 7]
     config = config.replace(options={**options, "climbers": 13})
-    with pytest.raises(ConfigError, match=r"climbers: got 13; .* most 12, the rest"):
+    with pytest.raises(
+        ConfigError, match=r"climbers: got 13; .* most 12 with .* actors have 4"
+    ):
         Search(config, point_task(config)).empty()
 
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from newton_qd import checks
 from newton_qd.checks import message
-from newton_qd.qd.algorithms.gradient_options import (
-    DifferentiableOptions,
-    differentiable,
-)
+from newton_qd.qd.algorithms.gradient_options import MAZES, SHORT
+from newton_qd.qd.algorithms.options import Options
 from newton_qd.qd.algorithms.spec import EmitterContext
 from newton_qd.qd.config import ConfigError
 
@@ -18,23 +17,35 @@ if TYPE_CHECKING:  # importing a list of algorithms imports no JAX
     from newton_qd.qd.emitters.ascent import AscentEmitter
 
 
+_MOST_STEPS = 2**30  # JAX counts in 32 bits
+_NARROWEST = 1e-6  # of the gradient of a fall
+
+# The return of a halfcheetah is chaotic. In a maze, rewards are negative, so the
+# gradient of a fall would point towards it.
+CLIMBING: Mapping[str, Mapping[str, Any]] = {
+    "halfcheetah_uni": {"climb_window": SHORT["window"]},
+    **{name: {"climb_termination_width": 0.0} for name in MAZES},
+}
+"""Defaults of climbers that depend on the environment."""
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ClimbingOptions(DifferentiableOptions):
+class ClimbingOptions(Options):
     """Options of algorithms with elites that climb.
 
     Attributes:
         climbers: Number of elites that climb at a time; each is one offspring of a
-            generation. 0: none.
+            generation. 0: none, which ``me-ascent`` refuses.
         climb_steps: Steps of a climber, one in each generation; then it begins again at
             a random elite.
         climb_shortest: Shortest step, in units of policy weights [-].
         climb_longest: Longest step, in units of policy weights [-].
         climb_momentum: Share of the former direction in a step [-].
-        climb_worlds: Start states of each gradient.
+        climb_worlds: Start states of each gradient; each step draws new ones.
         climb_window: Control steps after which this gradient is cut; 0: never.
         climb_termination_width: Width of the gradient of ``done`` at the limits of a
             healthy robot [m or rad]; with 0, a climber does not see that a fall is
-            near.
+            near. Use 0 if the rewards are negative.
     """
 
     climbers: int = 0
@@ -52,14 +63,14 @@ class ClimbingOptions(DifferentiableOptions):
         Raises:
             ValueError: A value is out of its range.
         """
-        for name in ("climb_steps", "climb_worlds"):
-            checks.integer(name, getattr(self, name), most=None)
-        if not 0 < self.climb_shortest <= self.climb_longest:
-            given = self.climb_shortest, self.climb_longest
-            name = "climb_shortest, climb_longest"
-            raise ValueError(message(name, given, "0 < shortest <= longest"))
+        checks.integer("climb_steps", self.climb_steps, most=_MOST_STEPS)
+        checks.integer("climb_worlds", self.climb_worlds)
+        checks.number("climb_shortest", self.climb_shortest, above=0)
+        checks.number("climb_longest", self.climb_longest, least=self.climb_shortest)
         checks.number("climb_momentum", self.climb_momentum, least=0, below=1)
-        checks.number("climb_termination_width", self.climb_termination_width, least=0)
+        if self.climb_termination_width:
+            name = "climb_termination_width"
+            checks.number(name, self.climb_termination_width, least=_NARROWEST)
 
     @property
     def climbing_episodes(self) -> int:
@@ -81,18 +92,20 @@ def ascent_emitter(
         ConfigError: There are more climbers than a generation can contain.
         ValueError: A value is out of its range.
     """
-    from newton_qd.gradients import GradientOptions
+    from newton_qd.gradients import GradientOptions, with_smooth_termination
     from newton_qd.qd.emitters.ascent import AscentEmitter, mean_slope
     from newton_qd.qd.scoring.rollout import episode_of
 
+    size = context.config.batch_size
     if options.climbers > most:
-        allowed = (
-            f"at most {most}, the rest of batch_size = {context.config.batch_size}"
-        )
+        rest = f", since actors have {size - most} of them" if most < size else ""
+        allowed = f"at most {most} with batch_size = {size}{rest}"
         raise ConfigError(message("options: climbers", options.climbers, allowed))
-    task = differentiable(context.task, options, options.climb_termination_width)
+    env = context.task.env
+    if options.climb_termination_width:
+        env = with_smooth_termination(env, options.climb_termination_width)
     # only the return is differentiated
-    task = dataclasses.replace(task, descriptor_extractor=None)
+    task = dataclasses.replace(context.task, env=env, descriptor_extractor=None)
     flow: Any = GradientOptions(
         window=options.climb_window or None, checkpoint_every=None
     )

@@ -116,6 +116,10 @@ SHORT: Mapping[str, Any] = {"window": 8}
 """Default of the window for the halfcheetah."""
 
 
+MAZES = ("antmaze", "antmaze_u", "antmaze_big", "antmaze_hardest", "humanoid_maze")
+"""Tasks with negative rewards, and with falls that end an episode."""
+
+
 def on_robots_that_fall(**defaults: object) -> dict[str, Mapping[str, object]]:
     """Returns defaults for the robots that can fall.
 

@@ -6,8 +6,8 @@ import dataclasses
 from typing import Any
 
 from newton_qd.checks import message
-from newton_qd.qd.algorithms.climbing import ClimbingOptions, ascent_emitter
-from newton_qd.qd.algorithms.gradient_options import initial_scale
+from newton_qd.qd.algorithms.climbing import CLIMBING, ClimbingOptions, ascent_emitter
+from newton_qd.qd.algorithms.gradient_options import MAZES, initial_scale
 from newton_qd.qd.algorithms.learning import LearningOptions, learning_method
 from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext
 from newton_qd.qd.algorithms.variation import with_isoline
@@ -46,10 +46,9 @@ class ActorCriticOptions(LearningOptions, ClimbingOptions):
 
 # To walk far in any direction takes many updates.
 _LONG = {"lifetime": 60}
-# The reward of these mazes is negative, and a fall ends the episode. So an actor that
-# maximizes the reward learns to fall at once.
-_MAZES = ("antmaze", "antmaze_u", "antmaze_big", "antmaze_hardest", "humanoid_maze")
+# In a maze, an actor that maximizes the reward learns to fall at once.
 _STEERED = {"steered": 1.0, "fitness": 0.0, **_LONG}
+_ACTORS = {"ant_omni": _LONG, **dict.fromkeys(MAZES, _STEERED)}
 
 
 def _make(context: EmitterContext, options: ActorCriticOptions) -> Any:
@@ -99,7 +98,10 @@ ME_ACTOR_CRITIC = AlgorithmSpec(
     "descriptor; a part of the offspring lies between actors and elites",
     make=_make,
     options=ActorCriticOptions,
-    tuned={"ant_omni": _LONG, **dict.fromkeys(_MAZES, _STEERED)},
+    tuned={
+        name: {**_ACTORS.get(name, {}), **CLIMBING.get(name, {})}
+        for name in (*_ACTORS, "halfcheetah_uni")
+    },
     evaluations=_evaluations,
     gradients=_gradients,
     initial_scale=initial_scale,

@@ -6,8 +6,7 @@ import dataclasses
 from typing import Any
 
 from newton_qd import checks
-from newton_qd.qd.algorithms.climbing import ClimbingOptions, ascent_emitter
-from newton_qd.qd.algorithms.gradient_options import SHORT, initial_scale
+from newton_qd.qd.algorithms.climbing import CLIMBING, ClimbingOptions, ascent_emitter
 from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext
 from newton_qd.qd.algorithms.variation import with_isoline
 from newton_qd.qd.config import EvolveConfig
@@ -59,8 +58,7 @@ ME_ASCENT = AlgorithmSpec(
     "gradients of whole episodes, one step in each generation",
     make=_make,
     options=MEAscentOptions,
-    tuned={"halfcheetah_uni": {"climb_window": SHORT["window"]}},
+    tuned=CLIMBING,
     evaluations=_evaluations,
     gradients=_gradients,
-    initial_scale=initial_scale,
 )

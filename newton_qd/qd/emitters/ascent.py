@@ -8,10 +8,10 @@ from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from qdax.core.emitters.emitter import Emitter
 
 from newton_qd import checks
-from newton_qd.checks import message
 from newton_qd.envs.state import select
 from newton_qd.gradients.episode import Episode
 from newton_qd.qd.emitters.cells import draw_cells
@@ -20,17 +20,20 @@ from newton_qd.types import ExtraScores, Genotype, PyTree, Repertoire, RNGKey
 Slope: TypeAlias = Callable[[jax.Array, RNGKey], tuple[jax.Array, jax.Array]]
 """Maps weights (N, size) and a key to gradients (N, size), and whether each is lost."""
 
+MOST_STEPS = 2**30
+"""Largest lifetime of a climber: JAX counts in 32 bits."""
+
+LOST = "climbers_overflowed"
+"""Name of what tells which gradients are lost; other emitters have ``overflowed``."""
+
 
 def mean_slope(episode: Episode, worlds: int) -> Slope:
     r"""Returns the gradient of the mean fitness over several start states.
 
     Near a stiff contact, the gradient of one world can be much longer than those of the
-    others. So each gradient counts with the median norm at most:
-
-    .. math:: \frac{1}{W} \sum_w \min\left(1, \frac{n}{|g_w|}\right) g_w, \qquad
-        n = \operatorname{median}_w |g_w|.
-
-    A world with a fault, or with a gradient that is not finite, counts as 0.
+    others. So a gradient that is longer than the median norm is shortened to it, see
+    :func:`limited_mean`. A world with a fault, or with a gradient that is not finite,
+    does not count.
 
     Args:
         episode: Episode whose genotypes are weights (size,).
@@ -42,35 +45,48 @@ def mean_slope(episode: Episode, worlds: int) -> Slope:
         (N,).
 
     Raises:
+        TypeError: ``episode`` is no ``Episode``.
         ValueError: ``worlds`` is not an integer from 1.
     """
-    checks.integer("worlds", worlds, most=None)
+    checks.instance("episode", episode, Episode, "an Episode")
+    checks.integer("worlds", worlds)
 
     def slope(weights: jax.Array, key: RNGKey) -> tuple[jax.Array, jax.Array]:
         keys = jax.random.split(key, worlds)
         found = jax.vmap(episode.gradient, (None, 0))(weights, keys)
-        lost = jnp.all(found.faulty | found.overflowed[..., 0], axis=0)
-        return limited_mean(found.gradients[:, :, 0]), lost
+        sound = ~(found.faulty | found.overflowed[..., 0])
+        mean = limited_mean(found.gradients[:, :, 0], sound)
+        return mean, ~jnp.any(sound, axis=0)
 
     return slope
 
 
-def limited_mean(gradients: jax.Array) -> jax.Array:
-    """Returns the mean of gradients that count with their median norm at most.
+def limited_mean(gradients: jax.Array, sound: jax.Array) -> jax.Array:
+    r"""Returns the mean of gradients after the long ones were shortened.
+
+    .. math:: \frac{1}{W} \sum_w \min\left(1, \frac{n}{|g_w|}\right) g_w
+
+    Here n is the median of the norms, of an even number the lower one of the two. Of
+    two gradients, the longer one is so shortened to the shorter one.
 
     Args:
         gradients: (W, N, size) gradients of W worlds.
+        sound: (W, N) whether a world counts.
 
     Returns:
-        (N, size) means.
+        (N, size) means; 0 where no world counts.
     """
+    sound = sound[..., None]
     # scaled first, because the square of a large gradient may overflow
     largest = jnp.max(jnp.abs(gradients), axis=-1, keepdims=True)
     units = gradients / jnp.where(largest > 0, largest, 1)
     norms = largest * jnp.linalg.norm(units, axis=-1, keepdims=True)
-    allowed = jnp.minimum(norms, jnp.median(norms, axis=0))
+    count = jnp.sum(sound, axis=0, keepdims=True)
+    order = jnp.sort(jnp.where(sound, norms, jnp.inf), axis=0)
+    median = jnp.take_along_axis(order, jnp.maximum(count - 1, 0) // 2, axis=0)
+    allowed = jnp.where(sound, jnp.minimum(norms, median), 0)
     factors = allowed / jnp.where(norms > 0, norms, 1)
-    return jnp.mean(factors * gradients, axis=0)
+    return jnp.sum(factors * gradients, axis=0) / jnp.maximum(count[0], 1)
 
 
 @jax.tree_util.register_dataclass
@@ -99,14 +115,14 @@ class AscentEmitter(Emitter):
     r"""Emits elites that climb along the gradient of their mean return.
 
     A climber :math:`\theta` begins at a random elite. In each generation, it makes one
-    step along the gradient g and is emitted:
+    step along the gradient g, and is then emitted (in the first one without a step):
 
     .. math:: m \leftarrow \beta m + (1 - \beta) \frac{g}{|g|}, \qquad
         \theta \leftarrow \theta + s \frac{m}{|m|}.
 
-    After its lifetime, it begins again at another elite. The length s of its steps is
-    drawn log-uniformly from a range at each beginning. The archive takes what is good
-    on the way, in whatever cell it is.
+    After its lifetime, or if its gradient was lost, it begins again at another elite.
+    The length s of its steps is drawn log-uniformly from a range at each beginning. A
+    climber may cross several cells of the archive; in each, it can become the elite.
     """
 
     def __init__(
@@ -130,14 +146,14 @@ class AscentEmitter(Emitter):
             momentum: Share of the former directions [-], below 1.
 
         Raises:
+            TypeError: ``slope`` is not a function, or a length is not a number.
             ValueError: A number is out of its range.
         """
-        for name, value in (("climbers", climbers), ("lifetime", lifetime)):
-            checks.integer(name, value, most=None)
-        if not 0 < shortest <= longest:
-            given = (shortest, longest)
-            allowed = "0 < shortest <= longest"
-            raise ValueError(message("shortest, longest", given, allowed))
+        checks.function("slope", slope, "a function of weights and a key")
+        checks.integer("climbers", climbers)
+        checks.integer("lifetime", lifetime, most=MOST_STEPS)
+        checks.number("shortest", shortest, above=0)
+        checks.number("longest", longest, least=shortest)
         checks.number("momentum", momentum, least=0, below=1)
         self._slope = slope
         self._climbers = climbers
@@ -169,9 +185,9 @@ class AscentEmitter(Emitter):
     def emit(
         self, repertoire: Repertoire, emitter_state: PyTree, key: jax.Array
     ) -> tuple[jax.Array, ExtraScores]:
-        """Returns the climbers, and whether a gradient ``overflowed``, (climbers,)."""
+        """Returns the climbers, and whether each lost its gradient, (climbers,)."""
         del repertoire, key
-        return emitter_state.weights, {"overflowed": emitter_state.lost}
+        return emitter_state.weights, {LOST: emitter_state.lost}
 
     def state_update(
         self,
@@ -187,8 +203,11 @@ class AscentEmitter(Emitter):
         state = emitter_state
         key, begin_key, slope_key = jax.random.split(state.key, 3)
         # one after the other, so that there are climbers of all ages
-        turn = jnp.arange(self._climbers) * self._lifetime // self._climbers
-        due = (state.generation + turn) % self._lifetime == 0
+        turn = np.arange(self._climbers) * self._lifetime // self._climbers
+        age = (
+            state.generation % self._lifetime + turn.astype(np.int32)
+        ) % self._lifetime
+        due = (age == 0) | state.lost
         own = state.weights, state.motion, state.steps
         weights, motion, steps = select(due, self._begun(repertoire, begin_key), own)
         slopes, lost = self._slope(weights, slope_key)

@@ -79,7 +79,9 @@ class Generation:
         told["extra_scores"] = {**told["extra_scores"], **remembered}
         emitter = self.emitter.state_update(emitter, **told)
         metrics = self._measured(repertoire, scores, initial)
-        metrics["rejected"] += jnp.sum(remembered.get("overflowed", 0))
+        for name, lost in remembered.items():
+            if name.endswith("overflowed"):  # of one emitter, or of several
+                metrics["rejected"] += jnp.sum(lost)
         return repertoire, emitter, metrics
 
     def _added(
