@@ -66,8 +66,8 @@ def limited_mean(gradients: jax.Array, sound: jax.Array) -> jax.Array:
 
     .. math:: \frac{1}{W} \sum_w \min\left(1, \frac{n}{|g_w|}\right) g_w
 
-    Here n is the median of the norms, of an even number the lower one of the two. Of
-    two gradients, the longer one is so shortened to the shorter one.
+    Here n is the median of the norms. For an even number of worlds, it is the lower one
+    of the two norms in the middle, so that it limits the longer one of two gradients.
 
     Args:
         gradients: (W, N, size) gradients of W worlds.
