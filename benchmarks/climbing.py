@@ -2,8 +2,8 @@
 
 The archive is that of a variant after some generations, with seed and settings of the
 protocol ``field``. Climbers (``AscentEmitter``) begin at its elites, the same for all
-settings, and never begin again. Nothing else is emitted. The gain is that of the sum of
-the fitnesses with offset, which is the QD score before re-evaluation:
+settings, and begin again only if their gradient was lost. Nothing else is emitted. The
+gain is that of the QD score with offset, before re-evaluation:
 
     python benchmarks/climbing.py walker2d_uni me@6 --generations 40 \
         --settings climb_worlds=4 --settings climb_termination_width=0

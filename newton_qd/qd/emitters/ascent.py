@@ -66,8 +66,9 @@ def limited_mean(gradients: jax.Array, sound: jax.Array) -> jax.Array:
 
     .. math:: \frac{1}{W} \sum_w \min\left(1, \frac{n}{|g_w|}\right) g_w
 
-    Here n is the median of the norms. For an even number of worlds, it is the lower one
-    of the two norms in the middle, so that it limits the longer one of two gradients.
+    The sum is over the W worlds that count, and n is the median of their norms. For an
+    even number of worlds, it is the lower one of the two norms in the middle, so that
+    it limits the longer one of two gradients.
 
     Args:
         gradients: (W, N, size) gradients of W worlds.
@@ -204,10 +205,8 @@ class AscentEmitter(Emitter):
         key, begin_key, slope_key = jax.random.split(state.key, 3)
         # one after the other, so that there are climbers of all ages
         turn = np.arange(self._climbers) * self._lifetime // self._climbers
-        age = (
-            state.generation % self._lifetime + turn.astype(np.int32)
-        ) % self._lifetime
-        due = (age == 0) | state.lost
+        age = state.generation % self._lifetime + turn.astype(np.int32)
+        due = (age % self._lifetime == 0) | state.lost
         own = state.weights, state.motion, state.steps
         weights, motion, steps = select(due, self._begun(repertoire, begin_key), own)
         slopes, lost = self._slope(weights, slope_key)
