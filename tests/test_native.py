@@ -102,6 +102,25 @@ def test_daemon_threads_leave_the_callbacks(end: str) -> None:
 
 
 @pytest.mark.slow
+def test_a_program_that_makes_its_first_call_late_is_waited_for() -> None:
+    """XLA would wait for the call, and the call for Python."""
+    late = """
+import contextlib, time
+contained = row_calls._errors_contained
+
+@contextlib.contextmanager
+def late():
+    if row_calls._Callbacks.ended:
+        time.sleep(0.5)
+    with contained():
+        yield
+
+row_calls._errors_contained = late
+"""
+    assert run(CALLBACKS + late + IN_FLIGHT + ENDS["two threads"])[0] == 0
+
+
+@pytest.mark.slow
 def test_effects_of_a_program_come_before_its_end() -> None:
     code = (
         IN_FLIGHT

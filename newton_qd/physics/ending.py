@@ -24,6 +24,7 @@ from newton_qd.physics import interrupts
 _JAX = str(Path(jax.__file__).parent)
 _IDLE = {module.__file__ for module in (threading, queue, selectors, interrupts)}
 _QUIET_SECONDS = 0.1  # without a call: no program in flight is left
+_BEGINNING_SECONDS = 1.0  # the same, if a thread has just begun a program
 _LEAVING_SECONDS = 10.0
 
 
@@ -51,20 +52,23 @@ def _stop(
     stop()
     if not before and not in_python:
         return
-    seen = -1
-    while seen != stopped():
-        seen = stopped()
+    calls, traced = stopped(), False
+    begin = last = time.monotonic()  # last: of the last sign of a program in flight
+    while time.monotonic() < begin + _LEAVING_SECONDS:
         time.sleep(_QUIET_SECONDS)
-    end = time.monotonic() + _LEAVING_SECONDS
-    in_flight = stopped() > 0
-    while time.monotonic() < end:
         places = _places()
         traces = any(_in_jax(frame) for frame, _ in places.values())
-        in_flight |= traces or stopped() > 0
+        traced |= traces
+        if traces or stopped() != calls:
+            calls, last = stopped(), time.monotonic()
         # a thread that has not moved may still be inside XLA
-        if not traces and not (in_flight and before.items() & places.items()):
+        inside = (traced or calls > 0) and before.items() & places.items()
+        # XLA may run a program in a thread of its own. Its first call comes later.
+        # Python must not end before it: XLA would wait for the call, and the call for
+        # Python.
+        quiet = _BEGINNING_SECONDS if traced and in_python else _QUIET_SECONDS
+        if not inside and time.monotonic() >= last + quiet:
             break
-        time.sleep(_QUIET_SECONDS)
 
 
 def _places() -> dict[int, tuple[FrameType, int]]:
