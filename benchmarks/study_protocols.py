@@ -83,6 +83,7 @@ OURS = (
     "ascii-me-exact",
     "me-conditioned",
     "cma-maega-actor-critic",
+    "dcrl-me-ascent",
 )
 
 FIELD = Protocol(

@@ -79,8 +79,10 @@ def _make(context: EmitterContext, options: ActorCriticOptions) -> Any:
         raise ConfigError(message(name, given, allowed))
     if not options.climbers:
         return with_isoline(emitter, config)
-    rest = config.batch_size - emitter.batch_size
-    return with_isoline(emitter, config, ascent_emitter(context, options, rest))
+    climbing = ascent_emitter(
+        context, options, others=emitter.batch_size, whose="actors"
+    )
+    return with_isoline(emitter, config, climbing)
 
 
 def _gradients(config: EvolveConfig, options: ActorCriticOptions) -> int:
