@@ -83,7 +83,6 @@ OURS = (
     "ascii-me-exact",
     "me-conditioned",
     "cma-maega-actor-critic",
-    "dcrl-me-ascent",
 )
 
 FIELD = Protocol(

@@ -45,7 +45,6 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "me-es": {"num_optimizer_steps": 2, "sample_sigma": 0.1, "learning_rate": 0.1},
     "me-gradient": {},
     "me-ascent": {"climbers": 4, "climb_steps": 3},
-    "dcrl-me-ascent": {**CRITIC, "climbers": 4, "climb_steps": 3},
     "me-actor-critic": {
         **{"actors": 2, "branches": 1, "copies": 4, "updates": 1, "lifetime": 3},
         **{"worlds": 2, "window": 4, "batches": 2, "critic": (8,)},
@@ -90,7 +89,7 @@ def test_every_algorithm_is_tested() -> None:
 def test_defaults_of_an_environment_are_accepted(env_name: str) -> None:
     task = make_task(EvolveConfig(env_name=env_name))
     names = [spec.name for spec in ALGORITHMS if spec.gradients is not None]
-    assert len(names) == 10
+    assert len(names) == 9
     for name in names:
         config = EvolveConfig(
             env_name=env_name,
@@ -145,7 +144,7 @@ def test_a_stop_changes_nothing(
     # What is differentiated counts, too: two parents, four climbers, two solution
     # points, the sixteen control steps of two actors.
     more = {"me-gradient": 2, "me-actor-critic": 1, "cma-mega": 2, "cma-maega": 2}
-    more |= {"me-ascent": 4, "dcrl-me-ascent": 4}
+    more |= {"me-ascent": 4}
     # two parents, each once for its actions and once for the gradient
     more |= {"ascii-me-exact": 4, "me-conditioned": 1}
     # two solution points, and the 64 control steps of their actors

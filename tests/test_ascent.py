@@ -227,15 +227,6 @@ def test_climbers_are_a_part_of_a_generation() -> None:
         Search(config, point_task(config)).empty()
 
 
-def test_climbers_leave_room_for_dcrl_me() -> None:
-    options: Any = {"climbers": 13}
-    config = SMALL.replace(algorithm="dcrl-me-ascent", options=options)
-    with pytest.raises(
-        ConfigError, match=r"climbers: got 13; .* most 12 with .* variations have 4"
-    ):
-        Search(config, point_task(config)).empty()
-
-
 def test_a_run_counts_what_is_differentiated() -> None:
     config = SMALL.replace(algorithm="me-ascent", iterations=3)
     options: Any = {"climbers": 16, "climb_worlds": 3}

@@ -19,7 +19,6 @@ from newton_qd.qd.algorithms.cma_maega_actor_critic import CMA_MAEGA_ACTOR_CRITI
 from newton_qd.qd.algorithms.cma_me import CMA_ME
 from newton_qd.qd.algorithms.cma_mega import CMA_MEGA
 from newton_qd.qd.algorithms.dcrl_me import DCRL_ME
-from newton_qd.qd.algorithms.dcrl_me_ascent import DCRL_ME_ASCENT
 from newton_qd.qd.algorithms.me import ME
 from newton_qd.qd.algorithms.me_actor_critic import ME_ACTOR_CRITIC
 from newton_qd.qd.algorithms.me_ascent import ME_ASCENT
@@ -49,7 +48,6 @@ ALGORITHMS: tuple[AlgorithmSpec[Any], ...] = (
     ASCII_ME,
     ME_GRADIENT,
     ME_ASCENT,
-    DCRL_ME_ASCENT,
     ASCII_ME_EXACT,
     ME_ACTOR_CRITIC,
     ME_CONDITIONED,

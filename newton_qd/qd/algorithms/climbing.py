@@ -79,19 +79,14 @@ class ClimbingOptions(Options):
 
 
 def ascent_emitter(
-    context: EmitterContext,
-    options: ClimbingOptions,
-    *,
-    others: int = 0,
-    whose: str = "others",
+    context: EmitterContext, options: ClimbingOptions, most: int
 ) -> AscentEmitter:
     """Returns the emitter of the climbers of an algorithm.
 
     Args:
         context: What the run gives to its algorithm.
         options: Options of the algorithm, with at least one climber.
-        others: Individuals of a generation that cannot be climbers.
-        whose: Who makes these, for the error message.
+        most: Largest number of climbers.
 
     Raises:
         ConfigError: There are more climbers than a generation can contain.
@@ -102,9 +97,8 @@ def ascent_emitter(
     from newton_qd.qd.scoring.rollout import episode_of
 
     size = context.config.batch_size
-    most = size - others
     if options.climbers > most:
-        rest = f", since {whose} have {others} of them" if others else ""
+        rest = f", since actors have {size - most} of them" if most < size else ""
         allowed = f"at most {most} with batch_size = {size}{rest}"
         raise ConfigError(message("options: climbers", options.climbers, allowed))
     env = context.task.env

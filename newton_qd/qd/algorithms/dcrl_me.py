@@ -59,13 +59,8 @@ class DCRLMEOptions(CriticOptions):
         return found
 
 
-def dcrl_emitter(context: EmitterContext, options: DCRLMEOptions) -> Any:
-    """DCRL-ME: critic and actor depend on the descriptor (Faldor et al. 2024).
-
-    Args:
-        context: What the run gives to its algorithm.
-        options: Options of the algorithm; a subclass may have more of them.
-    """
+def _make(context: EmitterContext, options: DCRLMEOptions) -> Any:
+    """DCRL-ME: critic and actor depend on the descriptor (Faldor et al. 2024)."""
     import jax
     import jax.numpy as jnp
 
@@ -96,14 +91,11 @@ def dcrl_emitter(context: EmitterContext, options: DCRLMEOptions) -> Any:
             **{**steps, "rewards": rewards}, desc=unknown, desc_prime=unknown
         )
 
-    fields = dataclasses.fields(DCRLMEOptions)
-    values = {field.name: getattr(options, field.name) for field in fields}
-
     def made(times: int) -> Any:
         """Returns the emitter for generations so many times as large."""
         shares = {name: times * size for name, size in options.shares(config).items()}
         emitter = DCRLMEEmitter(
-            DCRLMEConfig(**{**values, **shares}),
+            DCRLMEConfig(**{**dataclasses.asdict(options), **shares}),
             context.policy.network,
             actor,
             task.env,
@@ -121,7 +113,7 @@ DCRL_ME = AlgorithmSpec(
     name="dcrl-me",
     summary="DCRL-ME: like `pga-me`, with a critic and an actor that depend on the "
     "descriptor; the critic and the actor each produce a quarter of the generation",
-    make=dcrl_emitter,
+    make=_make,
     options=DCRLMEOptions,
     least=1,
     transitions=True,

@@ -79,10 +79,8 @@ def _make(context: EmitterContext, options: ActorCriticOptions) -> Any:
         raise ConfigError(message(name, given, allowed))
     if not options.climbers:
         return with_isoline(emitter, config)
-    climbing = ascent_emitter(
-        context, options, others=emitter.batch_size, whose="actors"
-    )
-    return with_isoline(emitter, config, climbing)
+    rest = config.batch_size - emitter.batch_size
+    return with_isoline(emitter, config, ascent_emitter(context, options, rest))
 
 
 def _gradients(config: EvolveConfig, options: ActorCriticOptions) -> int:

@@ -39,7 +39,8 @@ def _make(context: EmitterContext, options: MEAscentOptions) -> Any:
     Raises:
         ConfigError: There are more climbers than a generation can contain.
     """
-    return with_isoline(ascent_emitter(context, options), context.config)
+    emitter = ascent_emitter(context, options, context.config.batch_size)
+    return with_isoline(emitter, context.config)
 
 
 def _gradients(config: EvolveConfig, options: MEAscentOptions) -> int:
