@@ -9,7 +9,8 @@ seeds, with the lowest and the highest return in brackets:
     python benchmarks/actor_alone.py hopper_uni --settings discount=0.995 epochs=8 \
         noise=0.3 --compare termination_width 0 0.03 --seeds 5
 
-Without ``--compare``, it compares plain observations with whitened ones.
+Without ``--compare``, it compares plain observations with whitened ones. With
+``--episodes-after``, the actor then goes on with the gradient of whole episodes.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from newton_qd.qd import EvolveConfig, make_task
+from newton_qd.qd.algorithms.episode_learning import EpisodeLearningOptions
 from newton_qd.qd.algorithms.gradient_options import (
     DifferentiableOptions,
     differentiable,
@@ -34,6 +36,7 @@ from newton_qd.qd.emitters.actor_critic_learner import (
     measure_of,
 )
 from newton_qd.qd.emitters.actor_critic_settings import ActorCriticSettings
+from newton_qd.qd.emitters.episode_learner import EpisodeLearning
 from newton_qd.qd.emitters.whitening import Whitening
 from newton_qd.qd.scoring.networks import policy_for
 from newton_qd.qd.scoring.rollout import Policy
@@ -101,8 +104,26 @@ def begun(env_name: str, settings: ActorCriticSettings, seed: int) -> Trial:
     return Trial(task, policy, method, scale, actor, keys[4], keys[5])
 
 
+def by_episodes(trial: Trial) -> EpisodeLearning:
+    """Returns how the actor goes on from whole episodes, with the defaults."""
+    options = EpisodeLearningOptions()
+    width = options.episode_termination_width
+    return EpisodeLearning(
+        trial.method,
+        differentiable(trial.task, options, width).env,
+        after=0,
+        updates=options.episode_updates,
+        weight_noise=options.episode_weight_noise,
+    )
+
+
 def returns(
-    env_name: str, settings: ActorCriticSettings, updates: int, every: int, seed: int
+    env_name: str,
+    settings: ActorCriticSettings,
+    updates: int,
+    every: int,
+    seed: int,
+    episodes_after: int | None = None,
 ) -> list:
     """What the actor's policy does after each ``every`` updates: see ``walk``."""
     trial = begun(env_name, settings, seed)
@@ -113,6 +134,9 @@ def returns(
     )
     found = []
     for number in range(updates + 1):
+        if number == episodes_after:
+            actor = trial.method.moved(actor, actor.weights)
+            update = jax.jit(by_episodes(trial).update)
         if number % every == 0:
             found.append(try_out(trial.plain(actor)))
         key = jax.random.fold_in(trial.key, number)
@@ -153,6 +177,12 @@ def main() -> None:
     parser.add_argument("--updates", type=int, default=200)
     parser.add_argument("--every", type=int, default=20)
     parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument(
+        "--episodes-after",
+        type=int,
+        metavar="UPDATES",
+        help="updates after which the actor learns from whole episodes",
+    )
     parser.add_argument("--settings", type=changed, nargs="+", default=[])
     parser.add_argument("--compare", nargs="+", default=["whiten", "false", "true"])
     args = parser.parse_args()
@@ -174,6 +204,7 @@ def main() -> None:
                 args.updates,
                 args.every,
                 seed,
+                args.episodes_after,
             )
             for seed in range(args.seeds)
         ]

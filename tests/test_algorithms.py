@@ -48,6 +48,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "me-actor-critic": {
         **{"actors": 2, "branches": 1, "copies": 4, "updates": 1, "lifetime": 3},
         **{"worlds": 2, "window": 4, "batches": 2, "critic": (8,)},
+        "episodes_after": 2,
     },
     "ascii-me": {"epochs": 2},
     "ascii-me-exact": {"epochs": 2, "branches": 4, "window": 4},
@@ -142,8 +143,8 @@ def test_a_stop_changes_nothing(
     for column in ("qd_score", "coverage", "max_fitness"):
         assert metrics[column][-1] > metrics[column][0], column
     # What is differentiated counts, too: two parents, four climbers, two solution
-    # points, the sixteen control steps of two actors.
-    more = {"me-gradient": 2, "me-actor-critic": 1, "cma-mega": 2, "cma-maega": 2}
+    # points, the episodes of two actors in two worlds each.
+    more = {"me-gradient": 2, "me-actor-critic": 4, "cma-mega": 2, "cma-maega": 2}
     more |= {"me-ascent": 4}
     # two parents, each once for its actions and once for the gradient
     more |= {"ascii-me-exact": 4, "me-conditioned": 1}

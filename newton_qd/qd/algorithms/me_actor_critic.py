@@ -7,6 +7,10 @@ from typing import Any
 
 from newton_qd.checks import message
 from newton_qd.qd.algorithms.climbing import CLIMBING, ClimbingOptions, ascent_emitter
+from newton_qd.qd.algorithms.episode_learning import (
+    EpisodeLearningOptions,
+    episode_learning,
+)
 from newton_qd.qd.algorithms.gradient_options import MAZES, initial_scale
 from newton_qd.qd.algorithms.learning import LearningOptions, learning_method
 from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext
@@ -15,7 +19,7 @@ from newton_qd.qd.config import ConfigError, EvolveConfig
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ActorCriticOptions(LearningOptions, ClimbingOptions):
+class ActorCriticOptions(LearningOptions, EpisodeLearningOptions, ClimbingOptions):
     """Options of MAP-Elites with actors that learn with gradients of the physics.
 
     Attributes:
@@ -38,9 +42,15 @@ class ActorCriticOptions(LearningOptions, ClimbingOptions):
     lifetime: int = 10
 
     def episodes(self, config: EvolveConfig) -> int:
-        """Returns the differentiated control steps of a generation, in episodes."""
-        updates = self.actors * self.branches * self.updates
-        learnt = -(-updates * self.worlds * self.window // config.episode_length)
+        """Returns the differentiated control steps of a generation, in episodes.
+
+        If actors learn from windows first and then from episodes, it is the larger
+        number of the two.
+        """
+        times = self.actors * self.branches * self.worlds
+        learnt = -(-times * self.updates * self.window // config.episode_length)
+        if self.episodes_after:
+            learnt = max(learnt, times * self.episode_updates)
         return learnt + self.climbing_episodes
 
 
@@ -71,6 +81,7 @@ def _make(context: EmitterContext, options: ActorCriticOptions) -> Any:
         fitness=options.fitness,
         lifetime=options.lifetime,
         measures=task.descriptor_length,
+        later=episode_learning(context, options, method),
     )
     if emitter.batch_size > config.batch_size:
         given = options.actors, options.branches, options.copies

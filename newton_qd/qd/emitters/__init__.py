@@ -1,7 +1,7 @@
 """Emitters for QDax that use exact gradients.
 
 - ``ActorCriticEmitter``: policies of actors that learn over short horizons with
-  ``ActorCritic``
+  ``ActorCritic``, and then from whole episodes with ``EpisodeLearning``
 - ``ConditionedActorEmitter``: policies of one such actor that is told the descriptor
 - ``AscentEmitter``: elites that climb along the gradient of their return, step by step
 - ``AsciiEmitter``: parents move towards the better actions of other individuals
@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from newton_qd.qd.emitters.cma_maega import CMAMAEGAEmitter
     from newton_qd.qd.emitters.cma_mega import CMAMEGAEmitter
     from newton_qd.qd.emitters.conditioned import ConditionedActorEmitter
+    from newton_qd.qd.emitters.episode_learner import EpisodeLearning
     from newton_qd.qd.emitters.gradient_line import GradientLineEmitter
     from newton_qd.qd.emitters.gradient_variation import GradientVariationEmitter
     from newton_qd.qd.emitters.omg_mega import OMGMEGAEmitter
@@ -57,6 +58,7 @@ __all__ = [
     "CMAMAEGAEmitter",
     "CMAMEGAEmitter",
     "ConditionedActorEmitter",
+    "EpisodeLearning",
     "ExactAsciiEmitter",
     "GradientLineEmitter",
     "GradientVariationEmitter",
@@ -77,6 +79,7 @@ _HOME = {
     "CMAMAEGAEmitter": "newton_qd.qd.emitters.cma_maega",
     "CMAMEGAEmitter": "newton_qd.qd.emitters.cma_mega",
     "ConditionedActorEmitter": "newton_qd.qd.emitters.conditioned",
+    "EpisodeLearning": "newton_qd.qd.emitters.episode_learner",
     "ExactAsciiEmitter": "newton_qd.qd.emitters.ascii",
     "GradientLineEmitter": "newton_qd.qd.emitters.gradient_line",
     "GradientVariationEmitter": "newton_qd.qd.emitters.gradient_variation",

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+from collections.abc import Callable
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +16,7 @@ from newton_qd.checks import message
 from newton_qd.envs.state import select
 from newton_qd.qd.emitters.actor_critic_learner import ActorCritic, Learner
 from newton_qd.qd.emitters.cells import draw_cells
+from newton_qd.qd.emitters.episode_learner import EpisodeLearning
 from newton_qd.types import (
     ExtraScores,
     Genotype,
@@ -20,6 +24,12 @@ from newton_qd.types import (
     Repertoire,
     StateLike,
 )
+
+Update: TypeAlias = Callable[
+    [Learner, tuple[jax.Array, jax.Array], jax.Array], tuple[Learner, jax.Array]
+]
+"""Maps an actor, the scale of observations and a key to the actor after an update, and
+whether its gradient was lost ()."""
 
 
 @jax.tree_util.register_dataclass
@@ -82,6 +92,7 @@ class ActorCriticEmitter(Emitter):
         fitness: float = 0.1,
         lifetime: int = 10,
         measures: int,
+        later: EpisodeLearning | None = None,
     ) -> None:
         """Sets the actors and how much they learn.
 
@@ -98,6 +109,7 @@ class ActorCriticEmitter(Emitter):
             fitness: Weight of the reward for steered actors [-].
             lifetime: Generations after which a steered actor restarts.
             measures: Length of the descriptor.
+            later: How actors learn after some generations; ``None``: as before.
 
         Raises:
             ValueError: A number is out of its range.
@@ -120,6 +132,7 @@ class ActorCriticEmitter(Emitter):
         self._fitness = fitness
         self._lifetime = lifetime
         self._measures = measures
+        self._later = later
 
     @property
     def batch_size(self) -> int:
@@ -198,25 +211,65 @@ class ActorCriticEmitter(Emitter):
         state = emitter_state
         key, renewal_key, learn_key = jax.random.split(state.key, 3)
         learners = self._renewed(state, repertoire, renewal_key)
-        update = jax.vmap(self._method.update, in_axes=(0, None, 0))
+        by_windows = functools.partial(
+            self._learned, self._method.update, self._updates
+        )
+        told = learners, state.scale, learn_key
+        later = self._later
+        if later is None:
+            learners, failed, snapshots = by_windows(*told)
+        else:
+            learners, failed, snapshots = jax.lax.cond(
+                state.generation >= later.after,
+                functools.partial(self._by_episodes, later, state.generation),
+                by_windows,
+                *told,
+            )
+        return ActorCriticState(
+            learners, state.scale, snapshots, failed, state.generation + 1, key
+        )
+
+    def _learned(
+        self,
+        method: Update,
+        updates: int,
+        learners: Learner,
+        scale: PyTree,
+        key: jax.Array,
+    ) -> tuple[Learner, jax.Array, jax.Array]:
+        """Returns actors, lost gradients and snapshots after a generation."""
+        update = jax.vmap(method, in_axes=(0, None, 0))
 
         def learn(carry: tuple, key: jax.Array) -> tuple[tuple, None]:
             learners, failed = carry
             keys = jax.random.split(key, self._actors)
-            learners, lost = update(learners, state.scale, keys)
+            learners, lost = update(learners, scale, keys)
             return (learners, failed + lost), None
 
         def branch(carry: tuple, key: jax.Array) -> tuple[tuple, jax.Array]:
-            keys = jax.random.split(key, self._updates)
+            keys = jax.random.split(key, updates)
             carry, _ = jax.lax.scan(learn, carry, keys)
             return carry, carry[0].weights
 
-        begin = (learners, jnp.zeros_like(state.failed))
-        keys = jax.random.split(learn_key, self._branches)
+        begin = (learners, jnp.zeros((self._actors,), jnp.int32))
+        keys = jax.random.split(key, self._branches)
         (learners, failed), snapshots = jax.lax.scan(branch, begin, keys)
-        return ActorCriticState(
-            learners, state.scale, snapshots, failed, state.generation + 1, key
-        )
+        return learners, failed, snapshots
+
+    def _by_episodes(
+        self,
+        later: EpisodeLearning,
+        generation: jax.Array,
+        learners: Learner,
+        scale: PyTree,
+        key: jax.Array,
+    ) -> tuple[Learner, jax.Array, jax.Array]:
+        """Does what ``_learned`` does, from whole episodes."""
+        # these gradients have another length than those of windows, which the optimizer
+        # remembers
+        fresh = jax.vmap(self._method.moved)(learners, learners.weights)
+        learners = select(generation == later.after, fresh, learners)
+        return self._learned(later.update, later.updates, learners, scale, key)
 
     def _worlds(self) -> PyTree:
         """Returns the initial states of the worlds of an actor."""

@@ -101,7 +101,8 @@ class ActorCritic:
         return self.settings.worlds * self.settings.window
 
     @functools.cached_property
-    def _optimizers(self) -> tuple[PyTree, PyTree]:
+    def optimizers(self) -> tuple[PyTree, PyTree]:
+        """Optimizers of actor and critic, of ``optax``."""
         rates = self.settings.rate, self.settings.critic_rate
         actor, critic = (
             optax.chain(optax.clip_by_global_norm(1.0), optax.adam(rate, b1=0.7))
@@ -142,7 +143,7 @@ class ActorCritic:
         """
         number = self.settings.worlds
         critic = _network(key, (first.obs.shape[-1], *self.settings.critic, 1))
-        actor_optimizer, critic_optimizer = self._optimizers
+        actor_optimizer, critic_optimizer = self.optimizers
         return Learner(
             weights=weights,
             aim=aim,
@@ -162,7 +163,7 @@ class ActorCritic:
             learner: The actor, whose critic and worlds stay.
             weights: (size,) weights, for whitened observations.
         """
-        moments = self._optimizers[0].init(weights), learner.moments[1]
+        moments = self.optimizers[0].init(weights), learner.moments[1]
         return dataclasses.replace(learner, weights=weights, moments=moments)
 
     def update(
@@ -190,7 +191,7 @@ class ActorCritic:
         slope, found = jax.grad(loss, has_aux=True)(learner.weights)
         last, obs, targets, dones = found
         failed = ~jnp.all(jnp.isfinite(slope)) | ~jnp.all(jnp.isfinite(targets))
-        change, moments = self._optimizers[0].update(
+        change, moments = self.optimizers[0].update(
             slope / self.steps, learner.moments[0]
         )
         critic, critic_moments = self._fit(learner, scale, order_key, obs, targets)
@@ -297,7 +298,7 @@ class ActorCritic:
         targets: PyTree,
     ) -> tuple[Layers, PyTree]:
         """Fits the critic to its targets (worlds, window) in several steps."""
-        optimizer = self._optimizers[1]
+        optimizer = self.optimizers[1]
         obs, targets = obs.reshape(self.steps, -1), targets.reshape(self.steps)
         factor = 1 - self.settings.discount
 
