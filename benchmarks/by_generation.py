@@ -5,6 +5,9 @@ may not have on a GPU. This compares variants with as many generations. Seed and
 settings are those of the protocol ``field``; the scores are corrected.
 
     python benchmarks/by_generation.py hopper_uni me-actor-critic@11 --generations 80
+
+With ``--then``, another variant of the algorithm goes on from the archive and the
+actors of the first one. Both need the same state: as many actors, worlds and so on.
 """
 
 from __future__ import annotations
@@ -27,6 +30,13 @@ COLUMNS = {
 }
 
 
+def _begun(task: str, variant: str, seed: int) -> Progress:
+    """Returns a run of the protocol before its first generation."""
+    run = study_runs.Run(task, variant, seed)
+    with tempfile.TemporaryDirectory() as out:
+        return Progress(FIELD, run, Path(out), math.inf)
+
+
 def main() -> None:
     """Prints a line of the table after each ``--every`` generations."""
     parser = argparse.ArgumentParser(
@@ -37,20 +47,32 @@ def main() -> None:
     parser.add_argument("--generations", type=int, default=80)
     parser.add_argument("--every", type=int, default=20)
     parser.add_argument("--seed", type=int, default=1000, help="default: the tuning's")
+    parser.add_argument(
+        "--then",
+        nargs=2,
+        metavar=("VARIANT", "GENERATIONS"),
+        help="variant that goes on after so many generations",
+    )
     args = parser.parse_args()
-    if args.variant not in study_runs.variants():
-        parser.error(f"variant: got {args.variant}; allowed: a key of study/field.toml")
+    then, change = args.then or (args.variant, "0")
+    for name in (args.variant, then):
+        if name not in study_runs.variants():
+            parser.error(f"variant: got {name}; allowed: a key of study/field.toml")
+    if not change.isdecimal():
+        parser.error(f"--then: got {change}; allowed: a variant and an integer")
     for name in ("generations", "every"):
         if getattr(args, name) < 1:
             parser.error(f"{name}: got {getattr(args, name)}; allowed: integers from 1")
-    run = study_runs.Run(args.task, args.variant, args.seed)
-    with tempfile.TemporaryDirectory() as out:
-        search = Progress(FIELD, run, Path(out), math.inf)
+    search = _begun(args.task, args.variant, args.seed)
     print("| " + " | ".join(["generations", *COLUMNS.values(), "time [s]"]) + " |")
     print("|---" * (len(COLUMNS) + 2) + "|", flush=True)
     begin = time.process_time()
     for number in range(1, args.generations + 1):
         search.advance()
+        if number == int(change):
+            held = search.search.checkpoint(search.state)
+            search = _begun(args.task, then, args.seed)
+            search.state = search.search.restore(held)
         if number % args.every == 0:
             found, _ = search.scores()
             scores = [f"{found[name]:,.0f}" for name in COLUMNS]
