@@ -25,7 +25,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from newton_qd.qd import EvolveConfig, make_task
-from newton_qd.qd.algorithms.episode_learning import EpisodeLearningOptions
+from newton_qd.qd.algorithms.episode_learning import (
+    EpisodeLearningOptions,
+    episode_learning,
+)
 from newton_qd.qd.algorithms.gradient_options import (
     DifferentiableOptions,
     differentiable,
@@ -36,7 +39,6 @@ from newton_qd.qd.emitters.actor_critic_learner import (
     measure_of,
 )
 from newton_qd.qd.emitters.actor_critic_settings import ActorCriticSettings
-from newton_qd.qd.emitters.episode_learner import EpisodeLearning
 from newton_qd.qd.emitters.whitening import Whitening
 from newton_qd.qd.scoring.networks import policy_for
 from newton_qd.qd.scoring.rollout import Policy
@@ -104,19 +106,6 @@ def begun(env_name: str, settings: ActorCriticSettings, seed: int) -> Trial:
     return Trial(task, policy, method, scale, actor, keys[4], keys[5])
 
 
-def by_episodes(trial: Trial) -> EpisodeLearning:
-    """Returns how the actor goes on from whole episodes, with the defaults."""
-    options = EpisodeLearningOptions()
-    width = options.episode_termination_width
-    return EpisodeLearning(
-        trial.method,
-        differentiable(trial.task, options, width).env,
-        after=0,
-        updates=options.episode_updates,
-        weight_noise=options.episode_weight_noise,
-    )
-
-
 def returns(
     env_name: str,
     settings: ActorCriticSettings,
@@ -136,7 +125,10 @@ def returns(
     for number in range(updates + 1):
         if number == episodes_after:
             actor = trial.method.moved(actor, actor.weights)
-            update = jax.jit(by_episodes(trial).update)
+            options = EpisodeLearningOptions(episodes_after=1)
+            later = episode_learning(trial.task, options, trial.method)
+            assert later is not None
+            update = jax.jit(later.update)
         if number % every == 0:
             found.append(try_out(trial.plain(actor)))
         key = jax.random.fold_in(trial.key, number)

@@ -10,11 +10,11 @@ from newton_qd.qd.algorithms.gradient_options import (
     DifferentiableOptions,
     differentiable,
 )
-from newton_qd.qd.algorithms.spec import EmitterContext
 
 if TYPE_CHECKING:  # importing a list of algorithms imports no JAX
     from newton_qd.qd.emitters.actor_critic_learner import ActorCritic
     from newton_qd.qd.emitters.episode_learner import EpisodeLearning
+    from newton_qd.qd.scoring.task import Task
 
 _MOST = 2**30  # JAX counts in 32 bits
 _NARROWEST = 1e-6  # of the gradient of a fall
@@ -56,12 +56,12 @@ class EpisodeLearningOptions(DifferentiableOptions):
 
 
 def episode_learning(
-    context: EmitterContext, options: EpisodeLearningOptions, method: ActorCritic
+    task: Task, options: EpisodeLearningOptions, method: ActorCritic
 ) -> EpisodeLearning | None:
     """Returns how actors learn from episodes, or ``None`` if they never do.
 
     Args:
-        context: What the run gives to its algorithm.
+        task: The task.
         options: Options of the algorithm.
         method: Learning method of the actors before.
     """
@@ -72,7 +72,7 @@ def episode_learning(
     width = options.episode_termination_width
     return EpisodeLearning(
         method,
-        differentiable(context.task, options, width).env,
+        differentiable(task, options, width).env,
         after=options.episodes_after,
         updates=options.episode_updates,
         weight_noise=options.episode_weight_noise,

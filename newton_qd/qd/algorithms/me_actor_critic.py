@@ -81,7 +81,7 @@ def _make(context: EmitterContext, options: ActorCriticOptions) -> Any:
         fitness=options.fitness,
         lifetime=options.lifetime,
         measures=task.descriptor_length,
-        later=episode_learning(context, options, method),
+        later=episode_learning(context.task, options, method),
     )
     if emitter.batch_size > config.batch_size:
         given = options.actors, options.branches, options.copies
