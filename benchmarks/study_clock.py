@@ -98,8 +98,24 @@ def known_pace(out: Path, run: Run) -> float | None:
     return None
 
 
+def _timed(generation: Callable[[], object]) -> list[float]:
+    """Returns the times [s] of some generations."""
+    times: list[float] = []
+    while len(times) < LEAST_GENERATIONS or sum(times) < LEAST_SECONDS:
+        begin = time.perf_counter()
+        generation()
+        times.append(time.perf_counter() - begin)
+    return times
+
+
 def pace(
-    out: Path, run: Run, generation: Callable[[], object], gpu: str, commit: str
+    out: Path,
+    run: Run,
+    generation: Callable[[], object],
+    gpu: str,
+    commit: str,
+    *,
+    later: int = 0,
 ) -> float:
     """Returns the median time [s] of a generation on a GPU of its own.
 
@@ -111,6 +127,8 @@ def pace(
             one, which evaluates the initial population, is not timed.
         gpu: Name of the GPU.
         commit: Version of the code.
+        later: Generations after which a generation does something else, or 0. Then both
+            kinds are timed, and the slower one counts.
     """
     found = known_pace(out, run)
     if found is not None:
@@ -120,12 +138,12 @@ def pace(
         if found is not None:
             return found
         generation()
-        times: list[float] = []
-        while len(times) < LEAST_GENERATIONS or sum(times) < LEAST_SECONDS:
-            begin = time.perf_counter()
-            generation()
-            times.append(time.perf_counter() - begin)
+        times = _timed(generation)
         found = statistics.median(times)
+        if later:
+            for _ in range(later - 1 - len(times)):
+                generation()
+            found = max(found, statistics.median(_timed(generation)))
         line = (run.task, run.variant, gpu, commit, str(len(times)), f"{found:.7g}")
         add_line(out / PACES, dict(zip(HEAD, line, strict=True)), HEAD)
     return found

@@ -118,7 +118,10 @@ class Progress:
 
         state, spent = self.state, dataclasses.replace(self.spent)
         gpu = jax.devices()[0].device_kind
-        self.pace = study_clock.pace(out, self.run, self.advance, gpu, commit())
+        later = getattr(self.search.options, "episodes_after", 0)
+        self.pace = study_clock.pace(
+            out, self.run, self.advance, gpu, commit(), later=later
+        )
         self.state, self.spent = state, spent
 
     def save(self) -> None:

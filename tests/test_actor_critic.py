@@ -217,6 +217,9 @@ def test_measures_are_those_of_the_descriptor() -> None:
     )
     task = point_task(None)  # pyright: ignore[reportArgumentType]
     np.testing.assert_array_equal(measure_of(task)(before, after), [1.5, 1.0])
+    low, high = task.limits
+    from_the_middle = measure_of(task, centered=True)(before, after)
+    np.testing.assert_array_equal(from_the_middle, [1.5, 1.0] - (low + high) / 2)
     env = newton_qd.create("pointmaze")
     task = dataclasses.replace(
         task, env=env, descriptor_extractor=get_final_xy_position

@@ -51,21 +51,26 @@ def episodes(
     return EpisodeLearning(method(measure, noise=noise), PointEnv(), **given)
 
 
+@pytest.mark.parametrize("averaged", [False, True])
 @pytest.mark.parametrize("size", [0.3, 3.0])  # the second one falls
-def test_the_gradient_is_that_of_the_episode(size: float) -> None:
+def test_the_gradient_is_that_of_the_episode(size: float, averaged: bool) -> None:
     """Against rewards and measures up to a fall, added up step by step."""
-    later, aim = episodes(), jnp.array([1.0, 0.3, -0.2])
+    later, aim = episodes(averaged=averaged), jnp.array([1.0, 0.3, -0.2])
     start = learner(later.method, (1.0, 0.3, -0.2))
     weights = size * jax.random.normal(jax.random.key(4), (SIZE,))
     env = PointEnv()
 
     def by_hand(weights: jax.Array, state: Any) -> tuple[jax.Array, jax.Array]:
-        total, up = jnp.zeros(()), jnp.ones(())
+        gained, measured = jnp.zeros(()), jnp.zeros(2)
+        steps, up = jnp.zeros(()), jnp.ones(())
         for _ in range(LENGTH):
             state = env.step(state, policy(weights, state.obs))
-            total += up * (jnp.append(state.reward, state.pipeline_state) @ aim)
+            gained += up * state.reward
+            measured += up * state.pipeline_state
+            steps += up
             up = up * (1 - state.done)
-        return total, up
+        measured = measured * LENGTH / steps if averaged else measured
+        return jnp.append(gained, measured) @ aim, up
 
     found, sound = compiled(later.slopes)(weights, start, jax.random.key(6))
     expected, up = compiled(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import tempfile
 import threading
+import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -122,6 +123,28 @@ def test_a_pace_is_measured_once(tmp_path: Path, monkeypatch: Any) -> None:
     assert pace(1) == pytest.approx(first, rel=1e-6)
     assert len(ran) == 1 + study_clock.LEAST_GENERATIONS
     assert study_clock.known_pace(tmp_path, Run("hopper_uni", "me@2", 0)) is None
+
+
+def test_a_pace_is_that_of_the_slower_generations(
+    tmp_path: Path, monkeypatch: Any
+) -> None:
+    monkeypatch.setattr(study_clock, "LEAST_SECONDS", 0.0)
+    paces = []
+    for slow in (range(1, 11), range(11, 20), range(0)):
+        ran = []
+
+        def generation(slow: Any = slow, ran: list[int] = ran) -> None:
+            ran.append(len(ran))
+            if ran[-1] in slow:
+                time.sleep(0.05)
+
+        run = Run("hopper_uni", "me@1", 0)
+        out = tmp_path / str(slow)
+        out.mkdir()
+        found = study_clock.pace(out, run, generation, "H200", "abc", later=12)
+        paces.append(found)
+        assert len(ran) == 12 + study_clock.LEAST_GENERATIONS
+    assert min(paces[:2]) > 0.05 > 0.04 > paces[2]
 
 
 class Clockwork:

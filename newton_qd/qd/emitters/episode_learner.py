@@ -23,10 +23,13 @@ class EpisodeLearning:
     a limit of the adjoint. With the aim :math:`w`, it maximizes the mean over its
     worlds of
 
-    .. math:: \sum_t w \cdot (r_t, m_t) \prod_{s<t} (1 - d_s),
+    .. math:: w \cdot \sum_t g_t (r_t, m_t), \qquad g_t = \prod_{s<t} (1 - d_s),
 
     where a fall ends the sum, and ``done`` may have a gradient
-    (:func:`~newton_qd.gradients.with_smooth_termination`). Each world has weights of
+    (:func:`~newton_qd.gradients.with_smooth_termination`). If the descriptor is a mean
+    over the T control steps of an episode, the sum of the measures is
+    :math:`T \sum_t g_t m_t / \sum_t g_t` instead. So a fall changes it only as it
+    changes the descriptor. Each world has weights of
     its own (Plappert et al. 2018, "Parameter space noise for exploration"), which makes
     the return smoother. Near a stiff contact, the gradient of one world can be much
     longer than those of the others, so long ones are shortened to the median norm
@@ -40,6 +43,7 @@ class EpisodeLearning:
         updates: Updates of each actor before each time that it produces offspring.
         weight_noise: Standard deviation of the noise of weights, in units of the
             genotype.
+        averaged: Whether the descriptor is a mean over the steps of an episode.
 
     Raises:
         TypeError: A number has a wrong type.
@@ -51,6 +55,7 @@ class EpisodeLearning:
     after: int
     updates: int
     weight_noise: float
+    averaged: bool = False
 
     def __post_init__(self) -> None:
         """Checks the numbers.
@@ -131,10 +136,16 @@ class EpisodeLearning:
             state, tally, bad = carry
             action = self.method.policy(weights, state.obs) + noise
             after = self.env.step(state, jnp.clip(action, -1, 1))
-            gain = jnp.append(after.reward, self.method.measure(state, after)) @ aim
+            measures = self.method.measure(state, after)
+            gains = jnp.concatenate([after.reward[None], measures, one[None]])
             bad = bad | (~tally.over & at_fault(after))
-            return (after, tally.add(gain, after.done), bad), None
+            return (after, tally.add(gains, after.done), bad), None
 
-        begin = first, Tally.zero(noise.dtype), jnp.zeros((), bool)
+        one = jnp.ones((), noise.dtype)
+        nothing = Tally(jnp.zeros(aim.size + 1, noise.dtype), one)
+        begin = first, nothing, jnp.zeros((), bool)
         (_, tally, bad), _ = jax.lax.scan(advance, begin, noise)
-        return tally.fitness, bad
+        sums, steps = tally.fitness[:-1], tally.fitness[-1]
+        if self.averaged:
+            sums = sums.at[1:].multiply(len(noise) / steps)
+        return sums @ aim, bad
