@@ -31,6 +31,8 @@ class ActorCriticOptions(LearningOptions, EpisodeLearningOptions, ClimbingOption
         steered: Share of the actors that follow directions of the descriptor [-].
         fitness: Weight of the reward of steered actors [-].
         lifetime: Generations after which a steered actor restarts from a random elite.
+        to_empty: Share of the steered actors whose direction leads from their elite to
+            a cell without one, once they restart [-]; the others have a random one.
     """
 
     actors: int = 2
@@ -40,6 +42,7 @@ class ActorCriticOptions(LearningOptions, EpisodeLearningOptions, ClimbingOption
     steered: float = 0.5
     fitness: float = 0.1
     lifetime: int = 10
+    to_empty: float = 0.0
 
     def episodes(self, config: EvolveConfig) -> int:
         """Returns the differentiated control steps of a generation, in episodes.
@@ -82,6 +85,7 @@ def _make(context: EmitterContext, options: ActorCriticOptions) -> Any:
         lifetime=options.lifetime,
         measures=task.descriptor_length,
         later=episode_learning(context.task, options, method),
+        to_empty=options.to_empty,
     )
     if emitter.batch_size > config.batch_size:
         given = options.actors, options.branches, options.copies

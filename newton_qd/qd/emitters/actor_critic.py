@@ -15,7 +15,7 @@ from newton_qd import checks
 from newton_qd.checks import message
 from newton_qd.envs.state import select
 from newton_qd.qd.emitters.actor_critic_learner import ActorCritic, Learner
-from newton_qd.qd.emitters.cells import draw_cells
+from newton_qd.qd.emitters.cells import draw_cells, empty_targets
 from newton_qd.qd.emitters.episode_learner import EpisodeLearning
 from newton_qd.types import (
     ExtraScores,
@@ -93,6 +93,7 @@ class ActorCriticEmitter(Emitter):
         lifetime: int = 10,
         measures: int,
         later: EpisodeLearning | None = None,
+        to_empty: float = 0.0,
     ) -> None:
         """Sets the actors and how much they learn.
 
@@ -110,6 +111,8 @@ class ActorCriticEmitter(Emitter):
             lifetime: Generations after which a steered actor restarts.
             measures: Length of the descriptor.
             later: How actors learn after some generations; ``None``: as before.
+            to_empty: Share of the steered actors that restart with the direction from
+                their elite to an empty cell [-]; the others have random directions.
 
         Raises:
             ValueError: A number is out of its range.
@@ -120,7 +123,8 @@ class ActorCriticEmitter(Emitter):
             checks.integer(name, value, most=None)
         if not 0 < spread[0] <= spread[1]:
             raise ValueError(message("spread", spread, "0 < smallest <= largest"))
-        checks.number("steered", steered, least=0, most=1)
+        for name, share in {"steered": steered, "to_empty": to_empty}.items():
+            checks.number(name, share, least=0, most=1)
         self._method = method
         self._first = first
         self._actors = actors
@@ -133,6 +137,7 @@ class ActorCriticEmitter(Emitter):
         self._lifetime = lifetime
         self._measures = measures
         self._later = later
+        self._to_empty = to_empty
 
     @property
     def batch_size(self) -> int:
@@ -298,6 +303,30 @@ class ActorCriticEmitter(Emitter):
             axis=1,
         )
 
+    def _toward_empty(
+        self,
+        aims: jax.Array,
+        repertoire: Repertoire,
+        cells: jax.Array,
+        key: jax.Array,
+    ) -> jax.Array:
+        """Returns the aims; those of some actors lead from their elite to an empty cell.
+
+        Args:
+            aims: (K, 1 + D) aims.
+            repertoire: The archive.
+            cells: (K,) cells of the elites from which the actors restart.
+            key: Key of the choice.
+        """
+        cell_key, choice_key = jax.random.split(key)
+        targets = empty_targets(repertoire, cell_key, self._actors)
+        ways = targets - repertoire.descriptors[cells]
+        lengths = jnp.linalg.norm(ways, axis=1, keepdims=True)
+        ways = ways / jnp.where(lengths > 0, lengths, 1)
+        chosen = jax.random.uniform(choice_key, (self._actors,)) < self._to_empty
+        chosen = chosen & (jnp.arange(self._actors) >= self._actors - self._steered)
+        return aims.at[:, 1:].set(jnp.where(chosen[:, None], ways, aims[:, 1:]))
+
     def _renewed(
         self, state: ActorCriticState, repertoire: Repertoire, key: jax.Array
     ) -> Learner:
@@ -307,7 +336,11 @@ class ActorCriticEmitter(Emitter):
         cells = draw_cells(cell_key, filled, self._actors)
         weights = repertoire.genotypes[cells]
         weights = self._method.whitening.whitened(weights, state.scale)
-        new = self._begun(critic_key, weights, self._aims(aim_key))
+        aims = self._aims(aim_key)
+        if self._to_empty:
+            empty_key = jax.random.fold_in(aim_key, 1)
+            aims = self._toward_empty(aims, repertoire, cells, empty_key)
+        new = self._begun(critic_key, weights, aims)
         number = jnp.arange(self._actors)
         # one after the other, so that there are actors of all ages
         turn = number * self._lifetime // max(self._actors, 1)
