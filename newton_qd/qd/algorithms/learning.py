@@ -42,7 +42,7 @@ def learning_method(
     method = ActorCritic(
         task.env,
         policy.of_weights,
-        measure_of(task, centered=options.centered),
+        measure_of(task),
         context.config.episode_length,
         options,
         Whitening.of(policy) if options.whiten else Whitening(),

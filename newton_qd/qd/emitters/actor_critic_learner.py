@@ -10,7 +10,6 @@ from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 
 from newton_qd.envs.state import select
@@ -327,28 +326,15 @@ def averages(task: Task) -> bool:
     return task.descriptor_extractor is not get_final_xy_position
 
 
-def measure_of(
-    task: Task, *, centered: bool = False
-) -> Callable[[StateLike, StateLike], jax.Array]:
+def measure_of(task: Task) -> Callable[[StateLike, StateLike], jax.Array]:
     """Returns the function of the measures (D,) of a control step of a task.
 
     If the descriptor is the final position, the measure is the velocity [m/s]. For
     other tasks, the descriptor is a mean over the episode, and the measure is the state
     descriptor.
-
-    Args:
-        task: The task.
-        centered: Whether a state descriptor counts from the middle of the descriptor
-            space.
     """
     if averages(task):
-        middle = np.mean(task.limits, axis=0) if centered else 0
-
-        def state_descriptor(before: Any, after: Any) -> jax.Array:
-            del before
-            return after.info["state_descriptor"] - middle
-
-        return state_descriptor
+        return lambda before, after: after.info["state_descriptor"]
 
     def velocity(before: Any, after: Any) -> jax.Array:
         names = "state_descriptor"

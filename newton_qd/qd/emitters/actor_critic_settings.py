@@ -31,10 +31,6 @@ class ActorCriticSettings:
         whiten: Whether an actor learns weights for whitened observations.
         termination_width: Width of the gradient of ``done`` at the limits of a healthy
             robot [m or rad]; with 0, an actor does not see that a fall is near.
-        centered: Whether the measures of a descriptor that is a mean over the episode
-            count from the middle of the descriptor space. Otherwise an actor gains by a
-            fall if it follows a direction to small values, and loses by one if it
-            follows the opposite direction.
 
     Raises:
         TypeError: A value has a wrong type.
@@ -56,7 +52,6 @@ class ActorCriticSettings:
     batches: int = 4
     whiten: bool = True
     termination_width: float = 0.0
-    centered: bool = False
 
     def __post_init__(self) -> None:
         """Checks every value.
@@ -65,8 +60,7 @@ class ActorCriticSettings:
             TypeError: A value has a wrong type.
             ValueError: A value is out of its range.
         """
-        for name in ("whiten", "centered"):
-            checks.flag(name, getattr(self, name))
+        checks.flag("whiten", self.whiten)
         object.__setattr__(self, "critic", tuple(self.critic))
         for name in ("worlds", "window", "epochs", "batches"):
             checks.integer(name, getattr(self, name), most=None)
