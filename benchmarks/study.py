@@ -33,6 +33,10 @@ continued, see ``study_execution.py``; variants are in ``study/field.toml``:
 ``--reach-evaluations``, runs go on after that until they have a million evaluations.
 ``--stop-after S`` ends the command in time for a machine that is lent for so long.
 With ``--paced``, the runs of a GPU do not take turns: see ``study_clock.py``.
+
+``--list FILE`` has runs of several tasks, variants and times, the most informative
+first: a line of it is ``TASK VARIANT SEED UNTIL``. The file is read again whenever a
+run ends, so it can be changed meanwhile.
 """
 
 from __future__ import annotations
@@ -40,7 +44,9 @@ from __future__ import annotations
 import argparse
 import math
 import os
+import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import study_core
@@ -90,6 +96,7 @@ def arguments() -> argparse.Namespace:
 def _add_field_arguments(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("of the protocols field and small")
     group.add_argument("--variants", nargs="*", help="run these, as for ablations")
+    group.add_argument("--list", type=Path, help="file of the runs, see above")
     group.add_argument("--until", type=float, help="longest time of a run [s]")
     group.add_argument(
         "--reach-evaluations",
@@ -153,6 +160,13 @@ def checked(
     if args.until is None:
         stops = protocol.stops if protocol else ()
         args.until = max((x.amount for x in stops if x.unit == "s"), default=math.inf)
+    if args.list:
+        if not protocol:
+            parser.error("--list: got it without --protocol field or small")
+        try:
+            study_runs.listed(args.list, protocol, args.out)
+        except (OSError, ValueError) as error:
+            parser.error(f"--list: {error}")
     if args.paced and (not protocol or args.device != "cuda"):
         parser.error("--paced: got it without --protocol field or small and a GPU")
     for name in ("seeds", "gpus", "workers"):
@@ -165,6 +179,30 @@ def checked(
             option = name.replace("_", "-")
             parser.error(f"--{option}: got {value}; allowed: a number above 0")
     return args
+
+
+def coming(args: argparse.Namespace) -> Iterator[tuple[float, tuple[str, ...]]]:
+    """Longest time of each run [s], and its task, variant, seed and output.
+
+    While a list has a wrong line, what it had before counts.
+    """
+    if not args.list:
+        for what in left(args):
+            yield args.until, what
+        return
+    begun: set[tuple[study_runs.Run, float]] = set()
+    found: list[tuple[study_runs.Run, float]] = []
+    while True:
+        try:
+            found = study_runs.listed(args.list, PROTOCOLS[args.protocol], args.out)
+        except (OSError, ValueError) as error:
+            print(f"--list: {error}", file=sys.stderr, flush=True)
+        found = [each for each in found if each not in begun]
+        if not found:
+            return
+        begun.add(found[0])
+        run, until = found[0]
+        yield until, (run.task, run.variant, str(run.seed), str(args.out))
 
 
 def left(args: argparse.Namespace) -> list[tuple[str, ...]]:
@@ -220,19 +258,22 @@ def main() -> None:
         one(args, begin)
         return
     args.out.mkdir(parents=True, exist_ok=True)
-    missing = left(args)
     latest = min(args.start_until, args.stop_after)
     pool = Pool(args, [None] * args.workers, args.gpus)
-    for number, what in enumerate(missing):
+    runs = coming(args)
+    while True:
         slot = pool.wait()
         spent = time.monotonic() - begin
-        if spent > latest:
-            print(f"{len(missing) - number} runs are left", flush=True)
+        until, what = next(runs, (0.0, ()))
+        if not what:
             break
-        print(f"{spent:5.0f} s: {what}, {number + 1} of {len(missing)}", flush=True)
+        if spent > latest:
+            print(f"{1 + sum(1 for _ in runs)} runs are left", flush=True)
+            break
+        print(f"{spent:5.0f} s: {what} until {until:g} s", flush=True)
         more = []
         if args.protocol != "core":
-            more = ["--until", str(args.until)]
+            more = ["--until", str(until)]
             more += ["--stop-after", str(args.stop_after - spent)]
             more += ["--reach-evaluations"] * args.reach_evaluations
             more += ["--paced"] * args.paced

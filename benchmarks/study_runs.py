@@ -186,6 +186,15 @@ def planned(protocol: Protocol, choice: Choice) -> list[Run]:
     return found
 
 
+def finished(protocol: Protocol, out: Path) -> set[tuple[str, str, int, str]]:
+    """Returns task, variant, seed and stop of all lines of a folder."""
+    return {
+        (line["task"], line["variant"], int(line["seed"]), line["stop"])
+        for line in lines(out)
+        if line["protocol"] == protocol.name
+    }
+
+
 def missing(protocol: Protocol, out: Path, choice: Choice) -> list[Run]:
     """Returns the runs of a choice without a line for one of their stops.
 
@@ -194,11 +203,7 @@ def missing(protocol: Protocol, out: Path, choice: Choice) -> list[Run]:
         out: Folder of the runs.
         choice: The runs to look at.
     """
-    done = {
-        (line["task"], line["variant"], int(line["seed"]), line["stop"])
-        for line in lines(out)
-        if line["protocol"] == protocol.name
-    }
+    done = finished(protocol, out)
     within = protocol.stops_until(choice.until)
     stops = [str(stop) for stop in within if stop.unit == "s" or choice.reach]
     # slow algorithms may not reach a number of evaluations
@@ -208,6 +213,34 @@ def missing(protocol: Protocol, out: Path, choice: Choice) -> list[Run]:
         for run in planned(protocol, choice)
         if any((run.task, run.variant, run.seed, stop) not in done for stop in stops)
     ]
+
+
+def listed(path: Path, protocol: Protocol, out: Path) -> list[tuple[Run, float]]:
+    """Returns the runs of a list that are not finished, each with its longest time [s].
+
+    Args:
+        path: File with a line ``TASK VARIANT SEED UNTIL`` for each run.
+        protocol: The protocol.
+        out: Folder of the runs.
+
+    Raises:
+        ValueError: A line is none of a run.
+    """
+    done, found = finished(protocol, out), []
+    stops = {f"{x.amount:g}": str(x) for x in protocol.stops if x.unit == "s"}
+    for line in filter(str.strip, path.read_text(encoding="utf-8").splitlines()):
+        words = line.split()
+        task, variant, seed, until = words if len(words) == 4 else ("",) * 4
+        sound = task in protocol.tasks and variant in variants() and seed.isdecimal()
+        if not sound or until not in stops:
+            raise ValueError(
+                f"{path}: got {line!r}; allowed: TASK VARIANT SEED UNTIL, with a task "
+                f"of the protocol, a variant of {VARIANTS.name}, an integer from 0, "
+                f"and one of {', '.join(stops)}"
+            )
+        if (task, variant, int(seed), stops[until]) not in done:
+            found.append((Run(task, variant, int(seed)), float(until)))
+    return found
 
 
 def add_line(path: Path, line: dict[str, str], head: tuple[str, ...] = HEAD) -> None:

@@ -303,26 +303,14 @@ def test_steered_actors_begin_again() -> None:
     assert not (changed[:, 1] & changed[:, 2]).any()
 
 
-def restarted(**changes: Any) -> tuple[MapElitesRepertoire, Any]:
-    """An archive, and four steered actors that have just restarted from its elites."""
-    made = emitter(actors=4, steered=1.0, lifetime=1, **changes)
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_directions_can_lead_to_empty_cells(share: float) -> None:
+    archive: Any
+    made = emitter(actors=4, steered=1.0, lifetime=1, to_empty=share)
     archive, given = initial()
     state = compiled(made.init)(jax.random.key(1), archive, *given, {})
     state = dataclasses.replace(state, generation=jnp.ones((), jnp.int32))
-    return archive, compiled(made._renewed)(state, archive, jax.random.key(5))
-
-
-def test_actors_restart_from_the_fittest_of_some_elites() -> None:
-    archive, actors = restarted(rivals=200)
-    fittest = archive.genotypes[jnp.argmax(archive.fitnesses[:, 0])]
-    np.testing.assert_array_equal(actors.weights, jnp.tile(fittest, (4, 1)))
-    archive, actors = restarted()
-    assert len(np.unique(np.asarray(actors.weights), axis=0)) > 1
-
-
-@pytest.mark.parametrize("share", [0.0, 1.0])
-def test_directions_can_lead_to_empty_cells(share: float) -> None:
-    archive, actors = restarted(to_empty=share)
+    actors = compiled(made._renewed)(state, archive, jax.random.key(5))
     empty = np.asarray(archive.fitnesses)[:, 0] == -np.inf
     assert 0 < empty.sum() < len(empty)
     for weights, aim in zip(actors.weights, np.asarray(actors.aim), strict=True):
@@ -354,7 +342,6 @@ def test_lost_gradients_are_told() -> None:
         ({"spread": (0.1, 0.01)}, r"spread: got \(0.1, .*; .*0 < smallest <= largest"),
         ({"steered": -0.1}, "steered: got -0.1; .* from 0 to 1"),
         ({"to_empty": 1.1}, "to_empty: got 1.1; .* from 0 to 1"),
-        ({"rivals": 0}, "rivals: got 0; allowed: .* from 1"),
     ],
 )
 def test_bad_numbers_are_refused(changes: dict[str, Any], message: str) -> None:

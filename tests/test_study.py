@@ -141,6 +141,40 @@ def test_finished_runs_are_left_out(tmp_path: Path) -> None:
     assert len(study_runs.lines(tmp_path)) == 3
 
 
+def test_a_list_can_change_while_it_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    listed = tmp_path / "list"
+    listed.write_text("ant_uni me@1 0 60\n\nhopper_uni me@1 7 250\n")
+    words = ["study.py", "--protocol", "field", "--out", str(tmp_path)]
+    monkeypatch.setattr(sys, "argv", [*words, "--list", str(listed)])
+    runs = study.coming(study.arguments())
+    assert next(runs) == (60.0, ("ant_uni", "me@1", "0", str(tmp_path)))
+    listed.write_text("ant_uni me@1 0 60\nant_uni me@1 0 250\nant_uni me@2 3 60\n")
+    assert next(runs) == (250.0, ("ant_uni", "me@1", "0", str(tmp_path)))
+    listed.write_text("ant_uni me@1 0 6\n")
+    assert next(runs) == (60.0, ("ant_uni", "me@2", "3", str(tmp_path)))
+    assert "got 'ant_uni me@1 0 6'; allowed: " in capsys.readouterr().err
+    listed.write_text("ant_uni me@4 3 60\n")
+    row = {**line("me", 3, "60 s"), "protocol": "field", "task": "ant_uni"}
+    study_runs.add_line(tmp_path / "runs.csv", {**row, "variant": "me@4"})
+    assert next(runs, None) is None
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        *("ant me@1 0 60", "ant_uni me@x 0 60", "ant_uni me@1 -1 60"),
+        *("ant_uni me@1 0 61", "ant_uni me@1 0", "ant_uni me@1 0 60 60"),
+    ],
+)
+def test_a_wrong_line_of_a_list_is_told(tmp_path: Path, wrong: str) -> None:
+    listed = tmp_path / "list"
+    listed.write_text(f"ant_uni me@1 0 60\n{wrong}\n")
+    with pytest.raises(ValueError, match=f"got '{wrong}'; allowed: TASK .* 60, 250"):
+        study_runs.listed(listed, FIELD, tmp_path)
+
+
 def test_tuning_chooses_the_corrected_score(tmp_path: Path) -> None:
     assert len(left(tmp_path, tune=True)) == 8
     for variant, gain in (("me@1", 3.0), ("me@2", 5.0), ("me@3", 4.0)):

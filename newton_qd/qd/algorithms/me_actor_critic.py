@@ -33,7 +33,6 @@ class ActorCriticOptions(LearningOptions, EpisodeLearningOptions, ClimbingOption
         lifetime: Generations after which a steered actor restarts from a random elite.
         to_empty: Share of the steered actors whose direction leads from their elite to
             a cell without one, once they restart [-]; the others have a random one.
-        rivals: Random elites of which the fittest one is where an actor restarts.
     """
 
     actors: int = 2
@@ -44,7 +43,6 @@ class ActorCriticOptions(LearningOptions, EpisodeLearningOptions, ClimbingOption
     fitness: float = 0.1
     lifetime: int = 10
     to_empty: float = 0.0
-    rivals: int = 1
 
     def episodes(self, config: EvolveConfig) -> int:
         """Returns the differentiated control steps of a generation, in episodes.
@@ -88,7 +86,6 @@ def _make(context: EmitterContext, options: ActorCriticOptions) -> Any:
         measures=task.descriptor_length,
         later=episode_learning(context.task, options, method),
         to_empty=options.to_empty,
-        rivals=options.rivals,
     )
     if emitter.batch_size > config.batch_size:
         given = options.actors, options.branches, options.copies

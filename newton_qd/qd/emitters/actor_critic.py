@@ -94,7 +94,6 @@ class ActorCriticEmitter(Emitter):
         measures: int,
         later: EpisodeLearning | None = None,
         to_empty: float = 0.0,
-        rivals: int = 1,
     ) -> None:
         """Sets the actors and how much they learn.
 
@@ -114,14 +113,13 @@ class ActorCriticEmitter(Emitter):
             later: How actors learn after some generations; ``None``: as before.
             to_empty: Share of the steered actors that restart with the direction from
                 their elite to an empty cell [-]; the others have random directions.
-            rivals: Random elites of which the fittest one is where an actor restarts.
 
         Raises:
             ValueError: A number is out of its range.
         """
         counts = {"actors": actors, "branches": branches, "copies": copies}
         counts = {**counts, "updates": updates}
-        for name, value in {**counts, "lifetime": lifetime, "rivals": rivals}.items():
+        for name, value in {**counts, "lifetime": lifetime}.items():
             checks.integer(name, value, most=None)
         if not 0 < spread[0] <= spread[1]:
             raise ValueError(message("spread", spread, "0 < smallest <= largest"))
@@ -140,7 +138,6 @@ class ActorCriticEmitter(Emitter):
         self._measures = measures
         self._later = later
         self._to_empty = to_empty
-        self._rivals = rivals
 
     @property
     def batch_size(self) -> int:
@@ -336,10 +333,7 @@ class ActorCriticEmitter(Emitter):
         """Returns the actors; restarts those with a finished lifetime from elites."""
         aim_key, cell_key, critic_key = jax.random.split(key, 3)
         filled = repertoire.fitnesses[:, 0] > -jnp.inf
-        drawn = draw_cells(cell_key, filled, self._rivals * self._actors)
-        drawn = drawn.reshape(self._rivals, self._actors)
-        fittest = jnp.argmax(repertoire.fitnesses[drawn, 0], axis=0)
-        cells = drawn[fittest, jnp.arange(self._actors)]
+        cells = draw_cells(cell_key, filled, self._actors)
         weights = repertoire.genotypes[cells]
         weights = self._method.whitening.whitened(weights, state.scale)
         aims = self._aims(aim_key)
