@@ -28,7 +28,7 @@ class Tally:
     after the end count as 0, so the step that ends the episode adds no slope.
 
     Attributes:
-        fitness: () sum of the rewards so far.
+        fitness: () sum of the rewards so far; (N,) if each step has N of them.
         going: () 1 before the first ``done``, else 0.
     """
 
@@ -51,7 +51,7 @@ class Tally:
         The sum is in time order. A reduction over time would depend on the batch size.
 
         Args:
-            reward: () reward of the step.
+            reward: () reward of the step, or (N,) several of them.
             done: () above 0 if the step ends the episode, else 0.
         """
         over, dtype = self.over, self.going.dtype
