@@ -121,7 +121,8 @@ def pace(
 
     Args:
         out: Folder of the runs. Its ``paces.csv`` has the time of each task and
-            variant; the first run of a variant measures it.
+            variant; the first run of a variant measures it. Where runs of two GPUs
+            measure it at the same time, the one that ends first counts for both.
         run: The run.
         generation: Runs the next generation, compiled, and waits for its end. The first
             one, which evaluates the initial population, is not timed.
@@ -144,6 +145,9 @@ def pace(
             for _ in range(later - 1 - len(times)):
                 generation()
             found = max(found, statistics.median(_timed(generation)))
+        earlier = known_pace(out, run)  # of another GPU, meanwhile
+        if earlier is not None:
+            return earlier
         line = (run.task, run.variant, gpu, commit, str(len(times)), f"{found:.7g}")
         add_line(out / PACES, dict(zip(HEAD, line, strict=True)), HEAD)
     return found

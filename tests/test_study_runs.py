@@ -125,6 +125,26 @@ def test_a_pace_is_measured_once(tmp_path: Path, monkeypatch: Any) -> None:
     assert study_clock.known_pace(tmp_path, Run("hopper_uni", "me@2", 0)) is None
 
 
+def test_two_gpus_have_the_same_pace(tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setattr(study_clock, "LEAST_SECONDS", 0.0)
+    path = tmp_path / study_clock.PACES
+    found: list[float] = []
+
+    def generation() -> None:
+        if not path.is_file():  # the other GPU ends first
+            monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "1")
+            other = study_clock.pace(
+                tmp_path, RUN, lambda: time.sleep(0.002), "H200", "abc"
+            )
+            found.append(other)
+
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0")
+    assert study_clock.pace(tmp_path, RUN, generation, "H200", "abc") == pytest.approx(
+        found[0], rel=1e-6
+    )
+    assert len(path.read_text().splitlines()) == 2
+
+
 def test_a_pace_is_that_of_the_slower_generations(
     tmp_path: Path, monkeypatch: Any
 ) -> None:
