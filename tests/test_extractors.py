@@ -1,4 +1,4 @@
-"""AURORA's descriptors, with a model that is written here and with one of Flax."""
+"""Descriptors of robots, and AURORA's with a model of our own and one of Flax."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from newton_qd.extractors import (
     AuroraExtraInfo,
     AuroraExtraInfoNormalization,
     check_extractor,
+    folded_sum,
     get_aurora_encoding,
     get_feet_contact_proportion,
     get_final_xy_position,
@@ -231,3 +232,45 @@ def test_kernels_refuse_what_is_no_episode() -> None:
         physics.episode_final(described, jnp.zeros(3, np.float32))
     with pytest.raises(TypeError, match=r"got .*int32; allowed: float32, float64"):
         physics.episode_proportion(jnp.zeros((4, 2), np.int32), jnp.zeros(4, np.int32))
+
+
+def episodes() -> tuple[Transitions, jax.Array]:
+    """Three episodes of 5 steps: whole, ended after 2 steps, ended after 1."""
+    descriptors = jnp.arange(30, dtype=np.float32).reshape(3, 5, 2)
+    mask = jnp.array([[0] * 5, [0, 0, 1, 1, 1], [0, 1, 1, 1, 1]], np.float32)
+    return Transitions(descriptors), mask
+
+
+def test_final_position_is_of_the_last_valid_step() -> None:
+    assert get_final_xy_position(*episodes()).tolist() == [[8, 9], [12, 13], [20, 21]]
+
+
+def test_feet_proportion_is_over_valid_steps() -> None:
+    assert get_feet_contact_proportion(*episodes()).tolist() == [
+        [4.0, 5.0],
+        [11.0, 12.0],
+        [20.0, 21.0],
+    ]
+
+
+@pytest.mark.parametrize("steps", [1, 2, 7, 250])
+def test_descriptors_do_not_depend_on_the_batch(steps: int) -> None:
+    data = jax.random.uniform(jax.random.key(0), (64, steps, 4), np.float32)
+    mask = jnp.zeros((64, steps), np.float32)
+    extract = jax.jit(
+        lambda data, mask: get_feet_contact_proportion(Transitions(data), mask)
+    )
+    batch = np.asarray(extract(data, mask))
+    for world in range(0, 64, 9):
+        one = slice(world, world + 1)
+        assert (
+            np.asarray(extract(data[one], mask[one])).tobytes() == batch[one].tobytes()
+        )
+    np.testing.assert_allclose(batch, np.mean(data, axis=1), rtol=1e-5)
+    assert folded_sum(jnp.zeros((0, 3)), 0).tolist() == [0.0] * 3
+
+
+def test_descriptors_keep_float32_under_x64(x64: None) -> None:
+    data, mask = episodes()
+    assert get_final_xy_position(data, mask).dtype == np.float32
+    assert get_feet_contact_proportion(data, mask > 0).dtype == np.float32
