@@ -41,6 +41,7 @@ def test_arm_reach() -> None:
     np.testing.assert_allclose(read, after.info["xy_position"], atol=1e-7)
 
 
+@pytest.mark.slow
 def test_pusher_uni() -> None:
     before, after, actions = rolled("pusher_uni")
     q, v = after.pipeline_state.q, after.pipeline_state.v

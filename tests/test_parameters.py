@@ -82,11 +82,8 @@ def changed(system: System, params: Params) -> System:
     )
 
 
-@pytest.mark.parametrize(
-    "robot",
-    [pytest.param(ANT, marks=pytest.mark.slow, id="ant"), HOPPER],
-    ids=lambda robot: robot.name,
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("robot", [ANT, HOPPER], ids=lambda robot: robot.name)
 def test_parameters_are_as_if_in_the_files(x64: None, robot: RobotSpec) -> None:
     system = physics.load_system(robot, "float64")
     state, control = inputs(system)
