@@ -23,6 +23,7 @@ from study_protocols import OURS
 from study_report import interval
 from study_results import LEAST_SEEDS, compared, is_variant, main_variants
 from study_runs import TUNING_SEED, lines
+from study_scores import markdown
 
 Seeds = dict[int, list[float]]
 """Corrected QD scores by seed; the reported run is first."""
@@ -66,12 +67,9 @@ def load(folder: Path, repeats: Path, stop: str) -> tuple[Runs, set[tuple[str, s
     return found, {(task, variant) for (task, _, _), variant in main.items()}
 
 
-def again(runs: Runs) -> str:
+def again(runs: Runs) -> tuple[str, str]:
     """Sentence and Markdown table about the seeds that were run more than once."""
-    rows = [
-        "| task | variant | runs of each seed | highest to lowest |",
-        "|---|---|---|---|",
-    ]
+    rows = []
     every: list[float] = []
     for (task, variant), seeds in sorted(runs.items()):
         equal = [scores for _, scores in sorted(seeds.items()) if len(scores) > 1]
@@ -80,10 +78,11 @@ def again(runs: Runs) -> str:
             every += spread
             counts = ", ".join(str(len(scores)) for scores in equal)
             ratio = ", ".join(f"{ratio:.2f}" for ratio in spread)
-            rows.append(f"| {task} | {variant} | {counts} | {ratio} |")
+            rows.append([task, variant, counts, ratio])
     close = sum(ratio < CLOSE for ratio in every)
     first = f"Of {len(every)} groups of equal runs, {close} differ by less than"
-    return "\n".join([f"{first} {100 * (CLOSE - 1):.0f} %.", "", *rows])
+    head = "task", "variant", "runs of each seed", "highest to lowest"
+    return f"{first} {100 * (CLOSE - 1):.0f} %.", markdown(head, rows)
 
 
 def ratios(runs: Runs, main: set[tuple[str, str]]) -> str:
@@ -91,8 +90,7 @@ def ratios(runs: Runs, main: set[tuple[str, str]]) -> str:
 
     Tasks where neither of them was made again are left out.
     """
-    head = " | ".join(PICKS)
-    rows = [f"| task | ours | best other | {head} |", "|---" * (3 + len(PICKS)) + "|"]
+    rows = []
     for task in sorted({task for task, _ in runs}):
         sides: tuple[dict[str, Seeds], dict[str, Seeds]] = {}, {}
         for (own, name), seeds in runs.items():
@@ -106,8 +104,8 @@ def ratios(runs: Runs, main: set[tuple[str, str]]) -> str:
         if all(len(scores) == 1 for seeds in pair for scores in seeds.values()):
             continue
         cells = [_compared(*pair, *picks) for picks in PICKS.values()]
-        rows.append(f"| {task} | {ours} | {best} | {' | '.join(cells)} |")
-    return "\n".join(rows)
+        rows.append([task, ours, best, *cells])
+    return markdown(["task", "ours", "best other", *PICKS], rows)
 
 
 def _best(side: dict[str, Seeds]) -> str:
@@ -144,7 +142,7 @@ def main() -> None:
         runs, named = load(args.folder, args.repeats, args.stop)
     except (OSError, ValueError) as error:
         parser.error(str(error))
-    print(again(runs), ratios(runs, named), sep="\n\n")
+    print(*again(runs), ratios(runs, named), sep="\n\n")
 
 
 if __name__ == "__main__":

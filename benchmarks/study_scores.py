@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import itertools
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -31,11 +32,19 @@ from study_results import (
     to_best_other,
 )
 
+MILLION = "1000000 evaluations"
 PUBLISHED = {
     "hopper_uni": {"me": 401, "pga-me": 474, "dcrl-me": 527, "ascii-me": 680},
     "walker2d_uni": {"me": 434, "pga-me": 542, "dcrl-me": 645, "ascii-me": 767},
 }
 """Medians of QD scores [thousands] at a million evaluations (Mitsides et al. 2025)."""
+
+
+LONG = (
+    *("corrected mean fitness over common cells", "QD score", "coverage [%]"),
+    *("best", "time [s]"),
+)
+"""Columns that a short table leaves out."""
 
 
 def text(values: list[float], spec: str) -> str:
@@ -48,19 +57,20 @@ def text(values: list[float], spec: str) -> str:
     return f"{middle:{spec}} ({low:{spec}} to {high:{spec}})"
 
 
-def table(results: Results, stop: str) -> str:
-    """Markdown table of all tasks and algorithms at a stop."""
+def table(results: Results, stop: str, *, short: bool = False) -> str:
+    """Markdown table of all tasks and algorithms at a stop.
+
+    Args:
+        results: The runs.
+        stop: The stop.
+        short: Whether the columns of uncorrected scores, of common cells and of the
+            time are left out.
+    """
     limits = references(results)
-    head = (
-        *("task", "algorithm", "seeds", "**corrected QD score**", "**without offset**"),
-        *("corrected mean fitness over common cells", "corrected coverage [%]"),
-        *("corrected best", "QD score", "coverage [%]", "best"),
-        *("evaluations [k]", "time [s]"),
-    )
-    rows = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
+    rows: list[dict[str, str]] = []
     keys = sorted(key for key in results if key[2] == stop)
     for task, group in itertools.groupby(keys, key=lambda key: key[0]):
-        shared = common(results, task, stop)
+        shared = {} if short else common(results, task, stop)
         for key in group:
             runs = results[key]
 
@@ -68,44 +78,83 @@ def table(results: Results, stop: str) -> str:
                 return [float(run.line[name]) for run in runs]
 
             clock = "wall_s" if runs[0].line["device"] == "cuda" else "processor_s"
-            cells = (
-                *(task, key[1], str(len(runs))),
-                text(column("corrected_qd_score"), ",.0f"),
-                text([normalized(run, limits[task]) for run in runs], ".4f"),
-                text(shared[key[1]], ".4g"),
-                text(column("corrected_coverage"), ".1f"),
-                text(column("corrected_max_fitness"), ".4g"),
-                text(column("qd_score"), ",.0f"),
-                text(column("coverage"), ".1f"),
-                text(column("max_fitness"), ".4g"),
-                f"{np.mean(column('evaluations')) / 1e3:.0f}",
-                f"{np.mean(column(clock)):.0f}",
-            )
-            rows.append(f"| {' | '.join(cells)} |")
-    return "\n".join(rows)
+            row = {
+                "task": task,
+                "algorithm": key[1],
+                "seeds": str(len(runs)),
+                "**corrected QD score**": text(column("corrected_qd_score"), ",.0f"),
+                "**without offset**": text(
+                    [normalized(run, limits[task]) for run in runs], ".4f"
+                ),
+                "corrected mean fitness over common cells": text(
+                    shared.get(key[1], []), ".4g"
+                ),
+                "corrected coverage [%]": text(column("corrected_coverage"), ".1f"),
+                "corrected best": text(column("corrected_max_fitness"), ".4g"),
+                "QD score": text(column("qd_score"), ",.0f"),
+                "coverage [%]": text(column("coverage"), ".1f"),
+                "best": text(column("max_fitness"), ".4g"),
+                "evaluations [k]": f"{np.mean(column('evaluations')) / 1e3:.0f}",
+                "time [s]": f"{np.mean(column(clock)):.0f}",
+            }
+            left_out = LONG if short else ()
+            rows.append({n: cell for n, cell in row.items() if n not in left_out})
+    return markdown(list(rows[0]), [list(row.values()) for row in rows])
+
+
+def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Returns a Markdown table."""
+    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
+    return "\n".join([*lines, *(f"| {' | '.join(row)} |" for row in rows)])
 
 
 def overview(results: Results, rival: str | None = None) -> str:
     """Markdown table: our ratio to the best other algorithm, by task and stop.
 
     Those with enough seeds count first. With ``rival``, only this other algorithm
-    counts. Bold: the intervals do not overlap.
+    counts. Bold: the intervals do not overlap. Stops where nothing can be compared are
+    left out.
     """
     stops = sorted({key[2] for key in results}, key=lambda stop: (len(stop), stop))
-    rows = [f"| task | {' | '.join(stops)} |", "|---" * (1 + len(stops)) + "|"]
-    for task in sorted({key[0] for key in results}):
-        cells = []
-        for stop in stops:
-            found = to_best_other(results, task, stop, rival)
-            if found is None:
-                cells.append("-")
-                continue
-            ratio, word, seeds = found
-            mark = "**" if word == "apart" else ""
-            few = f" ({seeds} of {LEAST_SEEDS} seeds)" if seeds < LEAST_SEEDS else ""
-            cells.append(f"{mark}{ratio:.2f}{mark}{few}")
-        rows.append(f"| {task} | {' | '.join(cells)} |")
-    return "\n".join(rows)
+    tasks = sorted({key[0] for key in results})
+    columns = {
+        named(stop): [_ratio(results, task, stop, rival) for task in tasks]
+        for stop in stops
+    }
+    columns = {name: c for name, c in columns.items() if set(c) != {"-"}}
+    return markdown(["task", *columns], zip(tasks, *columns.values(), strict=True))
+
+
+def _ratio(results: Results, task: str, stop: str, rival: str | None) -> str:
+    """A cell of the overview."""
+    found = to_best_other(results, task, stop, rival)
+    if found is None:
+        return "-"
+    ratio, word, seeds = found
+    mark = "**" if word == "apart" else ""
+    few = f" ({seeds} seed{'s' * (seeds > 1)})" if seeds < LEAST_SEEDS else ""
+    return f"{mark}{ratio:.2f}{mark}{few}"
+
+
+def named(stop: str) -> str:
+    """Returns the name of a stop in the documentation."""
+    amount, unit = stop.split()
+    return "a million evaluations" if stop == MILLION else f"{int(amount):,} {unit}"
+
+
+def against(results: Results, rival: str, stops: Sequence[str]) -> str:
+    """Markdown table: the scores of ours and of the best variant of a rival."""
+    head = ["task"]
+    rows = {task: [task] for task in sorted({key[0] for key in results})}
+    for stop in stops:
+        head += [f"{named(stop)}: ours", rival, "ratio"]
+        for task, cells in rows.items():
+            sides = sides_of(results, task, stop, rival)
+            ours, best = (max(enough(side)) for side in sides)
+            ratio, word = compared(ours[:3], best[:3], min(ours[4], best[4]))
+            mark = "" if word == "apart" else f" ({word})"
+            cells += [f"{ours[0]:,.0f}", f"{best[0]:,.0f}", f"{ratio:.2f}{mark}"]
+    return markdown(head, rows.values())
 
 
 def verdict(results: Results, stop: str) -> str:
@@ -114,10 +163,8 @@ def verdict(results: Results, stop: str) -> str:
     Ours has the chosen variant. Others have the one that is best here, of those with
     enough seeds, if there are any.
     """
-    rows = [
-        "| task | our best: corrected QD score | best other | ratio | intervals |",
-        "|---|---|---|---|---|",
-    ]
+    head = "task", "our best: corrected QD score", "best other", "ratio", "intervals"
+    rows = []
     for task in sorted({key[0] for key in results}):
         sides = sides_of(results, task, stop)
         if not all(sides):
@@ -129,8 +176,8 @@ def verdict(results: Results, stop: str) -> str:
         if seeds >= LEAST_SEEDS:
             pairs = zip(cells, (ours, best), strict=True)
             cells = [f"{cell} ({x[1]:,.0f} to {x[2]:,.0f})" for cell, x in pairs]
-        rows.append(f"| {task} | {' | '.join(cells)} | {ratio:.2f} | {word} |")
-    return "\n".join(rows)
+        rows.append([task, *cells, f"{ratio:.2f}", word])
+    return markdown(head, rows)
 
 
 def published(results: Results) -> str:
@@ -139,20 +186,21 @@ def published(results: Results) -> str:
     The published scores have no offset, and neither have these. They are of a single
     evaluation of each individual, as in the first variant of each algorithm.
     """
-    rows = ["| task | algorithm | ratio here | published |", "|---|---|---|---|"]
+    rows = []
     for task, scores in PUBLISHED.items():
         sums: dict[str, list[float]] = {}
         for (own, _, stop), runs in results.items():
             name, number = runs[0].line["variant"].split("@")
-            if (own, stop, number) == (task, "1000000 evaluations", "1"):
+            if (own, stop, number) == (task, MILLION, "1"):
                 sums[name] = [run.raw[np.isfinite(run.raw)].sum() for run in runs]
         if "me" not in sums:
             continue
         base = np.median(sums["me"])
         for name in [name for name in scores if name in sums]:
             ratio, other = np.median(sums[name]) / base, scores[name] / scores["me"]
-            rows.append(f"| {task} | {name} | {ratio:.2f} | {other:.2f} |")
-    return "\n".join(rows) if len(rows) > 2 else ""
+            rows.append([task, name, f"{ratio:.2f}", f"{other:.2f}"])
+    head = "task", "algorithm", "ratio here", "published"
+    return markdown(head, rows) if rows else ""
 
 
 def report(results: Results) -> str:

@@ -46,9 +46,9 @@ def test_the_reported_run_is_first(loaded: Loaded) -> None:
 
 
 def test_seeds_that_ran_once_are_not_counted(loaded: Loaded) -> None:
-    sentence, _, _, _, *rows = study_repeats.again(loaded[0]).splitlines()
+    sentence, table = study_repeats.again(loaded[0])
     assert sentence == "Of 4 groups of equal runs, 0 differ by less than 15 %."
-    assert rows == [
+    assert table.splitlines()[2:] == [
         f"| hopper_uni | {OTHER} | 2, 2, 2 | 1.20, 1.20, 1.20 |",
         f"| hopper_uni | {OURS} | 2 | 1.17 |",
     ]
@@ -82,7 +82,7 @@ def test_tasks_without_runs_made_again_are_left_out(loaded: Loaded) -> None:
         for key, seeds in runs.items()
     }
     assert len(study_repeats.ratios(once, named).splitlines()) == 2
-    assert len(study_repeats.again(once).splitlines()) == 4
+    assert len(study_repeats.again(once)[1].splitlines()) == 2
 
 
 @pytest.mark.usefixtures("loaded")

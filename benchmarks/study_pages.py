@@ -1,0 +1,124 @@
+"""Write the tables of the study's pages from its runs.
+
+python benchmarks/study_pages.py            writes them into the pages
+python benchmarks/study_pages.py --check    fails if one is out of date
+
+A table of a page stands below a comment that names it: its kind, and a stop where the
+kind wants one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import functools
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import study_repeats
+import study_scores
+from study_results import Results, load
+from study_runs import TUNING_SEED, lines
+
+BENCHMARKS = Path(__file__).resolve().parent
+DOCS = BENCHMARKS.parent / "docs"
+FIELD = BENCHMARKS / "results" / "field"
+REPEATS = BENCHMARKS / "results" / "field_repeats.csv"
+SMALL = BENCHMARKS / "results" / "small"
+PAGES = tuple(DOCS / name for name in ("study.md", "study_scores.md", "study_runs.md"))
+TABLE = re.compile(
+    r"(?P<head><!-- table: (?P<kind>[^,\n]+)(?:, (?P<stop>[^\n]+))?; "
+    r"benchmarks/study_pages\.py -->\n\n)(?P<rows>(?:\|.*\n)*)"
+)
+LONG, BEFORE = "1000 s", "250 s"
+
+
+@functools.cache
+def _field() -> Results:
+    return load(FIELD)
+
+
+def _equal_runs(stop: str) -> str:
+    return study_repeats.again(study_repeats.load(FIELD, REPEATS, stop)[0])[1]
+
+
+def _repeats(stop: str) -> str:
+    return study_repeats.ratios(*study_repeats.load(FIELD, REPEATS, stop))
+
+
+def long_runs() -> str:
+    """Markdown table: the runs that came to the longest time, there and before."""
+    with REPEATS.open(newline="", encoding="utf-8") as file:
+        every = [*lines(FIELD), *csv.DictReader(file)]
+    scores = {
+        tuple(line[name] for name in ("task", "variant", "seed", "commit", "stop")): (
+            f"{float(line['corrected_qd_score']):,.0f}"
+        )
+        for line in reversed(every)  # the first one counts
+        if int(line["seed"]) != TUNING_SEED
+    }
+    rows = []
+    for (*run, stop), score in sorted(scores.items()):
+        task, variant, seed, _ = run
+        if stop == LONG:
+            rows.append([task, variant, seed, scores[*run, BEFORE], score])
+    head = "task", "variant", "seed", study_scores.named(BEFORE)
+    return study_scores.markdown([*head, study_scores.named(LONG)], rows)
+
+
+KINDS: dict[str, Callable[[str], str]] = {
+    "ratios": lambda _: study_scores.overview(_field()),
+    "ratios to MAP-Elites": lambda _: study_scores.overview(_field(), "me"),
+    "ours and DCRL-ME": lambda stops: study_scores.against(
+        _field(), "dcrl-me", stops.split(", ")
+    ),
+    "best": lambda stop: study_scores.verdict(_field(), stop),
+    "best on a CPU": lambda stop: study_scores.verdict(load(SMALL), stop),
+    "scores": lambda stop: study_scores.table(_field(), stop, short=True),
+    "published": lambda _: study_scores.published(_field()),
+    "long runs": lambda _: long_runs(),
+    "equal runs": _equal_runs,
+    "other runs": _repeats,
+}
+"""What writes the tables of a kind, given the stop."""
+
+
+def written(text: str) -> str:
+    """Returns the text of a page, with its tables anew.
+
+    Raises:
+        ValueError: A table is of an unknown kind.
+    """
+
+    def anew(found: re.Match[str]) -> str:
+        kind = found["kind"]
+        if kind not in KINDS:
+            raise ValueError(f"kind of a table: {kind!r}; there are {sorted(KINDS)}")
+        return f"{found['head']}{KINDS[kind](found['stop'] or '')}\n"
+
+    return TABLE.sub(anew, text)
+
+
+def main() -> int:
+    """Writes the pages, or compares them."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--check", action="store_true", help="write nothing")
+    check = parser.parse_args().check
+    old = 0
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        new = written(text)
+        if new != text:
+            old += 1
+            print(f"{page.name}: {'out of date' if check else 'written'}")
+            if not check:
+                page.write_text(new, encoding="utf-8")
+    return int(check and old > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
