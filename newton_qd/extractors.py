@@ -77,7 +77,10 @@ def get_feet_contact_proportion(data: StateDescriptors, mask: Mask) -> Descripto
     # If all components had one number of steps, XLA would multiply by its reciprocal in
     # some batches, and 41 * (1 / 41) is not 1.
     steps = folded_sum(jnp.broadcast_to(valid, data.state_desc.shape), 1)
-    return folded_sum(data.state_desc * valid, 1) / jax.lax.optimization_barrier(steps)
+    # after the end, a state descriptor may be anything, also nan; 0 times nan is nan
+    counts = (valid > 0) | jnp.isfinite(data.state_desc)
+    values = jnp.where(counts, data.state_desc, jnp.zeros_like(data.state_desc))
+    return folded_sum(values * valid, 1) / jax.lax.optimization_barrier(steps)
 
 
 def get_mean_state_descriptor(data: StateDescriptors, mask: Mask) -> Descriptor:

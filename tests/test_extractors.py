@@ -253,6 +253,22 @@ def test_feet_proportion_is_over_valid_steps() -> None:
     ]
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_state_descriptors_after_the_end_do_not_count(value: float) -> None:
+    """Nothing says that they are finite there: only the physics freezes a world."""
+    whole, mask = episodes()
+    after = jnp.where(mask[..., None] > 0, value, whole.state_desc)
+    for extractor in (get_feet_contact_proportion, get_final_xy_position):
+        found = extractor(Transitions(after), mask)
+        assert found.tolist() == extractor(whole, mask).tolist()
+    reduced = jax.vmap(physics.episode_proportion)(after, mask)
+    assert reduced.tolist() == get_feet_contact_proportion(whole, mask).tolist()
+    # before the end, they do
+    broken = whole.state_desc.at[0, 4, 1].set(value)
+    found = get_feet_contact_proportion(Transitions(broken), mask)
+    assert not np.isfinite(found[0, 1]) and np.isfinite(found[0, 0])
+
+
 @pytest.mark.parametrize("steps", [1, 2, 7, 250])
 def test_descriptors_do_not_depend_on_the_batch(steps: int) -> None:
     data = jax.random.uniform(jax.random.key(0), (64, steps, 4), np.float32)

@@ -268,6 +268,26 @@ def test_eval_sums_the_first_episode_only() -> None:
     np.testing.assert_allclose(sums[5].episode_metrics["reward"], expected, rtol=1e-6)
 
 
+class NotFinite(Line):
+    """A line whose numbers are not finite after the end."""
+
+    def step(self, state: State, action: jax.Array, params: Params = None) -> State:
+        over = state.done > 0
+        state = super().step(state, action, params)
+        reward = jnp.where(over, jnp.nan, jnp.float32(1))
+        moved = jnp.where(over, jnp.inf, state.metrics["moved"])
+        metrics = {**state.metrics, "moved": moved}
+        return state.replace(reward=reward, metrics=metrics)
+
+
+def test_what_is_not_finite_after_the_end_is_not_summed() -> None:
+    env = EvalWrapper(EpisodeWrapper(NotFinite(), 3, 1))
+    last = play(env, 6)[-1]
+    assert np.isnan(last.reward)
+    sums = last.info["eval_metrics"].episode_metrics
+    assert float(sums["reward"]) == 3.0 and float(sums["moved"]) == 3.0
+
+
 def test_completed_eval_counts_each_step_once() -> None:
     env = CompletedEvalWrapper(AutoResetWrapper(EpisodeWrapper(Line(), 3, 1)))
     states = play(env, 8)
@@ -424,6 +444,7 @@ def test_check_counts_what_it_does_not_name() -> None:
         pipeline_state=None,
         obs=np.zeros((20, 2)),
         reward=np.zeros(20),
+        done=np.ones(20),
     )
     with pytest.raises(newton_qd.FaultError, match="world 7 at step 7 and 12 more"):
         newton_qd.check(state)  # pyright: ignore[reportArgumentType]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -70,9 +71,7 @@ class EvalWrapper(Wrapper):
         state = with_reward_metric(self.env.step(state, action, params))
         active = sums.active_episodes
         totals = jax.tree.map(
-            lambda total, value: total + value * active,
-            sums.episode_metrics,
-            state.metrics,
+            functools.partial(_added, active), sums.episode_metrics, state.metrics
         )
         lost = at_fault(state) & (active > 0)
         totals = {**totals, "reward": jnp.where(lost, -jnp.inf, totals["reward"])}
@@ -84,6 +83,13 @@ class EvalWrapper(Wrapper):
             ),
         )
         return state.replace(info={**state.info, self.STATE_INFO_KEY: sums})
+
+
+def _added(active: jax.Array, total: jax.Array, value: jax.Array) -> jax.Array:
+    """Returns a sum with another value, if the episode is active."""
+    # after the end, a metric may be anything, also nan; 0 times nan is nan
+    counts = (active > 0) | jnp.isfinite(value)
+    return total + jnp.where(counts, value, jnp.zeros_like(value)) * active
 
 
 def with_reward_metric(state: State) -> State:

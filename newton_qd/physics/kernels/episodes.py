@@ -27,7 +27,11 @@ def proportion_forward(steps: int, nd: int, x: wp.array[scalar], y: wp.array[sca
     total = scalar(0.0)
     for t in range(steps):
         valid = scalar(1.0) - x[mask + t]
-        y[out + t] = x[at + t * nd + k - w * nd] * valid
+        # after the end, a state descriptor may be anything, also nan
+        value = scalar(0.0)
+        if valid > scalar(0.0):
+            value = x[at + t * nd + k - w * nd] * valid
+        y[out + t] = value
         total += valid
     n = int(steps)
     while n > 1:
