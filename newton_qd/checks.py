@@ -301,7 +301,7 @@ def precision(dtype: DTypeLike) -> np.dtype:
         ValueError: It is not float32 or float64, or it is float64 and JAX x64 is off.
     """
     try:
-        found = np.dtype(dtype)
+        found = None if dtype is None else np.dtype(dtype)  # NumPy takes it as float64
     except TypeError:
         found = None
     if found is None or found.name not in _FLOATS:

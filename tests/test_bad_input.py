@@ -125,6 +125,10 @@ def test_check_names_worlds(name: str) -> None:
     assert isinstance(caught.value, FloatingPointError)
     with pytest.raises(TypeError, match="traced"):
         jax.eval_shape(newton_qd.check, state)
+    for value in (2.0, jnp.nan):  # an environment of a user may say so
+        odd = state.replace(done=state.done.at[3].set(value))
+        with pytest.raises(newton_qd.FaultError, match="done neither 0 nor 1: world 3"):
+            newton_qd.check(odd)
 
 
 @pytest.mark.parametrize("name", EVERY_NAME)

@@ -205,7 +205,7 @@ def test_precision(x64: None) -> None:
     assert checks.precision("float64") == np.float64
     assert checks.precision(np.float32) == np.float32
     wrong: Any
-    for wrong in ("float16", "foo", 3, int):
+    for wrong in ("float16", "foo", 3, int, None):
         with pytest.raises(ValueError, match=r"^dtype: got .*;.*float32, float64"):
             checks.precision(wrong)
 

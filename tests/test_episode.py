@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import importlib
 import pickle
+import re
 from typing import Any
 
 import jax
@@ -71,6 +72,31 @@ def test_methods_are_the_functions_that_were(hopper: Any, options: Any) -> None:
         lambda: episode.directional(weights, ways, KEY),
         lambda: along(weights, ways, KEY),
     )
+
+
+@pytest.mark.parametrize(
+    ("shape", "text"),
+    [
+        ((2, 1, 2), "got shape (2, 1, 2); allowed: shape (3, R, 1 + D), R from 1"),
+        ((3, 2), "got shape (3, 2); allowed: shape (3, R, 1 + D), R from 1"),
+        ((3, 0, 2), "got shape (3, 0, 2); allowed: shape (3, R, 1 + D), R from 1"),
+        ((3, 1, 5), "weights: got 5 columns; allowed: 1 + D = 2"),
+    ],
+)
+def test_weights_of_a_wrong_shape(shape: Any, text: str, hopper: Any) -> None:
+    parts, weights = hopper
+    episode = Episode(*parts, episode_length=STEPS)
+    with pytest.raises(ValueError, match=re.escape(text)):
+        jax.eval_shape(episode.directional, weights, jnp.ones(shape), KEY)
+
+
+def test_a_gradient_is_a_function_and_noise_needs_a_key(line: Any) -> None:
+    episode, plans = line
+    wrong: Any = 3
+    with pytest.raises(TypeError, match="gradient: got 3; allowed: a method that ret"):
+        episode.scoring(wrong)
+    with pytest.raises(TypeError, match=r"^key: got "):
+        episode.mixed(plans, wrong)
 
 
 def test_mixed_gradients_are_the_function_that_was(line: Any) -> None:

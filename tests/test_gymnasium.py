@@ -95,6 +95,9 @@ def test_gymnasiums_own_check_of_a_robot() -> None:
 
 
 def test_truncation_is_not_termination() -> None:
+    options: Any = {"auto_reset": True}
+    with pytest.raises(TypeError, match="options: got 'auto_reset', which the adapter"):
+        make_gymnasium("hopper", **options)
     env = make_gymnasium(limited(3))
     env.reset(seed=0)
     ends = [env.step(np.zeros(1))[2:4] for _ in range(3)]

@@ -161,7 +161,10 @@ def test_wrong_batch() -> None:
     with pytest.raises(ValueError, match=r"params: .*shape \(\), .*batch axis \(3,\)"):
         env.step(state, action, one)
     with pytest.raises(ValueError, match=r"params: .*shape \(4,\)"):
-        env.step(state, action, randomize_params(KEY, env, 4))
+        env.step(state, action, randomize_params(KEY, make("ant_uni"), 4))
+    with pytest.raises(ValueError, match="worlds: got 4; allowed: 3, as env has, or"):
+        randomize_params(KEY, env, 4)
+    randomize_params(KEY, env, 3)
 
 
 def test_float64_parameters_are_refused_by_float32(x64: None) -> None:

@@ -307,4 +307,20 @@ def test_meshes_of_a_package(tmp_path: Path) -> None:
 def test_prefixed_elements_are_left_out(tmp_path: Path) -> None:
     """Extensions of simulators do not need their namespace."""
     extension = "<x:sensor y:on='1'/><gazebo><x:plugin/></gazebo>"
-    assert built(tmp_path, robot_text(link("a", extension), extension), "a").nb == 1
+    text = robot_text(link("a", extension), extension)
+    assert built(tmp_path, text, "a").nb == 1
+    own = text.replace("<robot ", "<robot xmlns='http://www.ros.org' ")
+    assert own != text and built(tmp_path, own, "a").nb == 1
+
+
+def test_an_axis_that_newton_cannot_normalize(tmp_path: Path) -> None:
+    """In single precision, the square of its length is 0."""
+    joint = (
+        "<joint name='j' type='continuous'><parent link='a'/><child link='b'/>"
+        "<axis xyz='{}'/></joint>"
+    )
+    parts = link("a"), link("b")
+    text = robot_text(*parts, joint.format("0 1e-30 0"))
+    with pytest.raises(RobotDescriptionError, match="got '0 1e-30 0'; allowed: a dir"):
+        built(tmp_path, text, "a")
+    assert built(tmp_path, robot_text(*parts, joint.format("0 1e-3 0")), "a").nb == 2

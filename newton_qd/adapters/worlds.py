@@ -30,6 +30,10 @@ def one_world(env: str | Env, options: dict[str, Any], *, endless: bool = False)
         UnknownEnvironment: The name is not registered.
     """
     if isinstance(env, str):
+        if "auto_reset" in options:
+            why = "which the adapter decides"
+            allowed = "other arguments of newton_qd.create"
+            raise TypeError(message("options", "auto_reset", allowed, why=why))
         env = registry.create(env, auto_reset=False, **options)
     elif not isinstance(env, Env):
         allowed = "a name of newton_qd.registered_envs(), or an environment"

@@ -60,7 +60,8 @@ def randomize_params(
     Raises:
         TypeError: ``env`` is not an environment, or ``key`` is not a key.
         ValueError: The environment has no physical parameters, ``worlds`` is not an
-            integer above 0, ``key`` is several keys, or a range is wrong.
+            integer above 0 or not that of ``env``, ``key`` is several keys, or a range
+            is wrong.
     """
     require_key("key", key)
     default = _default(env, worlds)
@@ -78,7 +79,11 @@ def randomize_params(
         for name, limits in given.items()
         if limits is not None
     }
-    batch = jnp.shape(env.default_params.gravity) if worlds is None else (worlds,)
+    batch = jnp.shape(env.default_params.gravity)
+    if worlds is not None and batch not in ((), (worlds,)):
+        allowed = f"{batch[0]}, as env has, or None"
+        raise ValueError(message("worlds", worlds, allowed))
+    batch = batch if worlds is None else (worlds,)
     if not batch:
         return _draw(key, default, bounds)
     keys = jax.random.split(key, batch)

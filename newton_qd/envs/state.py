@@ -118,8 +118,9 @@ def check(state: State) -> None:
         state: State of one world or of any batch.
 
     Raises:
-        FaultError: A world has a fault, or a value of its state is not finite. The
-            error names the worlds, and their steps if ``info`` has them.
+        FaultError: A world has a fault, a value of its state is not finite, or ``done``
+            is neither 0 nor 1. The error names the worlds, and their steps if ``info``
+            has them.
         TypeError: ``state`` is traced, or is no state.
         ValueError: ``state`` does not say whether it has a fault.
     """
@@ -155,6 +156,10 @@ def check(state: State) -> None:
             found.append(
                 f"{name} not finite: {_named(wrong, steps)}; no fault, so not frozen"
             )
+    ended = np.asarray(state.done)
+    wrong = (ended != 0) & (ended != 1)
+    if wrong.any():
+        found.append(f"done neither 0 nor 1: {_named(wrong, steps)}")
     if found:
         raise FaultError(". ".join(found))
 

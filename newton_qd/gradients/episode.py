@@ -15,9 +15,11 @@ import numpy as np
 from newton_qd import checks
 from newton_qd.checks import Fact, message
 from newton_qd.envs.env import Env
+from newton_qd.envs.inputs import require_key
 from newton_qd.envs.state import select
 from newton_qd.extractors import check_extractor
 from newton_qd.gradients.compiled import compiled_once, without_compiled
+from newton_qd.gradients.episode_input import check_first, check_weights
 from newton_qd.gradients.exact import EpisodeGradient, EpisodeGradients, differentiate
 from newton_qd.gradients.flow import EXACT, GradientOptions, passed_back, scan_keeping
 from newton_qd.gradients.mixed import (
@@ -164,7 +166,8 @@ class Episode:
         parameters = self.unravel(genotype)
         is_key = isinstance(start, (jax.Array, np.ndarray))
         first: Any = self.env.reset(start) if is_key else start
-        self._check_first(first)
+        described = self.descriptor_extractor is not None or self.transitions
+        check_first(first, described)
         kept = self.options.exact and self.options.checkpoint_every in (None, 1)
         if self.policy is None and kept and not self.transitions:
             if isinstance(self.env, Env):
@@ -239,8 +242,10 @@ class Episode:
 
         Raises:
             TypeError: ``start`` is neither a key nor a state.
-            ValueError: ``start`` or a genotype is wrong, as in a call of the episode.
+            ValueError: ``start`` or a genotype is wrong, as in a call of the episode,
+                or ``weights`` have another shape.
         """
+        check_weights(genotypes, weights)
         axes = (0, 0, None, None)
         return jax.vmap(self._differentiated, axes)(genotypes, weights, start, params)
 
@@ -283,6 +288,7 @@ class Episode:
                 call of the episode.
         """
         check_mixture(samples, sigma, tolerance)
+        require_key("key", key)
         return mixed_gradients(
             jax.vmap(self, (0, None, None))(genotypes, key, params),
             lambda around: self.gradient(around, key, params),
@@ -311,9 +317,13 @@ class Episode:
             mark gradients that were set to 0. Without gradients, it contains
             ``transitions`` if the episode returns them: the fields of QDax's
             ``QDTransition`` by name, (N, T, ...).
+
+        Raises:
+            TypeError: ``gradient`` is not a function.
         """
         if gradient is None:
             return self._score
+        checks.function("gradient", gradient, "a method that returns gradients")
         return lambda genotypes, key: gradient_scores(gradient(genotypes, key))
 
     @compiled_once
@@ -332,28 +342,6 @@ class Episode:
     ) -> EpisodeGradients:
         """Returns one episode with gradients of R sums; ``None``: of all components."""
         return differentiate(lambda x: self(x, start, params), genotype, weights)
-
-    def _check_first(self, first: Any) -> None:
-        """Checks the first state of an episode.
-
-        Raises:
-            TypeError: It is not a state.
-            ValueError: It is a state of several worlds, or lacks the state descriptor.
-        """
-        if not hasattr(first, "reward"):
-            allowed = "a key of jax.random, or a state of the environment"
-            raise TypeError(message("start", first, allowed))
-        if jnp.ndim(first.reward):
-            given = Fact(f"a state of a batch of shape {jnp.shape(first.reward)}")
-            allowed = "of one world, under jax.vmap for more"
-            raise ValueError(message("start", given, allowed))
-        described = self.descriptor_extractor is not None or self.transitions
-        if described and "state_descriptor" not in first.info:
-            given = Fact("states with no state descriptor")
-            allowed = (
-                "QD tasks, as ant_uni, or descriptor_extractor=None without transitions"
-            )
-            raise ValueError(message("env", given, allowed))
 
     def _plan(self, parameters: PyTree) -> jax.Array:
         """Returns open-loop actions (episode_length, nu).

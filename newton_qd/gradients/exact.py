@@ -9,6 +9,7 @@ from typing import Any, TypeAlias
 import jax
 import jax.numpy as jnp
 
+from newton_qd.checks import Fact, message
 from newton_qd.envs.state import select
 from newton_qd.gradients.outcome import Outcome
 from newton_qd.moved import moved_name
@@ -69,6 +70,9 @@ def differentiate(
         genotype: Genotype of the policy, or the actions.
         weights: (R, 1 + D) weights of one sum of fitness and descriptor in each row;
             ``None``: no sums, but the fitness and each component of the descriptor.
+
+    Raises:
+        ValueError: The weights have another number of columns.
     """
 
     def values(genotype: Genotype) -> tuple[jax.Array, Outcome]:
@@ -80,6 +84,9 @@ def differentiate(
     rows, pull, outcome = jax.vjp(values, genotype, has_aux=True)
     if weights is None:
         weights = jnp.eye(rows.size, dtype=rows.dtype)
+    if weights.shape[1] != rows.size:
+        given, allowed = Fact(f"{weights.shape[1]} columns"), f"1 + D = {rows.size}"
+        raise ValueError(message("weights", given, allowed))
     weights = split_as([rows], weights.astype(rows.dtype))
     (gradients,) = jax.vmap(pull)(weights)
     sound = finite_rows(gradients)

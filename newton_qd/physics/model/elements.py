@@ -28,6 +28,7 @@ _POINT = 1e-9
 
 _JOINT_TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating")
 _WITHOUT_AXIS = ("fixed", "floating")
+_SHORTEST = 1e-6  # of an axis: Newton divides by its length in single precision
 # Attributes that a shape must have. Newton uses 1 for a missing size.
 _SHAPES = {
     "sphere": ("radius",),
@@ -268,8 +269,9 @@ def _read_axis(reader: XmlReader, joint: ElementTree.Element) -> np.ndarray:
     if element is None:
         return np.array([1.0, 0.0, 0.0])
     axis = reader.numbers(element, "xyz", 3)
-    if not np.linalg.norm(axis) > 0:
-        raise reader.refused(element, "xyz", element.get("xyz"), "a direction")
+    if not np.linalg.norm(axis) > _SHORTEST:
+        allowed = f"a direction, longer than {_SHORTEST:g}"
+        raise reader.refused(element, "xyz", element.get("xyz"), allowed)
     return axis / np.linalg.norm(axis)
 
 

@@ -185,8 +185,8 @@ def _is_number(text: str) -> bool:
 
 
 def _drop_prefixed(element: ElementTree.Element) -> None:
-    """Removes names with a prefix: simulator extensions, and macros of xacro."""
-    for name in [name for name in element.attrib if ":" in name]:
+    """Removes namespaces, and names with a prefix: extensions, and macros of xacro."""
+    for name in [x for x in element.attrib if ":" in x or x == "xmlns"]:
         del element.attrib[name]
     for child in list(element):
         if ":" in child.tag:
