@@ -192,5 +192,9 @@ def test_wrong_runs_are_named(capsys: pytest.CaptureFixture[str]) -> None:
         assert cli.main([command, "ant", "--out", "no_folder/x.gif"]) == 2
         refused = "--out: got 'no_folder/x.gif', and no_folder is no folder; allowed: a"
         assert refused in capsys.readouterr().err
+    for command in ("explore", "replay"):  # a file of the run would be lost
+        assert cli.main([command, "ant", "--out", "config.json"]) == 2
+        refused = "--out: got 'config.json'; allowed: files that end with .html"
+        assert refused in capsys.readouterr().err
     assert cli.main(["explore", "a", "b", "c"]) == 2
     assert "DIR: got 3 folders; allowed: one folder or two" in capsys.readouterr().err

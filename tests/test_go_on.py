@@ -251,7 +251,8 @@ def test_wrong_archives_are_refused(reference: Path, tmp_path: Path) -> None:
         start_with(other, config)
     out = tmp_path / "run"
     run(SHORT, out=out)
-    with pytest.raises(ConfigError, match=r"warm_start: got .*; allowed: None, as the"):
+    refused = r"start_from: got genotypes with .*; allowed: no archive"
+    with pytest.raises(ConfigError, match=refused):
         start_with(reference, SHORT, out=out, resume=True)
 
 

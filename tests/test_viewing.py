@@ -167,6 +167,9 @@ def test_arrays_are_encoded() -> None:
     raw = np.frombuffer(base64.b64decode(short["data"]), "<i2")
     back = raw.reshape(-1, 3) * short["scale"] + short["offset"]
     assert np.abs(back - array.reshape(-1, 3)).max() < 8 / 65_535
+    nothing = html.encode(np.zeros((2, 0, 3)), "int16")  # an episode of one step
+    assert nothing["shape"] == [2, 0, 3] and nothing["data"] == ""
+    assert np.isfinite([*nothing["scale"], *nothing["offset"]]).all()
 
 
 def test_names_cannot_end_a_page(walk: Trajectory) -> None:

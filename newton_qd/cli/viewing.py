@@ -182,6 +182,7 @@ def replay(arguments: argparse.Namespace, task_factory: TaskFactory = None) -> i
             is neither a folder nor an environment of this name.
     """
     out = _target(arguments, "replay.html", ".html")
+    _check_page(out)
     from newton_qd.viewing import write_replay
 
     try:
@@ -208,6 +209,7 @@ def explore(arguments: argparse.Namespace, task_factory: TaskFactory = None) -> 
     if out is None:
         out = arguments.folders[0] / "explorer.html"
     _check_target(out, given=arguments.out is not None)
+    _check_page(out)
     runs = [_drawable(folder, task_factory) for folder in arguments.folders]
     from newton_qd.viewing import write_explorer
 
@@ -284,6 +286,16 @@ def _check_target(out: Path, *, given: bool) -> None:
     if given and not out.parent.is_dir():
         why = f"and {out.parent} is no folder"
         raise ConfigError(message("--out", str(out), "a file in a folder", why=why))
+
+
+def _check_page(out: Path) -> None:
+    """Checks that a page does not replace a file of another kind, such as a run's.
+
+    Raises:
+        ConfigError: The file does not end as a page does.
+    """
+    if out.suffix not in (".html", ".htm"):
+        raise ConfigError(message("--out", str(out), "files that end with .html"))
 
 
 def _trajectory(

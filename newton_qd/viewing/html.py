@@ -127,7 +127,9 @@ def encode(array: np.ndarray, kind: str = "float32") -> dict[str, Any]:
     found: dict[str, Any] = {"type": kind, "shape": list(array.shape)}
     if kind == "int16":
         flat = array.reshape(-1, array.shape[-1]).astype(np.float64)
-        low, high = flat.min(axis=0), flat.max(axis=0)
+        # an episode of one step has no rewards between two pictures
+        some = flat if len(flat) else np.zeros((1, flat.shape[1]))
+        low, high = some.min(axis=0), some.max(axis=0)
         offset = (low + high) / 2
         scale = np.maximum((high - low) / 2, 1e-9) / _LARGEST
         array = np.rint((flat - offset) / scale)

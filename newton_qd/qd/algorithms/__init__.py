@@ -26,6 +26,7 @@ from newton_qd.qd.algorithms.me_conditioned import ME_CONDITIONED
 from newton_qd.qd.algorithms.me_es import ME_ES
 from newton_qd.qd.algorithms.me_gradient import ME_GRADIENT
 from newton_qd.qd.algorithms.omg_mega import OMG_MEGA
+from newton_qd.qd.algorithms.options import check_fields
 from newton_qd.qd.algorithms.pga_me import PGA_ME
 from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext
 from newton_qd.qd.config import ConfigError
@@ -74,11 +75,13 @@ def register_algorithm(spec: AlgorithmSpec[Any]) -> None:
             dataclass of its options.
 
     Raises:
-        TypeError: ``spec`` is not an ``AlgorithmSpec``.
+        TypeError: ``spec`` is not an ``AlgorithmSpec``, or a field of its options has a
+            type that an option cannot have.
         ValueError: The name is in use, or is not text.
     """
     checks.instance("spec", spec, AlgorithmSpec, "an AlgorithmSpec")
     checks.text("spec.name", spec.name)
+    check_fields(spec.options)
     taken = [known.name for known in algorithms()]
     if spec.name in taken:
         allowed = f"any name but {listed(taken)}"

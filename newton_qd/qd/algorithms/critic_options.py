@@ -45,6 +45,18 @@ class CriticOptions(Options):
     policy_delay: int = 2
 
 
+def require_buffer(config: EvolveConfig, size: int) -> None:
+    """Checks that the replay buffer can hold the steps of a generation.
+
+    Raises:
+        ConfigError: It is too small.
+    """
+    steps = config.batch_size * config.starts * config.episode_length
+    if size < steps:
+        allowed = f"integers from {steps} (batch_size * starts * episode_length)"
+        raise ConfigError(message("options: replay_buffer_size", size, allowed))
+
+
 def require_batch_size(config: EvolveConfig, name: str, value: int | None) -> None:
     """Checks that an option does not change the size of a generation.
 

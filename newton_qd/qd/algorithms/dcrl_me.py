@@ -6,7 +6,7 @@ import dataclasses
 from typing import TYPE_CHECKING, Any
 
 from newton_qd.checks import listed, message
-from newton_qd.qd.algorithms.critic_options import CriticOptions
+from newton_qd.qd.algorithms.critic_options import CriticOptions, require_buffer
 from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext
 from newton_qd.qd.algorithms.variation import isoline, with_own_isoline
 from newton_qd.qd.config import ConfigError, EvolveConfig
@@ -60,7 +60,11 @@ class DCRLMEOptions(CriticOptions):
 
 
 def _make(context: EmitterContext, options: DCRLMEOptions) -> Any:
-    """DCRL-ME: critic and actor depend on the descriptor (Faldor et al. 2024)."""
+    """DCRL-ME: critic and actor depend on the descriptor (Faldor et al. 2024).
+
+    Raises:
+        ConfigError: The options do not fit the size of a generation.
+    """
     import jax
     import jax.numpy as jnp
 
@@ -75,6 +79,7 @@ def _make(context: EmitterContext, options: DCRLMEOptions) -> Any:
     from newton_qd.qd.algorithms.network_emitter import OfParameters
 
     config, task = context.config, context.task
+    require_buffer(config, options.replay_buffer_size)
     actor = MLPDC(
         layer_sizes=(*config.hidden, task.env.action_size),
         kernel_init=jax.nn.initializers.lecun_uniform(),

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from typing import Any, TypeVar
 
 from newton_qd import checks
-from newton_qd.checks import listed, message
+from newton_qd.checks import Fact, listed, message
 from newton_qd.qd.config import (
     ConfigError,
     EvolveConfig,
@@ -29,8 +29,9 @@ class Options:
     """Options of an algorithm; the base class has no options.
 
     A subclass is a frozen dataclass. Its docstring describes each field under
-    ``Attributes:``. Fields are numbers, booleans or tuples of integers. A default of
-    ``None`` means that the value follows from the settings of the run.
+    ``Attributes:``. Fields are numbers, booleans or tuples of integers; a user gives
+    none below 0. A default of ``None`` means that the value follows from the settings
+    of the run.
     """
 
     def check(self) -> None:
@@ -89,11 +90,31 @@ def read_options(
     return options
 
 
-def _without_none(hint: Any) -> Any:
-    """Returns the type in a union with ``None``; a user never gives ``None``."""
+def check_fields(kind: type[Options]) -> None:
+    """Checks the types of the fields of a user's options.
+
+    Raises:
+        TypeError: A field cannot be an option.
+    """
+    for name, hint in typing.get_type_hints(kind).items():
+        parts = _parts(hint)
+        wanted = parts[0] if len(parts) == 1 else hint
+        if wanted not in (float, int, bool) and wanted != tuple[int, ...]:
+            allowed = "float, int, bool or tuple[int, ...], each perhaps with None"
+            given = Fact(f"a field of type {hint}")
+            raise TypeError(message(f"options: {name}", given, allowed))
+
+
+def _parts(hint: Any) -> list[Any]:
+    """Returns the types in a union, without ``None``; a user never gives ``None``."""
     if typing.get_origin(hint) not in (typing.Union, types.UnionType):
-        return hint
-    (only,) = (part for part in typing.get_args(hint) if part is not types.NoneType)
+        return [hint]
+    return [part for part in typing.get_args(hint) if part is not types.NoneType]
+
+
+def _without_none(hint: Any) -> Any:
+    """Returns the type in a union with ``None``."""
+    (only,) = _parts(hint)
     return only
 
 

@@ -6,7 +6,11 @@ import dataclasses
 from typing import Any
 
 from newton_qd.checks import message
-from newton_qd.qd.algorithms.critic_options import CriticOptions, require_batch_size
+from newton_qd.qd.algorithms.critic_options import (
+    CriticOptions,
+    require_batch_size,
+    require_buffer,
+)
 from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext
 from newton_qd.qd.algorithms.variation import isoline, with_own_isoline
 from newton_qd.qd.config import ConfigError
@@ -43,6 +47,7 @@ def _make(context: EmitterContext, options: PGAMEOptions) -> Any:
 
     size = context.config.batch_size
     require_batch_size(context.config, "env_batch_size", options.env_batch_size)
+    require_buffer(context.config, options.replay_buffer_size)
     if not 0 < int(options.proportion_mutation_ga * size) < size:
         name = "options: proportion_mutation_ga"
         allowed = f"some individuals of batch_size = {size}, not all"

@@ -311,10 +311,10 @@ def _open(
     checkpoint, warnings = folder.restore(config, facts)
     for warning in warnings:
         display.note(warning)
-    done = 0 if checkpoint is None else checkpoint.iteration
-    display.note(
-        f"resuming {folder.path} after generation {done} of {config.iterations}"
-    )
+    done = "before the initial population"
+    if checkpoint is not None:
+        done = f"after generation {checkpoint.iteration} of {config.iterations}"
+    display.note(f"resuming {folder.path} {done}")
     return checkpoint
 
 

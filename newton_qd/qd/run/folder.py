@@ -197,6 +197,10 @@ class RunFolder:
         stored, facts = read_config(self.path / CONFIG)
         goes_on = algorithm_named(config.algorithm).goes_on
         for name, old, new in stored.differences(config):
+            if name == "warm_start":
+                begun = "no archive" if old is None else f"that with SHA-256 {old}"
+                given = "nothing" if new is None else f"genotypes with SHA-256 {new}"
+                raise self._other_run("start_from", begun, Fact(given))
             if name != "iterations":
                 raise self._other_run(name, repr(old), new)
             if config.iterations < stored.iterations:

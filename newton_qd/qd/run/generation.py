@@ -89,10 +89,14 @@ class Generation:
     ) -> tuple[Any, dict]:
         """Returns the archive with a generation added, and the emitter's arguments."""
         fitnesses, found, extra = scores
+        # an algorithm's own scores may be finite where the descriptor is not
+        sound = _sound(scores)
+        fitnesses = jnp.where(sound, fitnesses, -jnp.inf)
+        found = jnp.where(jnp.isfinite(found), found, 0)
         kept = _break_ties(fitnesses, found, repertoire.centroids)
         repertoire = repertoire.add(genotypes, found, kept, {})
         if not self.takes_faulty:
-            fitnesses = jnp.where(jnp.isfinite(fitnesses), fitnesses, -self.offset)
+            fitnesses = jnp.where(sound, fitnesses, -self.offset)
         return repertoire, {
             "repertoire": repertoire,
             "genotypes": genotypes,
@@ -110,17 +114,21 @@ class Generation:
         """
         from qdax.utils.metrics import default_qd_metrics
 
-        fitnesses, found, _ = scores
-        finite = jnp.isfinite(fitnesses) & jnp.all(jnp.isfinite(found), axis=1)
         metrics = default_qd_metrics(repertoire, qd_offset=self.offset)
         found = repertoire.fitnesses[:, 0]
         return {
             **metrics,
-            "rejected": jnp.sum(~finite),
+            "rejected": jnp.sum(~_sound(scores)),
             "mean_fitness": quality.mean_fitness(found),
             "initial_fitness": initial,
             "qd_gain": quality.qd_gain(found, initial),
         }
+
+
+def _sound(scores: PyTree) -> jax.Array:
+    """Returns whether fitness and descriptor of each individual are finite, (N,)."""
+    fitnesses, found, _ = scores
+    return jnp.isfinite(fitnesses) & jnp.all(jnp.isfinite(found), axis=1)
 
 
 def _strongly_typed(tree: PyTree) -> PyTree:

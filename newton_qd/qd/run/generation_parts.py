@@ -10,6 +10,7 @@ import jax
 from newton_qd.qd.algorithms import AlgorithmSpec, EmitterContext
 from newton_qd.qd.config import EvolveConfig
 from newton_qd.qd.run.generation import Generation
+from newton_qd.qd.scoring.checked import check_genotypes
 from newton_qd.qd.scoring.rollout import Policy
 from newton_qd.qd.scoring.task import Task
 from newton_qd.types import PyTree, ScoringFunction
@@ -79,8 +80,15 @@ class GenerationParts:
         )
 
     def propose(self, drawn: Drawn, *arguments: Any) -> PyTree:
-        """Returns the next genotypes, and the emitter's data about them."""
-        return self.of(drawn).propose(*arguments)
+        """Returns the next genotypes, and the emitter's data about them.
+
+        Raises:
+            ConfigError: The emitter proposes another number of individuals.
+        """
+        found = self.of(drawn).propose(*arguments)
+        shape = (self.config.batch_size, self.policy.size)
+        check_genotypes(found[0], self.algorithm.name, shape)
+        return found
 
     def begin(self, drawn: Drawn, *arguments: Any) -> PyTree:
         """Returns archive, emitter's state and metrics at the start."""

@@ -210,9 +210,12 @@ class Run:
             IndexError: A cell does not exist.
             LookupError: A cell is empty, or there is none.
             TypeError: ``keys`` are no keys.
+            ValueError: ``keys`` are none at all.
         """
         if keys is not None:
             require_key("keys", keys, several=True)
+            if keys.size == 0:
+                raise ValueError(message("keys", Fact("no keys"), "one or more"))
         alone = cell is not None and np.ndim(cell) == 0
         rows = self.cells if cell is None else np.atleast_1d(np.asarray(cell))
         if not len(rows):

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from newton_qd.qd.algorithms import ALGORITHMS, algorithm_named
 from newton_qd.qd.config import EvolveConfig
 from newton_qd.qd.extras import require_extra
 from newton_qd.qd.run.archive import Archive
@@ -67,8 +68,17 @@ def archive_figure(
         limits=task.limits,
         labels=task.labels,
         title=title,
-        fitness_label=f"fitness: return over {config.episode_length} control steps",
+        fitness_label=_fitness_label(config),
     )
+
+
+def _fitness_label(config: EvolveConfig) -> str:
+    """Says what the fitness of a run is."""
+    spec = algorithm_named(config.algorithm)
+    if spec.scoring is not None and spec not in ALGORITHMS:
+        return "fitness"  # a user's own
+    label = f"fitness: return over {config.episode_length} control steps"
+    return f"{label}, lowered by scatter" if config.scatter else label
 
 
 def plot_archive(

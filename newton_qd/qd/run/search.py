@@ -28,6 +28,7 @@ from newton_qd.qd.run.reevaluation import (
     corrected_fitnesses,
     reevaluate,
 )
+from newton_qd.qd.scoring.checked import checked_scoring, why_empty
 from newton_qd.qd.scoring.networks import policy_for
 from newton_qd.qd.scoring.robust import robust, run_scoring
 from newton_qd.qd.scoring.rollout import (
@@ -181,7 +182,12 @@ class Search:
             **{name: float(value) for name, value in metrics.items()},
         }
         if row["coverage"] == 0:
-            raise SearchError(self._emptiness(genotypes))
+            # scores do not say why: the fitness is -inf for all reasons
+            length = self._config.episode_length
+            episode = episode_of(self._task, self._policy, length)
+            found = jax.jit(jax.vmap(episode, (0, None)))(genotypes, self._key_reset)
+            own = self._algorithm.name if self._algorithm.scoring else None
+            raise SearchError(why_empty(found, own))
         rows = np.vstack([state.metrics, [row[name] for name in COLUMNS]])
         return SearchState(iteration, repertoire, rows, emitter)
 
@@ -230,22 +236,6 @@ class Search:
             # gradients of an emitter follow one episode
             alone = spec.gradients(self._config, self.options)
         return (episodes - alone) * self._config.starts + alone
-
-    def _emptiness(self, genotypes: jax.Array) -> str:
-        """Returns the text of the error about genotypes that no archive takes."""
-        # scores do not say why: the fitness is -inf for all reasons
-        length = self._config.episode_length
-        episode = episode_of(self._task, self._policy, length)
-        found = jax.jit(jax.vmap(episode, (0, None)))(genotypes, self._key_reset)
-        returns = ~np.isfinite(found.reward_sum)
-        descriptors = ~np.isfinite(found.descriptor).all(axis=-1)
-        faults = np.asarray(found.faulty) & ~returns & ~descriptors
-        return (
-            "no individual of the initial population has a finite return and "
-            f"descriptor: of {len(returns)} individuals, the return is not finite in "
-            f"{returns.sum()}, the descriptor is not finite in {descriptors.sum()}, "
-            f"and the physics had a fault in {faults.sum()}"
-        )
 
     def checkpoint(self, state: SearchState) -> Checkpoint:
         """Copies a state to the host."""
@@ -354,6 +344,8 @@ class Search:
         score = self._algorithm.scoring(
             self._config, self.options, self._task, self._policy
         )
+        name, measures = self._algorithm.name, self._task.descriptor_length
+        score = checked_scoring(score, name, measures)
         return self._split(robust(score, self._config, self._task))
 
     def _plain_scoring(self) -> ScoringFunction:

@@ -16,7 +16,10 @@ from newton_qd.qd.config import ConfigError, EvolveConfig
 from newton_qd.robots import ROBOTS, Material
 from newton_qd.scenes import SCENES, Scene
 
-_OWN = ("auto_reset", "batch_size", "brax_views", "episode_length", "eval_metrics")
+_OWN = (
+    *("auto_reset", "batch_size", "brax_views", "env_name", "episode_length"),
+    "eval_metrics",
+)
 """Arguments of ``create`` that are not for the settings of a run."""
 
 

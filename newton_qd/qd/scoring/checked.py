@@ -1,0 +1,97 @@
+"""Checks of scores, and of what an algorithm of a user gives to the search."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from newton_qd.checks import Fact, message
+from newton_qd.gradients.outcome import Outcome
+from newton_qd.qd.config import ConfigError
+from newton_qd.types import ExtraScores, Genotype, RNGKey, ScoringFunction
+
+
+def checked_scoring(
+    score: ScoringFunction, algorithm: str, measures: int
+) -> ScoringFunction:
+    """Returns a scoring function whose results have the right shapes.
+
+    JAX would broadcast a descriptor of another length into the archive.
+
+    Args:
+        score: Scoring function of an algorithm.
+        algorithm: Name of the algorithm, for the error.
+        measures: Length D of the descriptor.
+
+    Returns:
+        The same function. It raises ``ConfigError`` if the results are not fitnesses
+        (N,), descriptors (N, D) and a dictionary.
+    """
+    name = f"scoring function of {algorithm!r}"
+
+    def scored(
+        genotypes: Genotype, key: RNGKey
+    ) -> tuple[jax.Array, jax.Array, ExtraScores]:
+        found = score(genotypes, key)
+        allowed = "fitnesses (N,), descriptors (N, D) and a dictionary"
+        if not isinstance(found, tuple) or len(found) != 3:
+            count = f" of {len(found)}" if isinstance(found, tuple) else ""
+            given = Fact(f"a {type(found).__name__}{count}")
+            raise ConfigError(message(name, given, allowed))
+        number = len(jax.tree.leaves(genotypes)[0])
+        for what, values, shape in (
+            ("fitnesses", found[0], (number,)),
+            ("descriptors", found[1], (number, measures)),
+        ):
+            if jnp.shape(values) != shape:
+                given = Fact(f"shape {jnp.shape(values)}")
+                raise ConfigError(message(f"{name}: {what}", given, f"shape {shape}"))
+        if not isinstance(found[2], dict):
+            given = Fact(f"a {type(found[2]).__name__} in the last place")
+            raise ConfigError(message(name, given, allowed))
+        return found
+
+    return scored
+
+
+def check_genotypes(
+    genotypes: jax.Array, algorithm: str, shape: tuple[int, int]
+) -> None:
+    """Checks what an emitter proposes.
+
+    Args:
+        genotypes: The individuals.
+        algorithm: Name of the algorithm, for the error.
+        shape: Individuals of a generation and weights of each.
+
+    Raises:
+        ConfigError: They have another shape.
+    """
+    if genotypes.shape != shape:
+        name, given = f"emitter of {algorithm!r}", "genotypes of shape"
+        allowed = f"{shape}: batch_size individuals, and the weights of each"
+        raise ConfigError(message(name, Fact(f"{given} {genotypes.shape}"), allowed))
+
+
+def why_empty(found: Outcome, own: str | None) -> str:
+    """Returns the text of the error about individuals that no archive takes.
+
+    Args:
+        found: Their episodes, leaves (N, ...).
+        own: Name of the algorithm, if it has a scoring function of its own.
+    """
+    returns = ~np.isfinite(np.asarray(found.reward_sum))
+    descriptors = ~np.isfinite(np.asarray(found.descriptor)).all(axis=-1)
+    faults = np.asarray(found.faulty) & ~returns & ~descriptors
+    if own is not None and not (returns | descriptors | faults).all():
+        return (
+            f"the scoring function of {own!r} gives no individual of the initial "
+            "population a finite fitness and descriptor"
+        )
+    return (
+        "no individual of the initial population has a finite return and "
+        f"descriptor: of {len(returns)} individuals, the return is not finite in "
+        f"{returns.sum()}, the descriptor is not finite in {descriptors.sum()}, "
+        f"and the physics had a fault in {faults.sum()}"
+    )

@@ -1,0 +1,154 @@
+"""What the search says of an algorithm of a user that is not right."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from newton_qd.qd import EvolveConfig, Options, algorithms, make_task
+from newton_qd.qd.algorithms.me import ME
+from newton_qd.qd.config import ConfigError
+from newton_qd.qd.run.folder import COLUMNS
+from newton_qd.qd.run.plot import _fitness_label
+from newton_qd.qd.run.search import Search, SearchError
+from newton_qd.qd.scoring.task import Task
+
+SETTINGS = EvolveConfig(
+    env_name="pointmaze",
+    algorithm="own",
+    batch_size=8,
+    centroids=16,
+    episode_length=4,
+    hidden=(4,),
+    iterations=2,
+)
+Scores = tuple[jax.Array, jax.Array, dict[str, Any]]
+
+
+@pytest.fixture(scope="module")
+def task() -> Task:
+    return make_task(SETTINGS)
+
+
+@pytest.fixture(autouse=True)
+def forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(algorithms, "_REGISTERED", {})
+
+
+def search(task: Task, change: Callable[[Scores], Any]) -> Search:
+    """A search whose scores are made up, and then changed."""
+
+    def scoring(*_: Any) -> Any:
+        def score(genotypes: jax.Array, key: jax.Array) -> Any:
+            del key
+            scores = jnp.sum(genotypes, axis=1), jnp.clip(genotypes[:, :2], -1, 1), {}
+            return change(scores)
+
+        return score
+
+    spec = dataclasses.replace(ME, name="own", scoring=scoring)
+    algorithms.register_algorithm(spec)
+    return Search(SETTINGS, task)
+
+
+def test_a_descriptor_that_is_not_finite_enters_no_archive(task: Task) -> None:
+    """Its fitness is finite, so only the descriptor says that it is rejected."""
+
+    def change(scores: Scores) -> Scores:
+        fitnesses, found, extra = scores
+        return fitnesses.at[:3].set(1e3), found.at[:3, 1].set(jnp.inf), extra
+
+    one = search(task, change)
+    state = one.advance(one.advance(one.empty()))
+    held = one.checkpoint(state)
+    filled = jnp.isfinite(held.fitnesses)
+    assert filled.any() and held.fitnesses[filled].max() < 1e3
+    assert jnp.isfinite(held.descriptors[filled]).all()
+    assert held.metrics[:, COLUMNS.index("rejected")].tolist() == [3, 3]
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (lambda s: (s[0], s[1][:, :1], s[2]), "descriptors: got shape (8, 1); allowed"),
+        (lambda s: (s[0][:, None], *s[1:]), "fitnesses: got shape (8, 1); allowed: sh"),
+        (lambda s: s[:2], "'own': got a tuple of 2; allowed: fitnesses (N,), desc"),
+        (lambda s: (*s[:2], None), "got a NoneType in the last place; allowed: fitne"),
+    ],
+)
+def test_scores_of_a_wrong_shape_are_refused(
+    change: Callable[[Scores], Any], text: str, task: Task
+) -> None:
+    one = search(task, change)
+    with pytest.raises(ConfigError, match=re.escape(text)):
+        one.advance(one.empty())
+
+
+def test_scores_that_are_never_finite(task: Task) -> None:
+    one = search(task, lambda s: (s[0] * jnp.nan, *s[1:]))
+    with pytest.raises(SearchError, match="function of 'own' gives no individual of"):
+        one.advance(one.empty())
+
+
+def test_an_emitter_that_proposes_fewer_is_refused(task: Task) -> None:
+    def make(context: Any, options: Any) -> Any:
+        emitter = ME.make(context, options)
+
+        class Fewer(type(emitter)):
+            def emit(self, *arguments: Any) -> Any:
+                genotypes, extra = emitter.emit(*arguments)
+                return genotypes[:3], extra
+
+        made = object.__new__(Fewer)
+        made.__dict__.update(vars(emitter))
+        return made
+
+    algorithms.register_algorithm(dataclasses.replace(ME, name="own", make=make))
+    one = Search(SETTINGS, task)
+    state = one.advance(one.empty())
+    with pytest.raises(ConfigError, match=r"'own': got genotypes of shape \(3, \d+\)"):
+        one.advance(state)
+
+
+def test_options_have_types_that_a_command_line_can_give() -> None:
+    @dataclasses.dataclass(frozen=True, kw_only=True)
+    class Named(Options):
+        mode: str = "a"
+
+    @dataclasses.dataclass(frozen=True, kw_only=True)
+    class Good(Options):
+        size: int | None = None
+        rate: float = 0.5
+        hidden: tuple[int, ...] = (4,)
+        fast: bool = False
+
+    def register(options: type[Options]) -> None:
+        spec = dataclasses.replace(ME, name=options.__name__, options=options)
+        algorithms.register_algorithm(spec)
+
+    with pytest.raises(TypeError, match="mode: got a field of type <class 'str'>; all"):
+        register(Named)
+    register(Good)
+    assert [spec.name for spec in algorithms.algorithms()][-1] == "Good"
+
+
+@pytest.mark.parametrize("name", ["pga-me", "dcrl-me"])
+def test_a_buffer_that_is_too_small_is_refused(name: str, task: Task) -> None:
+    small = {"algorithm": name, "options": {"replay_buffer_size": 63}}
+    with pytest.raises(ConfigError, match="size: got 63; allowed: integers from 64 "):
+        Search(SETTINGS.replace(**small, starts=2), task)
+
+
+def test_the_label_of_a_picture_says_what_the_fitness_is(task: Task) -> None:
+    search(task, lambda scores: scores)
+    assert _fitness_label(SETTINGS) == "fitness"
+    label = "fitness: return over 4 control steps"
+    assert _fitness_label(SETTINGS.replace(algorithm="me")) == label
+    scattered = SETTINGS.replace(algorithm="me", starts=2, scatter=1.0)
+    assert _fitness_label(scattered) == f"{label}, lowered by scatter"
