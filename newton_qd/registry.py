@@ -266,6 +266,7 @@ def create(
         )
         allowed = "an episode length, or None with 1 and False"
         raise ValueError(message("episode_length", given, allowed))
+    checks.integer("batch_size", batch_size, least=0, optional=True)
     env = _base(env_name, spec, material, kwargs)
     if fixed_init_state:
         fixed = (

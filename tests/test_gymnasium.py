@@ -128,6 +128,11 @@ def test_worlds_of_a_vector_begin_as_single_ones() -> None:
     assert np.array_equal(observations, [one.reset(seed=5 + n)[0] for n in range(3)])
     observations, _ = many.reset(seed=[9, 1, 4])
     assert np.array_equal(observations, [one.reset(seed=n)[0] for n in (9, 1, 4)])
+    for seeds in ([1.5, 2, 3], [None, 1, 2], [1, 2]):
+        with pytest.raises(ValueError, match=r"seed: got .*; allowed: an integer, or"):
+            many.reset(seed=seeds)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="num_envs: got 0; allowed: integers from 1"):
+        make_gymnasium_vector("pointmaze", 0)
 
 
 @pytest.mark.parametrize("mode", [NEXT, SAME, OFF])

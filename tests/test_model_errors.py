@@ -46,6 +46,16 @@ BAD_FILES = {
         r"<mass>: value: got '-1'; allowed: pos",
     ),
     "zero mass": ('value="10.0"', 'value="0"', r"<mass>: value: got '0'; allowed: pos"),
+    "two masses": (
+        "</inertial>",
+        "</inertial><inertial/>",
+        r"<inertial>: second <inertial> of this link",
+    ),
+    "underscore": (
+        '<mass value="10.0"/>',
+        '<mass value="1_0"/>',
+        r"got '1_0'; allowed",
+    ),
     "no mass": ('<mass value="10.0"/>', "", r"<inertial>: element <mass> is missing"),
     "no moment": ('iyy="1.0"', "", r"<inertia>: attribute 'iyy' is missing"),
     "inertia": (

@@ -168,6 +168,11 @@ def test_keywords_reach_the_environment() -> None:
         newton_qd.create("pointmaze", zone=1)
 
 
+def test_batches_that_do_not_exist() -> None:
+    with pytest.raises(ValueError, match="batch_size: got -3; allowed: None, or int"):
+        newton_qd.create("pointmaze", batch_size=-3)
+
+
 def test_create_fn_is_lazy() -> None:
     make = newton_qd.create_fn("ant_uni", episode_length=5)
     assert make(batch_size=2).batch_size == 2  # pyright: ignore

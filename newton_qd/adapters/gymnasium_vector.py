@@ -89,6 +89,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         """
         if max_episode_steps is not None:
             options["episode_length"] = max_episode_steps
+        checks.integer("num_envs", num_envs)
         world = one_world(env, options)
         if autoreset_mode not in (*AutoresetMode, *(m.value for m in AutoresetMode)):
             allowed = checks.listed([mode.value for mode in AutoresetMode])
@@ -130,7 +131,8 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
             Observations (num_envs, no) and info.
 
         Raises:
-            ValueError: The mask or the seeds have the wrong shape.
+            ValueError: The mask or the seeds have the wrong shape, or a seed is not an
+                integer.
             gymnasium.error.ResetNeeded: There is a mask, and there was no reset.
         """
         seeds = None
@@ -139,7 +141,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
             seeds = (
                 np.asarray(seed) if several else int(seed) + np.arange(self.num_envs)
             )
-            if seeds.shape != (self.num_envs,):
+            if seeds.shape != (self.num_envs,) or seeds.dtype.kind not in "iu":
                 allowed = f"an integer, or {self.num_envs} integers"
                 raise ValueError(message("seed", seed, allowed))
             super().reset(seed=int(seeds[0]))

@@ -163,9 +163,12 @@ def read_link(reader: XmlReader, element: ElementTree.Element) -> Link:
 
 def _read_inertial(reader: XmlReader, link: ElementTree.Element, name: str) -> Link:
     """Returns a link with the mass, the centre and the inertia of the element."""
-    inertial = link.find("inertial")
-    if inertial is None:
+    found = link.findall("inertial")
+    if len(found) > 1:
+        raise reader.error(found[1], "second <inertial> of this link")
+    if not found:
         return Link(name, 0.0, np.zeros(3), np.zeros((3, 3)), ())
+    inertial = found[0]
     mass_element = reader.child(inertial, "mass")
     element = reader.child(inertial, "inertia")
     inertia = np.empty((3, 3))

@@ -153,7 +153,9 @@ class XmlReader:
         if text is None:
             raise self.error(element, f"attribute {key!r} is missing")
         try:
-            values = np.array([float(part) for part in text.split()])
+            # Python reads 1_0 as 10, which is no number elsewhere
+            parts = [] if "_" in text else text.split()
+            values = np.array([float(part) for part in parts])
         except ValueError:
             values = np.empty(0)
         valid = np.abs(values) <= LARGEST if finite else ~np.isnan(values)
