@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import re
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,7 @@ from newton_qd.qd.run.folder import COLUMNS
 from newton_qd.qd.run.opened import Run
 from newton_qd.qd.run.reevaluation import Reevaluated
 from newton_qd.viewing import record, write_explorer
+from newton_qd.viewing.elites import record_elites
 from newton_qd.viewing.explorer import explorer_html
 
 __all__ = ["chrome", "pages"]  # fixtures
@@ -28,10 +31,14 @@ HOSTILE = "</script><script>window.hacked=1</script>\u202e"
 
 
 def opened(
-    name: str, dimensions: int, grid: tuple[int, ...] | None, seed: int = 0
+    name: str,
+    dimensions: int,
+    grid: tuple[int, ...] | None,
+    seed: int = 0,
+    steps: int = STEPS,
 ) -> Run:
     """A run of the point maze without an evolution: its policies are one action."""
-    env: Any = newton_qd.create("pointmaze", episode_length=STEPS, auto_reset=False)
+    env: Any = newton_qd.create("pointmaze", episode_length=steps, auto_reset=False)
     rng = np.random.default_rng(seed)
     limits = np.zeros(dimensions), np.ones(dimensions)
     if grid is None:
@@ -69,7 +76,7 @@ def opened(
     )
     config = EvolveConfig(
         env_name="pointmaze",
-        episode_length=STEPS,
+        episode_length=steps,
         hidden=(),
         grid=grid,
         centroids=None if grid else cells,
@@ -139,6 +146,13 @@ def test_a_click_shows_the_elite(kind: str, pages: Pages, tmp_path: Path) -> Non
     assert (page.evaluate(height) - before) * (0.5 - before) > 0
     shown = page.evaluate("NQD.maps[0].selected")
     assert f"cell {run.cells[shown]}," in page.inner_text("#facts")
+    # the keys of a control are its own
+    slider = page.locator("#maps input[type=range]")
+    slider.focus()
+    least = float(slider.input_value())
+    page.keyboard.press("ArrowRight")
+    assert float(slider.input_value()) > least
+    assert page.evaluate("NQD.maps[0].selected") == shown
 
 
 @pytest.mark.slow
@@ -175,6 +189,32 @@ def test_two_runs_filter_colour_and_hostile_names(pages: Pages, tmp_path: Path) 
         page.locator(".tools button").first.click()
     stored = info.value.path().read_text(encoding="utf-8")
     assert f'"cell":{runs[0].best()[0].cell}' in stored and '"genotype":[' in stored
+
+
+def test_scenes_are_not_mixed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The page has one drawing: a robot would move among walls that it never had."""
+    runs = [opened("grid", 2, (5, 4), seed) for seed in (0, 1)]
+    assert explorer_html(runs)
+    recorded = []
+
+    def record(*arguments: Any, **options: Any) -> Any:
+        found = record_elites(*arguments, **options)
+        shapes = found.drawing.shapes[: -len(recorded) or None]
+        recorded.append(found)
+        drawing = dataclasses.replace(found.drawing, shapes=shapes)
+        return dataclasses.replace(found, drawing=drawing)
+
+    monkeypatch.setattr("newton_qd.viewing.explorer.record_elites", record)
+    with pytest.raises(ValueError, match=r"runs: got .*; allowed: .*same scene"):
+        explorer_html(runs)
+
+
+@pytest.mark.parametrize(("steps", "every"), [(1, 1), (6, 2), (7, 1)])
+def test_the_last_step_is_seen(steps: int, every: int) -> None:
+    text = explorer_html([opened("grid", 2, (5, 4), steps=steps)])
+    found = re.search(r'"every": ?(\d+), ?"lengths": ?\[(\d+)', text)
+    assert found is not None
+    assert [int(x) for x in found.groups()] == [every, steps // every]
 
 
 def test_a_large_archive_is_thinned(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -36,6 +36,7 @@ from newton_qd.viewing import (
 )
 from newton_qd.viewing.drawing import body_frames, drawing_of_system
 from newton_qd.viewing.trajectory import Trajectory
+from newton_qd.viewing.video import _durations
 
 __all__ = ["compile_once", "reference"]  # fixtures
 PAGES = Path(newton_qd.__file__).parent / "viewing" / "pages"
@@ -256,6 +257,22 @@ def test_render_refuses_what_it_would_ignore(
 ) -> None:
     assert cli.main(["render", "ant", *arguments]) == 2
     assert message in capsys.readouterr().err
+
+
+def test_a_gif_has_the_speed_of_its_rate() -> None:
+    """Its unit is a hundredth of a second, and errors must not add up."""
+    for rate in (7.0, 20.0, 30.0, 50.0):
+        found = _durations(90, rate)
+        assert abs(sum(found) - 1000 * 90 / rate) <= 5
+        assert all(x % 10 == 0 and abs(x - 1000 / rate) < 10 for x in found)
+
+
+@pytest.mark.parametrize("rate", [0.001, 60.0])
+def test_a_gif_cannot_have_any_rate(
+    rate: float, walk: Trajectory, tmp_path: Path
+) -> None:
+    with pytest.raises(ValueError, match=r"rate of a GIF: got .*; allowed: .* 50"):
+        render(walk, tmp_path / "a.gif", rate=rate)
 
 
 def test_moments_beyond_the_end_are_refused(walk: Trajectory, tmp_path: Path) -> None:

@@ -120,6 +120,18 @@ class Drawing:
         """Distance of the lines on the ground [m]."""
         return 1.0 if self.radius > _SMALL else 0.1
 
+    def shows(self, other: Drawing) -> bool:
+        """Whether another robot and its scene look the same; colours may differ."""
+
+        def seen(drawing: Drawing) -> tuple:
+            shapes = [
+                (x.body, x.kind, x.frame.tolist(), x.size.tolist())
+                for x in drawing.shapes
+            ]
+            return drawing.body_names, sorted(shapes)
+
+        return seen(self) == seen(other)
+
 
 def body_frames(drawing: Drawing, q: np.ndarray) -> np.ndarray:
     """Returns the world frames of the bodies.

@@ -44,11 +44,13 @@ def explorer_html(
 ) -> str:
     """Returns a page that shows the archives of one run or two runs.
 
-    It has the motion of the elites at half rate. If the page would be larger than
+    It has the motion of the elites at half rate, or at full rate if a number of control
+    steps is odd. If the page would be larger than
     10 MB, only some elites move, and the page says so.
 
     Args:
-        runs: One run or two of the same robot, from ``newton_qd.qd.load_run(DIR)``.
+        runs: One run or two of the same robot in the same scene, from
+            ``newton_qd.qd.load_run(DIR)``.
         starts: Other start states that each elite is evaluated from; 0: none. The page
             then compares these fitnesses with those of the archive.
         seed: Seed of these start states.
@@ -56,8 +58,8 @@ def explorer_html(
 
     Raises:
         TypeError: The environment cannot be drawn, or ``runs`` is no list of runs.
-        ValueError: There are not one or two runs, an archive is empty, the robots
-            differ, or a number is not allowed.
+        ValueError: There are not one or two runs, an archive is empty, the robots or
+            their scenes differ, or a number is not allowed.
     """
     checks.integer("starts", starts, least=0)
     checks.integer("seed", seed, least=0)
@@ -72,7 +74,11 @@ def explorer_html(
         if not len(run.cells):
             name = f"archive of {run.path}"
             raise ValueError(message(name, Fact("no elite"), "at least one"))
-    chosen = [_moving(run, _LARGEST_PAGE / len(runs) - _FIXED) for run in runs]
+    # half rate would lose the last step of an episode of an odd length
+    odd = any(run.config.episode_length % _EVERY for run in runs)
+    every = 1 if odd else _EVERY
+    budget = _LARGEST_PAGE / len(runs) - _FIXED
+    chosen = [_moving(run, budget, every) for run in runs]
     total, before = sum(map(len, chosen)), 0
     found, first = [], None
     for run, cells in zip(runs, chosen, strict=True):
@@ -86,14 +92,14 @@ def explorer_html(
         before += len(cells)
         if first is None:
             first = trajectory
-        _check_same(first, trajectory)
-        found.append(_run_data(run, cells, trajectory, starts, seed))
+        _check_same(first, trajectory, [run.config.env_name for run in runs])
+        found.append(_run_data(run, cells, trajectory, every, starts, seed))
     assert first is not None
     title = " and ".join(dict.fromkeys(run.config.env_name for run in runs))
     data = {
         "title": title,
         "drawing": drawing_data(first.drawing),
-        "dt": first.dt * _EVERY,
+        "dt": first.dt * every,
         "unit": " s" if first.dt != 1.0 else " steps",
         "runs": found,
     }
@@ -111,7 +117,7 @@ def write_explorer(
     """Writes the page of :func:`explorer_html`. It opens from the disk.
 
     Args:
-        runs: One run or two runs of the same robot.
+        runs: One run or two runs of the same robot in the same scene.
         path: The HTML file; it is replaced if it exists.
         starts: Other start states that each elite is evaluated from; 0: none.
         seed: Seed of these start states.
@@ -122,8 +128,8 @@ def write_explorer(
 
     Raises:
         TypeError: The environment cannot be drawn, or ``runs`` is no list of runs.
-        ValueError: There are not one or two runs, an archive is empty, the robots
-            differ, or a number is not allowed.
+        ValueError: There are not one or two runs, an archive is empty, the robots or
+            their scenes differ, or a number is not allowed.
         OSError: The file cannot be written.
     """
     target = Path(path)
@@ -132,27 +138,28 @@ def write_explorer(
     return target
 
 
-def _check_same(first: Trajectory, other: Trajectory) -> None:
+def _check_same(first: Trajectory, other: Trajectory, names: list[str]) -> None:
     """Checks that two runs can be seen in one page.
 
     Raises:
-        ValueError: The robots or the durations of a step differ.
+        ValueError: The robots, their scenes or the durations of a step differ.
     """
-    same = first.drawing.body_names == other.drawing.body_names
-    if not same or first.dt != other.dt:
-        given = Fact(f"{first.drawing.name} and {other.drawing.name}")
-        raise ValueError(message("runs", given, "two runs of the same robot"))
+    if not first.drawing.shows(other.drawing) or first.dt != other.dt:
+        given = Fact(" and ".join(names))
+        allowed = "two runs of the same robot in the same scene"
+        raise ValueError(message("runs", given, allowed))
 
 
-def _moving(run: Run, budget: float) -> np.ndarray:
+def _moving(run: Run, budget: float, every: int) -> np.ndarray:
     """Returns the cells whose elites move in the page: all, or as many as fit.
 
     Args:
         run: The run.
         budget: Size of their motion [bytes].
+        every: Steps between two frames of the page.
     """
     env = run.task.env.unwrapped
-    frames = run.config.episode_length // _EVERY + 1
+    frames = run.config.episode_length // every + 1
     system = getattr(env, "system", None)
     numbers = (2, 0) if system is None else (system.nq, len(system.feet))
     # int16 for coordinates and reward, a byte for each foot
@@ -168,7 +175,12 @@ def _moving(run: Run, budget: float) -> np.ndarray:
 
 
 def _run_data(
-    run: Run, cells: np.ndarray, trajectory: Trajectory, starts: int, seed: int
+    run: Run,
+    cells: np.ndarray,
+    trajectory: Trajectory,
+    every: int,
+    starts: int,
+    seed: int,
 ) -> dict[str, Any]:
     """Returns a run as a JSON value."""
     low, high = (np.asarray(ends, float) for ends in run.task.limits)
@@ -200,7 +212,7 @@ def _run_data(
             f"QD score {again.qd_score:,.0f}, coverage {again.coverage:.1f} %, "
             f"best fitness {again.max_fitness:.1f}"
         ],
-        "motion": _motion_data(trajectory),
+        "motion": _motion_data(trajectory, every),
         "genotypes": _genotypes(run),
     }
 
@@ -263,18 +275,18 @@ def _metrics(
     return found
 
 
-def _motion_data(trajectory: Trajectory) -> dict[str, Any]:
-    """Returns the motion of elites at half rate as a JSON value."""
-    q = trajectory.q[:, ::_EVERY]
+def _motion_data(trajectory: Trajectory, every: int) -> dict[str, Any]:
+    """Returns the motion of elites as a JSON value, one frame for some steps."""
+    q = trajectory.q[:, ::every]
     frames = q.shape[1]
     steps = np.arange(trajectory.steps)
     valid = steps < trajectory.lengths[:, None]
     rewards = np.where(valid, trajectory.rewards, 0.0)
     feet = trajectory.feet[:, 1:] > 0
-    missing = (-trajectory.steps) % _EVERY
+    missing = (-trajectory.steps) % every
     rewards = np.pad(rewards, [(0, 0), (0, missing)])
     feet = np.pad(feet, [(0, 0), (0, missing), (0, 0)])
-    shape = (len(q), rewards.shape[1] // _EVERY, _EVERY)
+    shape = (len(q), rewards.shape[1] // every, every)
     summed = rewards.reshape(shape).sum(axis=-1)[:, : frames - 1]
     # in how many of the steps between two frames a foot touches the ground
     touched = feet.reshape(*shape, feet.shape[-1]).sum(axis=2)[:, : frames - 1]
@@ -282,6 +294,6 @@ def _motion_data(trajectory: Trajectory) -> dict[str, Any]:
         "q": encode(q, "int16"),
         "rewards": encode(summed[..., None], "int16"),
         "feet": encode(touched, "uint8"),
-        "every": _EVERY,
-        "lengths": (trajectory.lengths // _EVERY).tolist(),
+        "every": every,
+        "lengths": (trajectory.lengths // every).tolist(),
     }

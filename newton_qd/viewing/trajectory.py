@@ -140,16 +140,16 @@ def joined(trajectories: list[Trajectory]) -> Trajectory:
         trajectories: At least one. Contacts are kept if all have them.
 
     Raises:
-        ValueError: There is none, or the robots or the durations of a step differ.
+        ValueError: There is none, or the robots, their scenes or the durations of a
+            step differ.
     """
     if not trajectories:
         raise ValueError(message("trajectories", Fact("none"), "at least one"))
     first = trajectories[0]
     for other in trajectories[1:]:
-        same = other.drawing.body_names == first.drawing.body_names
-        if not same or other.dt != first.dt:
+        if not first.drawing.shows(other.drawing) or other.dt != first.dt:
             given = Fact(f"{first.drawing.name} and {other.drawing.name}")
-            allowed = "one robot with one duration of a step"
+            allowed = "one robot in one scene with one duration of a step"
             raise ValueError(message("trajectories", given, allowed))
     steps = max(one.steps for one in trajectories)
 

@@ -20,6 +20,7 @@ from newton_qd.viewing.trajectory import Trajectory
 FORMATS = (".png", ".gif", ".mp4")
 _RATE = 20.0  # pictures per second of a GIF or video
 _COLORS = 48  # of a GIF
+_SLOWEST, _FASTEST = 0.01, 50.0  # pictures per second of a GIF
 
 
 def require(ending: str) -> None:
@@ -58,7 +59,7 @@ def render(
         height: Height of the picture of one world [px].
         time: Moment of a picture [s], up to the end of the longest episode; ``None``:
             the middle. Only for ``.png``.
-        rate: Pictures per second of a GIF or a video [1/s].
+        rate: Pictures per second of a GIF or a video [1/s]; of a GIF 0.01 to 50.
         zoom: Size of the robot in the picture; 1: as in the pages.
         elevation: Angle of the view above the ground [deg]; ``None``: as in the pages.
         progress: Called after each picture with its number from 1 and their count.
@@ -78,6 +79,9 @@ def render(
     ending = target.suffix.lower()
     if ending not in FORMATS:
         raise ValueError(message("path", str(path), f"files with {listed(FORMATS)}"))
+    if ending == ".gif":
+        # it has hundredths of a second, and browsers slow down below two of them
+        checks.number("rate of a GIF", rate, least=_SLOWEST, most=_FASTEST)
     checks.number("rate", rate, above=0)
     last = int(trajectory.lengths.max())
     _check_time(time, ending, last * trajectory.dt)
@@ -146,10 +150,20 @@ def _write_images(
         format="GIF",
         save_all=True,
         append_images=small[1:],
-        duration=round(1000 / rate),
+        duration=_durations(len(small), rate),
         loop=0,
         optimize=True,
     )
+
+
+def _durations(count: int, rate: float) -> list[int]:
+    """Returns how long a GIF shows each picture [ms].
+
+    The file has hundredths of a second, so the ends of the pictures are rounded, and
+    errors do not add up.
+    """
+    ends = np.rint(100.0 * np.arange(count + 1) / rate)
+    return (10 * np.diff(ends)).astype(int).tolist()
 
 
 def _write_video(found: Iterable[np.ndarray], path: Path, rate: float) -> None:

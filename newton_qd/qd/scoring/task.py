@@ -228,5 +228,6 @@ def _labels(env: Any, length: int) -> tuple[str, ...]:
     if env.state_descriptor_name == "feet_contact":
         return tuple(f"{foot} contact" for foot in env.unwrapped.robot.feet)
     if env.state_descriptor_name == "xy_position" and length == 2:
-        return ("final x [m]", "final y [m]")
+        unit = "m" if hasattr(env.unwrapped, "robot") else "-"
+        return (f"final x [{unit}]", f"final y [{unit}]")
     return tuple(f"descriptor {index + 1}" for index in range(length))

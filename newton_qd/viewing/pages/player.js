@@ -94,7 +94,11 @@
       const field = event.target.tagName;
       if (field === "SELECT" || (field === "INPUT" && event.target.type !== "checkbox"
         && event.target.type !== "range")) return;
-      if (field === "BUTTON" && event.key === "Enter") return;
+      if (field === "BUTTON" && (event.key === "Enter" || event.key === " ")) return;
+      // a control does what its own keys stand for; the time slider goes by frames
+      const moves = event.key.startsWith("Arrow") || ["Home", "End"].includes(event.key);
+      if (event.target.type === "range" && event.target !== this.slider && moves) return;
+      if (event.target.type === "checkbox" && event.key === " ") return;
       if (this.act(event.key)) event.preventDefault();
     });
   };
