@@ -34,7 +34,7 @@ from newton_qd.qd.emitters import (
     OMGMEGAEmitter,
     SteeringEmitter,
 )
-from newton_qd.qd.scoring.gradient_scores import read_scores
+from newton_qd.qd.scoring.gradient_scores import normalize, read_scores
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
 
@@ -86,6 +86,26 @@ def test_errors_name_what_is_wrong() -> None:
         search.init(start(), centroids(), jax.random.key(0))
 
 
+def test_gradients_that_were_set_to_zero_are_not_known() -> None:
+    fitnesses, descriptors, extra = compiled(score)(start(), jax.random.key(0))
+    read = functools.partial(read_scores, start(), fitnesses, descriptors)
+    assert read(extra).finite.all()
+    lost = jnp.zeros((len(fitnesses), 3), bool).at[2, 1].set(True)
+    found = read({**extra, "overflowed": lost})
+    assert np.flatnonzero(~found.finite).tolist() == [2]
+    # the count of an emitter beside has another shape
+    assert read({**extra, "overflowed": jnp.ones(4, jnp.int32)}).finite.all()
+
+
+@pytest.mark.parametrize("size", [1e-30, 1.0, 1e25, 3e38])
+def test_lengths_of_large_gradients_do_not_overflow(size: float) -> None:
+    rows = jnp.asarray([[0.6, 0.8], [0.0, 0.0]], jnp.float32) * size
+    found = normalize(rows)
+    assert not np.any(found[1])
+    if size >= 1:
+        np.testing.assert_allclose(found[0], [0.6, 0.8], rtol=1e-6)
+
+
 def line(**changes: Any) -> GradientLineEmitter:
     given = {"parents": 2, "branches": 2, "shortest": 0.1, "longest": 1.0, **changes}
     return GradientLineEmitter(along(score), **given)
@@ -116,6 +136,7 @@ def line(**changes: Any) -> GradientLineEmitter:
         ),
         (lambda: line(steered=2.0), "steered: got 2.0; .* from 0 to 1"),
         (lambda: line(longest=0.0), r"longest: got \(0.1, 0.0\);.*shortest <= long"),
+        (lambda: line(longest=np.inf), r"longest: got \(0.1, inf\);.*finite"),
         (lambda: SteeringEmitter(4, max_step=0.0), "max_step: got 0.0; .*above 0"),
         (lambda: SteeringEmitter(4, max_step=1.0, steps=0), "steps: got 0; .* from 1"),
     ],

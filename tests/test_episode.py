@@ -99,6 +99,24 @@ def test_a_gradient_is_a_function_and_noise_needs_a_key(line: Any) -> None:
         episode.mixed(plans, wrong)
 
 
+def test_descriptors_of_a_wrong_shape(line: Any) -> None:
+    """A descriptor (D,) would lose all components but the first."""
+    episode, plans = line
+    flat = dataclasses.replace(
+        episode, descriptor_extractor=lambda data, mask: data.state_desc[0, -1]
+    )
+    with pytest.raises(
+        ValueError, match=r"got descriptors of shape \(1,\); allowed"
+    ):
+        flat(plans[0], KEY)
+
+
+def test_integers_have_no_gradient(line: Any) -> None:
+    episode, plans = line
+    with pytest.raises(TypeError, match="genotypes: got an array of int32; allowed: a"):
+        episode.gradient(plans.astype(jnp.int32), KEY)
+
+
 def test_mixed_gradients_are_the_function_that_was(line: Any) -> None:
     episode, plans = line
     settings: Any = {"samples": 4, "sigma": 0.1, "tolerance": 0.5}

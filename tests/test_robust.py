@@ -100,6 +100,28 @@ def test_results_are_joined(
     assert not np.any(extra["gradients"][2])
 
 
+@pytest.mark.parametrize("scatter", [None, Scatter(width=0.7, offset=2.0)])
+def test_a_gradient_that_one_start_has_lost_is_lost(scatter: Scatter | None) -> None:
+    """The mean of the others would be no gradient of the mean."""
+    genotypes = jnp.asarray([[0.3, 0.1], [1.2, -0.7]], jnp.float32)
+    first = jax.random.split(KEY, 3)[0]
+
+    def losing(genotypes: jax.Array, key: jax.Array) -> Any:
+        fitness, found, extra = some_scores(genotypes, key)
+        here = jnp.all(jax.random.key_data(key) == jax.random.key_data(first))
+        lost = jnp.zeros(extra["overflowed"].shape, bool).at[1, 2].set(here)
+        gradients = jnp.where(lost[:, None], 0, extra["gradients"])
+        given = {"gradients": gradients, "overflowed": lost}
+        return fitness, found, given  # as little as emitters need
+
+    score = robust_scoring(losing, starts=3, scatter=scatter)
+    _, _, extra = score(genotypes, KEY)
+    lost = ~np.any(extra["gradients"], axis=1)
+    # with scatter, the fitness depends on every component of the descriptor
+    assert lost.tolist() == [[False] * 3, [scatter is not None, False, True]]
+    assert extra["overflowed"].tolist() == [[False] * 3, [False, False, True]]
+
+
 def test_the_price_of_scatter() -> None:
     price = Scatter(width=3.0, offset=10.0)
     # two episodes that end 2 w apart: each is w away from their mean

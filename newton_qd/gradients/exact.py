@@ -72,8 +72,13 @@ def differentiate(
             ``None``: no sums, but the fitness and each component of the descriptor.
 
     Raises:
+        TypeError: A genotype is not of floating point, so it has no gradient.
         ValueError: The weights have another number of columns.
     """
+    for leaf in jax.tree.leaves(genotype):
+        if not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
+            given = Fact(f"an array of {jnp.result_type(leaf)}")
+            raise TypeError(message("genotypes", given, "arrays of floating point"))
 
     def values(genotype: Genotype) -> tuple[jax.Array, Outcome]:
         outcome = run(genotype)

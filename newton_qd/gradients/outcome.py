@@ -7,6 +7,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
+from newton_qd.checks import Fact, message
 from newton_qd.envs.state import at_fault
 from newton_qd.extractors import Trajectories
 from newton_qd.types import Action, DescriptorExtractor, StateLike
@@ -132,11 +133,19 @@ def finished(
         over: (T,) whether the episode had ended before a step.
         bad: () whether there was a fault.
         taken: The steps.
+
+    Raises:
+        ValueError: The descriptors have the wrong shape.
     """
     descriptor = jnp.zeros((0,), fitness.dtype)
     if extractor is not None:
         assert readings is not None
         data, mask = Trajectories(readings[None]), over[None].astype(readings.dtype)
-        descriptor = extractor(data, mask)[0]
+        descriptors = extractor(data, mask)
+        if jnp.ndim(descriptors) != 2 or len(descriptors) != 1:
+            given = Fact(f"descriptors of shape {jnp.shape(descriptors)}")
+            allowed = "(n, nd), here (1, nd)"
+            raise ValueError(message("descriptor_extractor", given, allowed))
+        descriptor = descriptors[0]
     bad = bad | ~jnp.isfinite(fitness) | ~jnp.all(jnp.isfinite(descriptor))
     return Outcome(jnp.where(bad, -jnp.inf, fitness), descriptor, bad, taken, fitness)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import jax
@@ -61,9 +62,9 @@ class GradientLineEmitter(Emitter):
         """
         for name, value in (("parents", parents), ("branches", branches)):
             checks.integer(name, value, most=None)
-        if not 0 < shortest <= longest:
+        if not 0 < shortest <= longest < math.inf:
             given = (shortest, longest)
-            allowed = "0 < shortest <= longest"
+            allowed = "0 < shortest <= longest, finite"
             raise ValueError(message("shortest, longest", given, allowed))
         checks.number("steered", steered, least=0, most=1)
         self._gradient = gradient

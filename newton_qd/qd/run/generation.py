@@ -118,7 +118,7 @@ class Generation:
         found = repertoire.fitnesses[:, 0]
         return {
             **metrics,
-            "rejected": jnp.sum(~_sound(scores)),
+            "rejected": jnp.sum(~_sound(scores) | _lost(scores)),
             "mean_fitness": quality.mean_fitness(found),
             "initial_fitness": initial,
             "qd_gain": quality.qd_gain(found, initial),
@@ -129,6 +129,14 @@ def _sound(scores: PyTree) -> jax.Array:
     """Returns whether fitness and descriptor of each individual are finite, (N,)."""
     fitnesses, found, _ = scores
     return jnp.isfinite(fitnesses) & jnp.all(jnp.isfinite(found), axis=1)
+
+
+def _lost(scores: PyTree) -> jax.Array:
+    """Returns whether a gradient of each individual is not finite, (N,)."""
+    fitnesses, found, extra = scores
+    if "overflowed" not in extra:
+        return jnp.zeros(fitnesses.shape, bool)
+    return jnp.any(extra["overflowed"].reshape(len(found), -1), axis=1)
 
 
 def _strongly_typed(tree: PyTree) -> PyTree:

@@ -28,6 +28,7 @@ GRADIENTS = "gradients"
 # pyribs' epsilon: a normalized gradient is shorter than 1 if the gradient is this
 # small.
 _EPSILON = 1e-8
+_SMALLER = 1e-20
 
 
 class GradientsError(ValueError):
@@ -65,7 +66,8 @@ def read_scores(
         genotypes: (N, size) the individuals.
         fitnesses: (N,) or (N, 1) their fitnesses.
         descriptors: (N, D) their descriptors.
-        extra_scores: Dictionary with ``"gradients"`` (N, size, 1 + D).
+        extra_scores: Dictionary with ``"gradients"`` (N, size, 1 + D), and perhaps
+            ``"overflowed"`` (N, 1 + D), which marks gradients that were set to 0.
 
     Raises:
         GradientsError: The gradients are missing or have the wrong shape, or genotypes
@@ -90,6 +92,10 @@ def read_scores(
     finite = finite_scores(fitnesses, descriptors) & jnp.all(
         jnp.isfinite(gradients), axis=(1, 2)
     )
+    lost = extra_scores.get("overflowed")
+    # an emitter beside may have put its own count there
+    if lost is not None and jnp.shape(lost) == (count, expected[2]):
+        finite = finite & ~jnp.any(lost, axis=1)
     return Scores(
         genotypes=genotypes,
         fitnesses=jnp.where(finite, jnp.reshape(fitnesses, (-1,)), -jnp.inf),
@@ -123,5 +129,8 @@ def finite_scores(fitnesses: jax.Array, descriptors: jax.Array) -> jax.Array:
 
 def normalize(gradients: jax.Array) -> jax.Array:
     """Returns gradients (..., size) of length 1; a zero gradient stays zero."""
+    lengths = jnp.linalg.norm(gradients, axis=-1, keepdims=True)
+    # squares of large numbers overflow
+    gradients = gradients * jnp.where(jnp.isinf(lengths), _SMALLER, 1)
     lengths = jnp.linalg.norm(gradients, axis=-1, keepdims=True)
     return gradients / (lengths + _EPSILON)

@@ -54,7 +54,8 @@ def make_ribs_evaluation(
 
     Raises:
         ValueError: ``worst`` is not finite. The returned function raises
-            ``GradientsError`` if gradients are missing or have the wrong shape.
+            ``GradientsError`` if gradients are missing or have the wrong shape, and
+            ``ValueError`` if the limits do not have the shape of a descriptor.
     """
     checks.number("worst", worst)
     low = jnp.asarray(limits[0], jnp.float32)
@@ -62,6 +63,10 @@ def make_ribs_evaluation(
     @jax.jit
     def run(genotypes: jax.Array) -> tuple[jax.Array, ...]:
         fitnesses, descriptors, extra = score(genotypes, key)
+        if low.shape != descriptors.shape[1:]:
+            given = Fact(f"arrays of shape {low.shape}")
+            allowed = f"arrays of shape {descriptors.shape[1:]}"
+            raise ValueError(message("limits", given, allowed))
         good = jnp.isfinite(fitnesses) & jnp.isfinite(descriptors).all(axis=1)
         rows: tuple[jax.Array, ...] = ()
         if jacobian:

@@ -44,7 +44,8 @@ def robust_scoring(
 
     Returns:
         Function with the arguments and results of ``score``. The fitness is ``-inf`` if
-        that of any start is. Gradients are those of these fitnesses and descriptors.
+        that of any start is. Gradients are those of these fitnesses and descriptors; 0
+        if that of any start is lost.
         Transitions of all starts follow each other, (N, starts T, ...), and beside them
         are the descriptors of their episodes, ``episode_descriptors`` (N, starts, D).
         With ``scatter``, the dictionary has the fitness without its price,
@@ -178,8 +179,8 @@ def _joined(
         joined[name] = jax.tree.map(_PARTS[name], value)
     if "gradients" in extra:
         mixed = jax.tree.map(lambda x: _mixed(weights, slopes, x), extra["gradients"])
-        sound = ~joined["faulty"]
-        mixed = jax.tree.map(lambda x: _where(sound, x), mixed)
+        lost = _lost(joined, weights[0], every_row=slopes is not None)
+        mixed = jax.tree.map(lambda x: _without(lost, x), mixed)
         joined["gradients"] = mixed
         joined["normalized_grads"] = unit_rows(mixed)
     return joined
@@ -198,9 +199,28 @@ def _mixed(
     return mixed.at[..., 0].set(first)
 
 
-def _where(sound: jax.Array, leaf: jax.Array) -> jax.Array:
-    shape = (-1, *(1,) * (leaf.ndim - 1))
-    return jnp.where(sound.reshape(shape), leaf, jnp.zeros_like(leaf))
+def _lost(joined: ExtraScores, rows: jax.Array, *, every_row: bool) -> jax.Array:
+    """Returns which gradients (N, R) are not known, because one of a start is not.
+
+    Args:
+        joined: Dictionary with ``faulty`` (N,) and ``overflowed`` (N, R), if known.
+        rows: (N, R) an array of this shape.
+        every_row: Whether the first row depends on all rows.
+    """
+    lost = jnp.zeros(rows.shape, bool)
+    if "faulty" in joined:
+        lost = lost | joined["faulty"][:, None]
+    if "overflowed" in joined:
+        lost = lost | joined["overflowed"]
+    first = jnp.any(lost, axis=1) if every_row else lost[:, 0]
+    return lost.at[:, 0].set(first)
+
+
+def _without(lost: jax.Array, leaf: jax.Array) -> jax.Array:
+    """Returns gradients (N, ..., R) with 0 where they are lost (N, R)."""
+    inner = (1,) * (leaf.ndim - 2)
+    lost = lost.reshape(lost.shape[0], *inner, lost.shape[1])
+    return jnp.where(lost, jnp.zeros_like(leaf), leaf)
 
 
 def _end_to_end(leaf: jax.Array) -> jax.Array:
