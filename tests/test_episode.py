@@ -105,9 +105,7 @@ def test_descriptors_of_a_wrong_shape(line: Any) -> None:
     flat = dataclasses.replace(
         episode, descriptor_extractor=lambda data, mask: data.state_desc[0, -1]
     )
-    with pytest.raises(
-        ValueError, match=r"got descriptors of shape \(1,\); allowed"
-    ):
+    with pytest.raises(ValueError, match=r"got descriptors of shape \(1,\); allowed"):
         flat(plans[0], KEY)
 
 
