@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import re
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -127,6 +127,7 @@ def test_options_have_types_that_a_command_line_can_give() -> None:
         rate: float = 0.5
         hidden: tuple[int, ...] = (4,)
         fast: bool = False
+        names: ClassVar[tuple[str, ...]] = ("no", "option")
 
     def register(options: type[Options]) -> None:
         spec = dataclasses.replace(ME, name=options.__name__, options=options)

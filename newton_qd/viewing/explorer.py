@@ -45,8 +45,8 @@ def explorer_html(
     """Returns a page that shows the archives of one run or two runs.
 
     It has the motion of the elites at half rate, or at full rate if a number of control
-    steps is odd. If the page would be larger than
-    10 MB, only some elites move, and the page says so.
+    steps is odd. If the page would be larger than 10 MB, only some elites move, and the
+    page says so.
 
     Args:
         runs: One run or two of the same robot in the same scene, from

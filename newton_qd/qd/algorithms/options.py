@@ -96,7 +96,9 @@ def check_fields(kind: type[Options]) -> None:
     Raises:
         TypeError: A field cannot be an option.
     """
-    for name, hint in typing.get_type_hints(kind).items():
+    hints = typing.get_type_hints(kind)
+    for name in [field.name for field in dataclasses.fields(kind)]:
+        hint = hints[name]
         parts = _parts(hint)
         wanted = parts[0] if len(parts) == 1 else hint
         if wanted not in (float, int, bool) and wanted != tuple[int, ...]:

@@ -45,12 +45,11 @@ def robust_scoring(
     Returns:
         Function with the arguments and results of ``score``. The fitness is ``-inf`` if
         that of any start is. Gradients are those of these fitnesses and descriptors; 0
-        if that of any start is lost.
-        Transitions of all starts follow each other, (N, starts T, ...), and beside them
-        are the descriptors of their episodes, ``episode_descriptors`` (N, starts, D).
-        With ``scatter``, the dictionary has the fitness without its price,
-        ``unscattered`` (N,). The function raises ``ValueError`` for other entries of
-        the dictionary.
+        if that of any start is lost. Transitions of all starts follow each other, (N,
+        starts T, ...), and beside them are the descriptors of their episodes,
+        ``episode_descriptors`` (N, starts, D). With ``scatter``, the dictionary has the
+        fitness without its price, ``unscattered`` (N,). The function raises
+        ``ValueError`` for other entries of the dictionary.
 
     Raises:
         TypeError: ``score`` is not a function, or ``scatter`` is no ``Scatter``.
