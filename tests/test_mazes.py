@@ -76,6 +76,7 @@ def test_hurdles() -> None:
     assert np.all(half[:, :2] == [0.2, 1.0])
 
 
+@pytest.mark.slow
 def test_no_shot_gets_into_a_wall(tmp_path: Path) -> None:
     """A ball from the middle of every free cell in all directions, up to 10 m/s."""
     system = physics.load_system(ball_spec(tmp_path), "float32", ANTMAZE_HARDEST)

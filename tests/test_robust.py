@@ -114,7 +114,7 @@ def test_a_gradient_that_one_start_has_lost_is_lost(scatter: Scatter | None) -> 
         given = {"gradients": gradients, "overflowed": lost}
         return fitness, found, given  # as little as emitters need
 
-    score = robust_scoring(losing, starts=3, scatter=scatter)
+    score = jax.jit(robust_scoring(losing, starts=3, scatter=scatter))
     _, _, extra = score(genotypes, KEY)
     lost = ~np.any(extra["gradients"], axis=1)
     # with scatter, the fitness depends on every component of the descriptor

@@ -63,6 +63,7 @@ def generations(number: int) -> list[tuple[Any, Any]]:
     return rows
 
 
+@pytest.mark.slow
 def test_gradients_raise_what_they_are_of() -> None:
     """Return, and both coordinates of the end, of a small step along each gradient."""
     state = generations(6)[0][0]

@@ -86,8 +86,9 @@ class GenerationParts:
             ConfigError: The emitter proposes another number of individuals.
         """
         found = self.of(drawn).propose(*arguments)
-        shape = (self.config.batch_size, self.policy.size)
-        check_genotypes(found[0], self.algorithm.name, shape)
+        # an emitter that evaluates others itself may propose only its best one
+        number = None if self.algorithm.evaluates else self.config.batch_size
+        check_genotypes(found[0], self.algorithm.name, number, self.policy.size)
         return found
 
     def begin(self, drawn: Drawn, *arguments: Any) -> PyTree:

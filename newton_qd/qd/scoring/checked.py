@@ -56,22 +56,25 @@ def checked_scoring(
 
 
 def check_genotypes(
-    genotypes: jax.Array, algorithm: str, shape: tuple[int, int]
+    genotypes: jax.Array, algorithm: str, number: int | None, size: int
 ) -> None:
     """Checks what an emitter proposes.
 
     Args:
         genotypes: The individuals.
         algorithm: Name of the algorithm, for the error.
-        shape: Individuals of a generation and weights of each.
+        number: Individuals of a generation; ``None``: any.
+        size: Weights of each.
 
     Raises:
         ConfigError: They have another shape.
     """
-    if genotypes.shape != shape:
-        name, given = f"emitter of {algorithm!r}", "genotypes of shape"
-        allowed = f"{shape}: batch_size individuals, and the weights of each"
-        raise ConfigError(message(name, Fact(f"{given} {genotypes.shape}"), allowed))
+    shape = genotypes.shape
+    if len(shape) != 2 or shape[0] != (number or shape[0]) or shape[1] != size:
+        name, given = f"emitter of {algorithm!r}", f"genotypes of shape {shape}"
+        rows = "N" if number is None else number
+        allowed = f"({rows}, {size}): batch_size individuals, and the weights of each"
+        raise ConfigError(message(name, Fact(given), allowed))
 
 
 def why_empty(found: Outcome, own: str | None) -> str:
