@@ -63,7 +63,9 @@ def long_runs() -> str:
     for (*run, stop), score in sorted(scores.items()):
         task, variant, seed, _ = run
         if stop == LONG:
-            rows.append([task, variant, seed, scores[*run, BEFORE], score])
+            # a run that another commit has continued has its earlier score there
+            before = scores.get((*run, BEFORE), "-")
+            rows.append([task, variant, seed, before, score])
     head = "task", "variant", "seed", study_scores.named(BEFORE)
     return study_scores.markdown([*head, study_scores.named(LONG)], rows)
 

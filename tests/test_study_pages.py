@@ -70,6 +70,7 @@ def test_long_runs_have_their_own_score_before(
     write(
         tmp_path / "runs.csv",
         *(("first", 0, "250 s", 1000.0), ("later", 0, "1000 s", 3000.0)),
+        ("continued", 1, "1000 s", 4000.0),
         *((name, TUNING_SEED, stop, 9.0) for name in "ab" for stop in ("1000 s",)),
     )
     repeats = tmp_path / "again.csv"
@@ -78,4 +79,7 @@ def test_long_runs_have_their_own_score_before(
     monkeypatch.setattr(study_pages, "REPEATS", repeats)
     head, _, *rows = study_pages.long_runs().splitlines()
     assert head == "| task | variant | seed | 250 s | 1,000 s |"
-    assert rows == ["| ant_uni | me@7 | 0 | 2,000 | 3,000 |"]
+    assert rows == [
+        "| ant_uni | me@7 | 0 | 2,000 | 3,000 |",
+        "| ant_uni | me@7 | 1 | - | 4,000 |",
+    ]
