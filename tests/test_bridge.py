@@ -224,8 +224,21 @@ def test_no_second_derivative() -> None:
     def first(action: jax.Array) -> jax.Array:
         return jax.grad(lambda a: advance(a).sum())(action).sum()
 
-    with pytest.raises(ValueError, match=r"FFI call to .* cannot be differentiated"):
+    with pytest.raises(TypeError, match=r"first derivatives only: .*lax.stop_gradient"):
         jax.grad(first)(jnp.asarray(ACTIONS[0, 0]))
+
+
+def test_an_inner_gradient_may_be_constant() -> None:
+    """The cure that the error names."""
+    action = jnp.asarray(ACTIONS[0, 0])
+    first = jax.grad(lambda a: advance(a).sum())
+
+    def product(a: jax.Array) -> jax.Array:
+        return advance(a).sum() * first(jax.lax.stop_gradient(a)).sum()
+
+    np.testing.assert_allclose(
+        jax.grad(product)(action), first(action) * first(action).sum(), rtol=1e-6
+    )
 
 
 def test_wrong_precision(x64: None) -> None:

@@ -1,13 +1,15 @@
-"""An error for forward mode that says what to use instead.
+"""Errors for derivatives that a kernel does not have; they say what to use instead.
 
-A kernel has an adjoint, but no forward derivative. JAX's own error for this names
-neither the cause nor the cure. Two primitives stand before the kernel: the identity,
-and its tangent. The way back passes the tangent unchanged. Only forward mode computes
-it.
+A kernel has an adjoint, but no forward derivative, and the adjoint has no derivative.
+JAX's own errors for this name neither the cause nor the cure. Two primitives stand
+before the kernel: the identity, and its tangent. The way back passes the tangent
+unchanged. Only forward mode computes it. Another identity stands before the adjoint. It
+refuses any tangent.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -17,13 +19,24 @@ from jax.interpreters import ad, batching, mlir
 _FORWARD = (
     "can't apply forward-mode autodiff (jvp) to a custom_vjp function: the physics has "
     "first derivatives in reverse mode only; use jax.grad, jax.vjp or jax.jacrev "
-    "instead of jax.jvp, jax.jacfwd or jax.hessian (docs/gradients.md)"
+    "instead of jax.jvp, jax.jacfwd or jax.hessian (docs/physics.md)"
+)
+
+_SECOND = (
+    "the physics has first derivatives only: a gradient of it cannot be differentiated "
+    "again; take the inner gradient at jax.lax.stop_gradient(x), or use differences of "
+    "gradients (docs/physics.md)"
 )
 
 
 def reverse_mode_only(x: jax.Array) -> jax.Array:
     """Returns ``x`` unchanged. Its derivative in forward mode is a ``TypeError``."""
     return _same.bind(x)
+
+
+def first_derivatives_only(x: jax.Array) -> jax.Array:
+    """Returns ``x`` unchanged. Its derivative is a ``TypeError``."""
+    return _first.bind(x)
 
 
 def _refuse(*arguments: object, **options: object) -> Any:
@@ -42,16 +55,31 @@ def _differentiated(primals: tuple, tangents: tuple) -> tuple[Any, Any]:
     return _same.bind(x), tangent
 
 
-def _batched(arguments: tuple, axes: tuple) -> tuple[Any, Any]:
-    return _same.bind(*arguments), axes[0]
+def _differentiated_again(primals: tuple, tangents: tuple) -> Any:
+    """Refuses to differentiate an adjoint.
+
+    Raises:
+        TypeError: Always.
+    """
+    raise TypeError(_SECOND)
 
 
-_same = Primitive("newton_qd_reverse_mode_only")
-_same.def_abstract_eval(lambda x: x)
-_same.def_impl(lambda x: x)
-mlir.register_lowering(_same, lambda context, x: [x])
-batching.primitive_batchers[_same] = _batched
-ad.primitive_jvps[_same] = _differentiated
+def _identity(name: str, differentiated: Callable[[tuple, tuple], Any]) -> Primitive:
+    """Returns an identity with a derivative of its own."""
+    same = Primitive(name)
+    same.def_abstract_eval(lambda x: x)
+    same.def_impl(lambda x: x)
+    mlir.register_lowering(same, lambda context, x: [x])
+    batching.primitive_batchers[same] = lambda arguments, axes: (
+        same.bind(*arguments),
+        axes[0],
+    )
+    ad.primitive_jvps[same] = differentiated
+    return same
+
+
+_same = _identity("newton_qd_reverse_mode_only", _differentiated)
+_first = _identity("newton_qd_first_derivatives_only", _differentiated_again)
 
 _tangent = Primitive("newton_qd_tangent")
 _tangent.def_abstract_eval(lambda x: x)

@@ -20,7 +20,10 @@ from newton_qd.physics.explicit_mesh import over_devices, row_like
 from newton_qd.physics.native import Plan
 from newton_qd.physics.native.library import library
 from newton_qd.physics.precision import SCALARS
-from newton_qd.physics.reverse_mode import reverse_mode_only
+from newton_qd.physics.reverse_mode import (
+    first_derivatives_only,
+    reverse_mode_only,
+)
 from newton_qd.physics.warp_internals import ffi_callback
 
 interrupts.protect(ffi_callback())
@@ -205,7 +208,8 @@ def differentiable(
         return y, (x, y) if keeps_outputs else (x,)
 
     def run_backward(kept: tuple[jax.Array, ...], y_bar: jax.Array) -> tuple[jax.Array]:
-        return (call(f"{name}_backward")(*kept, y_bar, output_dims=size)[0],)
+        rows = [first_derivatives_only(x) for x in (*kept, y_bar)]
+        return (call(f"{name}_backward")(*rows, output_dims=size)[0],)
 
     run.defvjp(run_forward, run_backward)
     return lambda x: run(reverse_mode_only(x))
