@@ -14,8 +14,9 @@ The facade:
 - ``randomize_params``: physical parameters drawn at random
 - ``NewtonQDSolver``: the same physics as a solver of Newton
 
-``newton_qd.authoring`` has everything that you need for your own environment.
-``newton_qd.tables`` has tables by the name of an environment.
+``newton_qd.qd`` has Quality-Diversity with the environments. ``newton_qd.authoring``
+has everything that you need for your own environment. ``newton_qd.tables`` has tables
+by the name of an environment.
 
 Importing the package imports no other module of it. Each name is loaded when it is
 first used.
@@ -24,10 +25,12 @@ first used.
 from __future__ import annotations
 
 import importlib
+import importlib.util
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from newton_qd import authoring as authoring
+    from newton_qd import gradients as gradients
     from newton_qd import tables as tables
     from newton_qd.envs.base import Env
     from newton_qd.envs.randomization import randomize_params
@@ -77,7 +80,7 @@ _HOME = {
     "registered_envs": "newton_qd.registry",
 }
 
-_MODULES = ("authoring", "tables")
+_MODULES = ("authoring", "gradients", "tables")
 """Modules that the facade loads as ``newton_qd.NAME``."""
 
 _MOVED = {
@@ -92,12 +95,19 @@ _MOVED = {
 
 
 def __getattr__(name: str) -> Any:
-    """Loads a name of the facade when it is first used."""
+    """Loads a name of the facade when it is first used.
+
+    Raises:
+        AttributeError: The facade does not have it.
+    """
     if name in _MODULES:
         return importlib.import_module(f"{__name__}.{name}")
     if name not in _HOME:
         from newton_qd.moved import moved_name
 
+        path = f"{__name__}.{name}"
+        if not name.startswith("_") and importlib.util.find_spec(path) is not None:
+            raise AttributeError(f"{path} is loaded by itself: import {path}")
         return moved_name(__name__, name, _MOVED)
     value = getattr(importlib.import_module(_HOME[name]), name)
     globals()[name] = value

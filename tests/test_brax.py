@@ -195,6 +195,11 @@ def test_brax_trains_on_it(
             "backend: got 'mjx', a physics of brax; allowed: None, newton_qd",
         ),
         (
+            lambda env: env("pointmaze").step(cast("Any", None), jnp.zeros(2)),
+            TypeError,
+            "state: got None; allowed: a state, as reset",
+        ),
+        (
             lambda env: env("pointmaze", episode_length=5),
             ValueError,
             "env: got an environment with an episode length; allowed: one world",

@@ -90,6 +90,13 @@ def test_weights_of_a_wrong_shape(shape: Any, text: str, hopper: Any) -> None:
         jax.eval_shape(episode.directional, weights, jnp.ones(shape), KEY)
 
 
+def test_weights_are_an_array(line: Any) -> None:
+    episode, plans = line
+    nested: Any = [[[1.0, 0.0]]] * len(plans)
+    with pytest.raises(TypeError, match=r"weights: got \[\[.*; allowed: an array of"):
+        episode.directional(plans, nested, KEY)
+
+
 def test_a_gradient_is_a_function_and_noise_needs_a_key(line: Any) -> None:
     episode, plans = line
     wrong: Any = 3

@@ -277,6 +277,12 @@ def test_missing_extra_says_the_command() -> None:
     assert "pip install 'newton_qd[qd]'" in str(error) and "qdax" in str(error)
 
 
+def test_the_facade_says_how_to_load_a_module(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(newton_qd, "qd", raising=False)
+    with pytest.raises(AttributeError, match="by itself: import newton_qd"):
+        newton_qd.qd  # noqa: B018 # pyright: ignore
+
+
 def test_facade() -> None:
     for name in newton_qd.__all__:
         assert getattr(newton_qd, name) is not None

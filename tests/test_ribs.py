@@ -187,8 +187,28 @@ def test_what_evolve_has_found_becomes_a_ribs_archive() -> None:
         archive = to_ribs(result.archive, LIMITS, grid)
         assert archive.stats.obj_max == result.archive.fitnesses.max()
         assert 0 < len(archive) <= result.archive.filled.sum()
-    with pytest.raises(ValueError, match=r"grid: got \(3, 4\), .* 12 cells.*: 16"):
+    with pytest.raises(ValueError, match=r"grid: got \(3, 4\), .* 12 cells.* of 16"):
         to_ribs(result.archive, LIMITS, (3, 4))
+
+
+@pytest.mark.parametrize(
+    ("limits", "grid", "error", "text"),
+    [
+        (None, None, TypeError, r"limits: got None; allowed: lowest and highest"),
+        ((0.0, 1.0), None, ValueError, r"limits: got arrays of shape \(\) and \(\);"),
+        (([0] * 3, [1] * 3), None, ValueError, r"\(3,\); allowed: .* \(2,\) each"),
+        (([0, 1], [1, 1]), None, ValueError, r"\[1.0, 1.0\]\); allowed: .* above the"),
+        (LIMITS, 16, TypeError, r"grid: got 16; allowed: None, or a tuple of integers"),
+        (LIMITS, (4.0, 4), ValueError, r"grid\[0\]: got 4.0; allowed: integers from 1"),
+        (LIMITS, (16,), ValueError, r"grid: got \(16,\), .*; allowed: 2 integers with"),
+    ],
+)
+def test_wrong_limits_and_grids(limits: Any, grid: Any, error: Any, text: str) -> None:
+    from ribs.archives import GridArchive
+
+    empty = from_ribs(GridArchive(solution_dim=2, dims=(4, 4), ranges=[(0, 1)] * 2))
+    with pytest.raises(error, match=text):
+        to_ribs(empty, limits, grid)
 
 
 def test_what_cannot_be_converted(monkeypatch: pytest.MonkeyPatch) -> None:

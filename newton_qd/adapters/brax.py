@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from newton_qd import registry
+from newton_qd import checks, registry
 from newton_qd.adapters.worlds import one_world
 from newton_qd.checks import message
 from newton_qd.envs.base import Env, PhysicsEnv
@@ -148,9 +148,11 @@ class BraxEnv(envs.Env):
             action: (nu,) action.
 
         Raises:
-            TypeError: The action has the wrong type.
+            TypeError: ``state`` is not a state, or the action has the wrong type.
             ValueError: The action has the wrong shape.
         """
+        allowed = "a state, as reset() returns it"
+        checks.instance("state", state, (envs.State, State), allowed)
         info: dict[str, Any] = {key: state.info[key] for key in self._keys}
         if "fault" in info:
             info["fault"] = jnp.zeros(jnp.shape(state.done), jnp.int32)

@@ -6,7 +6,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from newton_qd import checks
 from newton_qd.checks import Fact, message
 from newton_qd.types import Genotype
 
@@ -45,8 +47,11 @@ def check_weights(genotypes: Genotype, weights: Any) -> None:
         weights: (N, R, 1 + D) weights; ``differentiate`` checks the last axis.
 
     Raises:
+        TypeError: They are not an array.
         ValueError: They have another shape.
     """
+    allowed = "an array of shape (N, R, 1 + D)"
+    checks.instance("weights", weights, (jax.Array, np.ndarray), allowed)
     shape, number = jnp.shape(weights), len(jax.tree.leaves(genotypes)[0])
     if len(shape) != 3 or shape[0] != number or not shape[1]:
         allowed = f"shape ({number}, R, 1 + D), R from 1"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, cast
 
@@ -53,12 +54,14 @@ def make_ribs_evaluation(
         and, with ``jacobian``, gradients (N, 1 + D, size).
 
     Raises:
-        ValueError: ``worst`` is not finite. The returned function raises
-            ``GradientsError`` if gradients are missing or have the wrong shape, and
-            ``ValueError`` if the limits do not have the shape of a descriptor.
+        TypeError: ``limits`` are not two vectors.
+        ValueError: ``worst`` is not finite, or a highest descriptor is not above the
+            lowest one. The returned function raises ``GradientsError`` if gradients are
+            missing or have the wrong shape, and ``ValueError`` if the limits do not
+            have the shape of a descriptor.
     """
     checks.number("worst", worst)
-    low = jnp.asarray(limits[0], jnp.float32)
+    low = jnp.asarray(_limits(limits)[0], jnp.float32)
 
     @jax.jit
     def run(genotypes: jax.Array) -> tuple[jax.Array, ...]:
@@ -104,17 +107,20 @@ def to_ribs(
 
     Raises:
         MissingExtra: pyribs is not installed.
-        ValueError: ``grid`` does not have as many cells as the repertoire, or a fitness
-            is NaN.
+        TypeError: ``repertoire`` has no centroids, ``limits`` are not two vectors, or
+            ``grid`` is not a tuple of integers.
+        ValueError: A highest descriptor is not above the lowest one, ``grid`` does not
+            have as many cells as the repertoire, or a fitness is NaN.
     """
     require_extra("ribs", "ribs")
     from ribs.archives import CVTArchive, GridArchive
 
+    if not hasattr(repertoire, "centroids"):
+        raise TypeError(message("repertoire", repertoire, "an archive with centroids"))
     centroids = np.asarray(repertoire.centroids)
-    if grid is not None and np.prod(grid) != len(centroids):
-        allowed = f"{len(centroids)} cells, as the repertoire has"
-        why = f"which has {np.prod(grid)} cells"
-        raise ValueError(message("grid", grid, allowed, why=why))
+    limits = _limits(limits, centroids.shape[1])
+    if grid is not None:
+        _check_grid(grid, *centroids.shape)
     ravel = jax.vmap(lambda genotype: ravel_pytree(genotype)[0])
     solutions = np.asarray(ravel(jax.tree.map(jnp.asarray, repertoire.genotypes)))
     common: Any = {
@@ -173,6 +179,54 @@ def from_ribs(archive: CVTArchive | GridArchive) -> MapElitesRepertoire:
         descriptors=jnp.asarray(descriptors),
         centroids=jnp.asarray(centroids, jnp.float32),
     )
+
+
+def _limits(limits: Any, length: int | None = None) -> Limits:
+    """Returns lowest and highest descriptor as vectors.
+
+    Args:
+        limits: Lowest and highest descriptor, (D,) each.
+        length: D; ``None``: any.
+
+    Raises:
+        TypeError: They are not two vectors of numbers.
+        ValueError: They have another length, or a highest descriptor is not above the
+            lowest one.
+    """
+    allowed = f"lowest and highest descriptor, ({length or 'D'},) each"
+    try:
+        low, high = (np.asarray(limit, np.float64) for limit in limits)
+    except (TypeError, ValueError):
+        raise TypeError(message("limits", limits, allowed)) from None
+    if low.ndim != 1 or low.shape != high.shape or length not in (None, len(low)):
+        given = Fact(f"arrays of shape {low.shape} and {high.shape}")
+        raise ValueError(message("limits", given, allowed))
+    if not (np.isfinite([low, high]).all() and (high > low).all()):
+        allowed = "finite numbers, the highest above the lowest"
+        raise ValueError(message("limits", (low.tolist(), high.tolist()), allowed))
+    return low, high
+
+
+def _check_grid(grid: Any, cells: int, dimensions: int) -> None:
+    """Checks that a grid has the cells of a repertoire.
+
+    Args:
+        grid: Cells along each dimension.
+        cells: Number of cells of the repertoire.
+        dimensions: Length of a descriptor.
+
+    Raises:
+        TypeError: It is not a tuple.
+        ValueError: It has other entries, or another number of cells.
+    """
+    checks.instance("grid", grid, (tuple, list), "a tuple of integers", optional=True)
+    for index, along in enumerate(grid):
+        checks.integer(f"grid[{index}]", along)
+    number = math.prod(grid)
+    if len(grid) != dimensions or number != cells:
+        allowed = f"{dimensions} integers with a product of {cells}"
+        why = f"which has {number} cells"
+        raise ValueError(message("grid", grid, allowed, why=why))
 
 
 def _refuse_nan(name: str, values: np.ndarray) -> None:

@@ -133,8 +133,11 @@ def episode_of(
         transitions: Whether to return the steps.
 
     Raises:
+        TypeError: ``task`` is not a ``Task``, or ``policy`` not a ``Policy``.
         ValueError: ``episode_length`` is not an integer from 1.
     """
+    checks.instance("task", task, Task, "a Task, as make_task() makes it")
+    checks.instance("policy", policy, Policy, "a Policy, as make_policy() makes it")
     return Episode(
         task.env,
         policy.apply,

@@ -62,6 +62,7 @@ def make_task(config: EvolveConfig) -> Task:
             are used.
 
     Raises:
+        TypeError: ``config`` is not an ``EvolveConfig``.
         UnknownEnvironment: No environment of this name is registered.
         ConfigError: The environment has no descriptor, no reward offset, or no finite
             limits of its descriptor. Or the grid does not fit the descriptor, or an
@@ -70,6 +71,7 @@ def make_task(config: EvolveConfig) -> Task:
     # imported here, because the registry imports every environment
     import newton_qd
 
+    checks.instance("config", config, EvolveConfig, "an EvolveConfig")
     name = config.env_name
     if name not in newton_qd.registered_envs():
         raise newton_qd.UnknownEnvironment(name, newton_qd.registered_envs())
