@@ -1,23 +1,16 @@
-"""The package as a whole: import arrows, light import, wheel, README."""
+"""The package as a whole: import arrows, packages in their home, light import."""
 
 from __future__ import annotations
 
 import ast
-import email
-import functools
-import itertools
 import json
-import os
 import re
-import shlex
-import subprocess
 import sys
-import tarfile
-import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from fresh_python import run_python
 
 import newton_qd
 
@@ -25,7 +18,6 @@ ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "newton_qd"
 # where the package under test is: the checkout, or an installation
 TESTED = Path(newton_qd.__file__).parent.parent
-README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 # A module may import those of its own name and those before it.
 LAYERS = (
@@ -100,7 +92,6 @@ HEAVY = {
     "torch",
     "tqdm",
 }
-CORE_DEPENDENCIES = {"jax", "newton", "numpy", "warp-lang"}
 
 
 def modules() -> dict[str, Path]:
@@ -243,23 +234,6 @@ def test_no_import_cycles() -> None:
         visit(name, ())
 
 
-def run_python(
-    code: str, cwd: Path, **variables: str
-) -> subprocess.CompletedProcess[str]:
-    """Run code in a fresh interpreter in which a warning for our code is an error."""
-    own = "import warnings; warnings.filterwarnings('error', module='newton_qd')\n"
-    return subprocess.run(
-        [sys.executable, "-c", own + code],
-        cwd=cwd,
-        env={**os.environ, **variables},
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=300,
-    )
-
-
 def test_import_is_light(tmp_path: Path) -> None:
     code = "import sys, newton_qd, json; print(json.dumps(sorted(sys.modules)))"
     cache = tmp_path / "kernels"
@@ -297,143 +271,3 @@ def test_facade() -> None:
     }
     assert names <= set(newton_qd.__all__)
     assert all(hasattr(newton_qd, name) for name in newton_qd.__all__)
-
-
-@pytest.fixture(scope="module")
-def distributions(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder with the wheel and the source distribution of this checkout."""
-    folder = tmp_path_factory.mktemp("distributions")
-    subprocess.run(
-        [sys.executable, "-m", "hatchling", "build", "-d", str(folder)],
-        cwd=ROOT,
-        check=True,
-        stdin=subprocess.DEVNULL,
-        timeout=300,
-        capture_output=True,
-    )
-    return folder
-
-
-def urdf_names() -> set[str]:
-    """File names of the suite's robots and scenes."""
-    return {path.name for path in (ROOT / "urdf").glob("*.urdf")}
-
-
-def test_wheel_holds_the_robots(distributions: Path, tmp_path: Path) -> None:
-    (wheel,) = distributions.glob("*.whl")
-    with zipfile.ZipFile(wheel) as archive:
-        held = {
-            name.removeprefix("newton_qd/urdf/")
-            for name in archive.namelist()
-            if name.startswith("newton_qd/urdf/")
-        }
-        archive.extractall(tmp_path)
-    assert "ant.urdf" in held
-    assert urdf_names() <= held
-    code = "from newton_qd.assets import find_urdf; print(find_urdf('ant.urdf'))"
-    result = run_python(code, tmp_path, PYTHONPATH=str(tmp_path))
-    assert result.returncode == 0, result.stderr
-    found = Path(result.stdout.strip()).resolve()
-    assert found == (tmp_path / "newton_qd" / "urdf" / "ant.urdf").resolve()
-
-
-def test_wheel_holds_the_pages(distributions: Path) -> None:
-    (wheel,) = distributions.glob("*.whl")
-    with zipfile.ZipFile(wheel) as archive:
-        held = set(archive.namelist())
-    pages = {path.name for path in (PACKAGE / "viewing" / "pages").iterdir()}
-    assert {"three.min.js", "three.LICENSE", "explorer.js", "style.css"} <= pages
-    assert {f"newton_qd/viewing/pages/{name}" for name in pages} <= held
-
-
-def test_wheel_says_that_it_is_typed(distributions: Path) -> None:
-    (wheel,) = distributions.glob("*.whl")
-    with zipfile.ZipFile(wheel) as archive:
-        assert "newton_qd/py.typed" in archive.namelist()
-
-
-def test_source_distribution_holds_the_robots(distributions: Path) -> None:
-    (sdist,) = distributions.glob("*.tar.gz")
-    with tarfile.open(sdist) as archive:
-        held = {name.partition("/")[2] for name in archive.getnames()}
-    assert {f"urdf/{name}" for name in urdf_names()} <= held
-    assert {"LICENSE", "README.md", "pyproject.toml"} <= held
-
-
-def test_core_dependencies(distributions: Path) -> None:
-    (wheel,) = distributions.glob("*.whl")
-    with zipfile.ZipFile(wheel) as archive:
-        (name,) = (n for n in archive.namelist() if n.endswith("/METADATA"))
-        metadata = email.message_from_bytes(archive.read(name))
-        scripts = archive.read(name.replace("METADATA", "entry_points.txt")).decode()
-    required = metadata.get_all("Requires-Dist", [])
-    core = [requirement for requirement in required if "extra ==" not in requirement]
-    assert all(">=" in requirement for requirement in core), "no lower bound"
-    assert {re.split(r"[^\w-]", entry)[0] for entry in core} == CORE_DEPENDENCIES
-    extras = set(metadata.get_all("Provides-Extra", []))
-    assert {"qd", "viz", "docs", "dev", "all"} <= extras
-    assert "newton-qd = newton_qd.cli:main" in scripts
-
-
-def readme_blocks(language: str) -> list[str]:
-    """Code blocks of the README in one language."""
-    return re.findall(rf"^```{language}\n(.*?)^```$", README, re.M | re.S)
-
-
-def readme_commands() -> list[str]:
-    """Commands of the README."""
-    lines = itertools.chain.from_iterable(
-        block.splitlines() for block in readme_blocks("bash")
-    )
-    return [line.strip() for line in lines if line.strip()]
-
-
-def test_ci_runs_the_test_command_of_the_readme() -> None:
-    (command,) = [line for line in readme_commands() if "pytest" in line][:1]
-    script = (ROOT / ".ci" / "run").read_text(encoding="utf-8").splitlines()
-    assert command in script
-    # what the README leaves out runs too
-    assert 'pytest -n auto -m "slow and not optimized" || failed=$?' in script
-    mark = r"mark\.optimized"
-    files = f"$(grep -l '{mark}' tests/test_*.py)"
-    assert f"pytest -n auto --optimized -m optimized {files}" in script
-    # ... and no helper marks a test so
-    helpers = {*(ROOT / "tests").glob("*.py")} - {*(ROOT / "tests").glob("test_*.py")}
-    assert not [path for path in helpers if re.search(mark, path.read_text("utf-8"))]
-
-
-def test_readme_names_commands_that_exist() -> None:
-    from newton_qd import cli
-
-    (command,) = [line for line in readme_commands() if "newton-qd evolve" in line][:1]
-    arguments = shlex.split(command.partition("newton-qd ")[2])
-    with pytest.raises(SystemExit) as ended:
-        cli.main([*arguments, "--help"])
-    assert ended.value.code == 0
-
-
-@pytest.mark.parametrize("index", range(len(readme_blocks("python"))))
-def test_readme_examples_run(index: int) -> None:
-    assert "state" in readme_namespace(index)
-
-
-@functools.cache
-def readme_namespace(index: int) -> dict[str, object]:
-    """Names after a block of the README; each goes on where the last one ended."""
-    namespace = dict(readme_namespace(index - 1)) if index else {}
-    block = readme_blocks("python")[index]
-    exec(compile(block, "README.md", "exec"), namespace)
-    return namespace
-
-
-def test_readme_table_of_environments() -> None:
-    rows = re.findall(
-        r"^\| `(\w+)` \| (\d+) \| (\d+) \| (\d+|-) \|", README, re.MULTILINE
-    )
-    assert {row[0] for row in rows} == set(newton_qd.registered_envs())
-    for name, observation, action, descriptor in rows:
-        env = newton_qd.create(name)
-        assert env.observation_size == int(observation)
-        assert env.action_size == int(action)
-        length = getattr(env, "descriptor_length", None)
-        assert length == (None if descriptor == "-" else int(descriptor))
