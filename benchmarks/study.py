@@ -69,7 +69,7 @@ def arguments() -> argparse.Namespace:
         "--seeds", type=int, help="at most so many; default: 5, or as the protocol says"
     )
     _add_field_arguments(parser)
-    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--seconds", type=float, help="time of a run of core: 60")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     parser.add_argument("--gpus", type=int, default=1)
     parser.add_argument("--workers", type=int, default=1)
@@ -157,6 +157,11 @@ def checked(
                 parser.error(f"--run: got {value}; allowed: {', '.join(known)}")
     if args.seeds is None:
         args.seeds = protocol.seeds if protocol else 5
+    if protocol and args.seconds is not None:
+        parser.error("--seconds: got it without --protocol core; use --until")
+    if not protocol and args.until is not None:
+        parser.error("--until: got it with --protocol core; use --seconds")
+    args.seconds = 60.0 if args.seconds is None else args.seconds
     if args.until is None:
         stops = protocol.stops if protocol else ()
         args.until = max((x.amount for x in stops if x.unit == "s"), default=math.inf)
@@ -167,6 +172,11 @@ def checked(
             study_runs.listed(args.list, protocol, args.out)
         except (OSError, ValueError) as error:
             parser.error(f"--list: {error}")
+    if protocol and not args.reach_evaluations:
+        times = [x.amount for x in protocol.stops if x.unit == "s"]
+        if 0 < args.until < min(times):
+            allowed = ", ".join(f"{x:g}" for x in times)
+            parser.error(f"--until: got {args.until:g}; allowed: {allowed}")
     if args.paced and (not protocol or args.device != "cuda"):
         parser.error("--paced: got it without --protocol field or small and a GPU")
     for name in ("seeds", "gpus", "workers"):
@@ -271,8 +281,9 @@ def main() -> None:
             print(f"{1 + sum(1 for _ in runs)} runs are left", flush=True)
             break
         print(f"{spent:5.0f} s: {what} until {until:g} s", flush=True)
-        more = []
-        if args.protocol != "core":
+        if args.protocol == "core":
+            more = ["--seconds", str(args.seconds)]
+        else:
             more = ["--until", str(until)]
             more += ["--stop-after", str(args.stop_after - spent)]
             more += ["--reach-evaluations"] * args.reach_evaluations

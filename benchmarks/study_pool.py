@@ -44,8 +44,7 @@ class Pool:
     def start(self, slot: int, *what: str) -> None:
         """Starts ``study.py`` again with other arguments."""
         args = self.args
-        common = ["--seconds", str(args.seconds), "--device", args.device]
-        common += ["--protocol", args.protocol]
+        common = ["--device", args.device, "--protocol", args.protocol]
         command = [sys.executable, str(STUDY), *common, *what]
         variables = {**os.environ, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
         if args.protocol != "core":  # other seeds can use what was compiled

@@ -229,6 +229,8 @@ def main() -> None:
     )
     args = parser.parse_args()
     results = load(args.runs)
+    if not results:
+        parser.error(f"runs: got {args.runs}; allowed: a folder with runs.csv")
     if args.note_best:
         note_best(results)
     known = {str(x) for protocol in PROTOCOLS.values() for x in protocol.stops}

@@ -76,6 +76,11 @@ def test_what_is_no_archive_is_refused(tmp_path: Path) -> None:
     arrays = {name: getattr(small(), name) for name in NAMES}
     with pytest.raises(FileNotFoundError, match=r"has no archive\.npz; allowed"):
         load_archive(tmp_path)
+    file = tmp_path / "archive.npz"
+    file.write_bytes(b"")
+    with pytest.raises(FileNotFoundError, match=r"folder: got .*, which has no a"):
+        load_archive(file)
+    file.unlink()
     for change, message in (
         ({"format": np.asarray(2)}, r"has format 2; this version .* reads format 1"),
         ({"colours": np.zeros(3)}, r"holds the arrays .*'colours'"),

@@ -134,6 +134,33 @@ def test_defaults_of_the_methods(page: dict[str, Any]) -> None:
     assert after.reward.dtype == after.done.dtype == np.float32 and after.reward == 1
 
 
+def test_a_control_of_another_type_is_converted(page: dict[str, Any]) -> None:
+    """As what ``observe`` and ``outcome`` return."""
+
+    class Switched(Still):
+        def control(self, state: PhysicsState, action: jax.Array) -> jax.Array:
+            return jnp.where(action > 0, 1, -1)
+
+    class Plain(Still):
+        def control(self, state: PhysicsState, action: jax.Array) -> jax.Array:
+            return jnp.where(action > 0, 1.0, -1.0)
+
+    found, expected = (
+        kind(page["ROBOT"]).rollout(
+            kind(page["ROBOT"]).reset(jax.random.key(0)), jnp.ones((2, 2))
+        )
+        for kind in (Switched, Plain)
+    )
+    np.testing.assert_array_equal(found.obs, expected.obs)
+
+
+def test_kinematics_need_a_state_of_the_physics(page: dict[str, Any]) -> None:
+    env = Still(page["ROBOT"])
+    state: Any = env.reset(jax.random.key(0))
+    with pytest.raises(TypeError, match=r"state: got .*such as state.pipeline_state"):
+        env.kinematics(state)
+
+
 def test_a_pose_of_ones_own(page: dict[str, Any]) -> None:
     class Turned(Still):
         def reset_pose(self, rng: jax.Array, q: jax.Array) -> jax.Array:
@@ -201,6 +228,24 @@ def test_check_names_what_is_not_finite(part: str, words: str) -> None:
             (0.0, False, {"lean": jnp.zeros(2)}),
             ValueError,
             r"Bad.outcome: 'lean': got shape \(2,\); allowed: shape \(\)",
+        ),
+        (
+            "outcome",
+            (None, False, {}),
+            TypeError,
+            "Bad.outcome: 'reward': got None; allowed: real numbers",
+        ),
+        (
+            "outcome",
+            (0.0, False, {"lean": jnp.zeros((), complex)}),
+            TypeError,
+            "Bad.outcome: 'lean': got complex numbers; allowed: real numbers",
+        ),
+        (
+            "observe",
+            {"x": jnp.zeros(2, complex)},
+            TypeError,
+            "Bad.observe: 'x': got complex numbers; allowed: real numbers",
         ),
     ],
 )

@@ -278,7 +278,10 @@ BUILDERS = {"message", "not_simulated", "unsupported"}
 # Beginnings of other texts, by file, and why they are no `NAME: got VALUE`.
 EXCEPTIONS = {
     "assets.py": {"the URDF files of newton_qd are missing": "about an installation"},
-    "physics/reverse_mode.py": {"_FORWARD": "JAX's words, and what to use instead"},
+    "physics/reverse_mode.py": {
+        "_FORWARD": "JAX's words, and what to use instead",
+        "_SECOND": "about a transformation, not a value",
+    },
     "physics/model/xml_reader.py": {
         "{self.path}, line {error.lineno}": "about the text of a file, not a value",
         "{self.path}, line 1": "about the text of a file, not a value",

@@ -116,6 +116,10 @@ def test_policies_are_diagnosed_too() -> None:
             {"genotypes": np.zeros((2, 16, 2))},
             r"allowed: .*\(worlds, steps, 1\)",
         ),
+        (
+            {"policy": lambda x, y: y, "genotypes": np.zeros((2, 1), int)},
+            r"genotypes: got a leaf of int..; allowed: floating-point",
+        ),
         ({"policy": lambda x, y: y}, "genotypes: got None; allowed: with a policy"),
     ],
 )

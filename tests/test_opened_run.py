@@ -117,6 +117,8 @@ def test_an_evaluation_repeats_the_archive_bitwise(found: Run) -> None:
     alone = found.evaluate(int(cells[1]))
     assert alone.fitnesses.shape == () and alone.descriptors.shape == (2,)
     assert alone.fitnesses == archive.fitnesses[cells[1]]
+    place = tuple((archive.centroids[cells[1]] * 4).astype(int).tolist())
+    assert found.evaluate(place).cells == cells[1]  # as ``elite`` reads it
 
 
 @pytest.mark.parametrize("kind", [jax.random.key, jax.random.PRNGKey])

@@ -96,6 +96,8 @@ def test_what_pyribs_would_refuse_counts_as_faulty() -> None:
     def without(genotypes: jax.Array, key: jax.Array) -> Any:
         return jnp.ones(3), descriptors, {}
 
+    with pytest.raises(ValueError, match=r"solutions: got .*; allowed: .*\(N, size\)"):
+        make_ribs_evaluation(score, key, **common)(solutions[0])
     evaluate = make_ribs_evaluation(without, key, jacobian=True, **common)
     with pytest.raises(GradientsError, match=r"'gradients' is missing"):
         evaluate(solutions)

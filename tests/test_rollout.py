@@ -83,6 +83,17 @@ def test_a_batched_environment_rolls_out_each_world() -> None:
         env.rollout(state, actions[:, :2])
 
 
+@pytest.mark.parametrize("options", [{}, {"auto_reset": False, "eval_metrics": True}])
+def test_wrappers_around_a_batch_roll_out_each_world(options: dict[str, Any]) -> None:
+    env = newton_qd.create("pointmaze", batch_size=WORLDS, **options)
+    state = jax.jit(env.reset)(jax.random.key(1))
+    actions = jnp.swapaxes(plans(env), 0, 1)
+    expected = jax.jit(lambda s, a: scanned(env, s, a))(state, actions)
+    assert_same(jax.jit(env.rollout)(state, actions), expected)
+    with pytest.raises(ValueError, match=r"actions: .* shape \(steps, 5, 2\)"):
+        env.rollout(state, actions[:, 0])
+
+
 class Doubled(Wrapper):
     """Doubles the action."""
 

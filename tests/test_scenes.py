@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -249,6 +250,18 @@ def test_refused_rows(tmp_path: Path) -> None:
     message = "colliders of 'base': got none; allowed: at least one, each of sphere"
     with pytest.raises(RobotDescriptionError, match=message):
         load_system(bare, scene=dataclasses.replace(TRAP, links=("base",)))
+    wrong: Any
+    for wrong in (["torso"], "torso", (3,)):
+        message = r"scene 'trap', links: got .*; allowed: None, a tuple of names"
+        with pytest.raises(RobotDescriptionError, match=message):
+            load_system(ANT, scene=dataclasses.replace(TRAP, links=wrong))
+    wrong = 4
+    with pytest.raises(RobotDescriptionError, match=r"'trap', urdf: got 4; allowed: a"):
+        load_system(ANT, scene=dataclasses.replace(TRAP, urdf=wrong))
+    wrong = ["foot_1"]
+    message = r"robot 'ant', contacts: link: got \['foot_1'\]; allowed: a name"
+    with pytest.raises(RobotDescriptionError, match=message):
+        load_system(dataclasses.replace(ANT, contacts=(Contact(wrong),)))
     with pytest.raises(TypeError, match="scene: got 'trap'; allowed: None, or a Scene"):
         load_system(ANT, scene="trap")  # pyright: ignore[reportArgumentType]
 

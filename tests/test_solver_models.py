@@ -127,6 +127,13 @@ def test_bad_arguments_of_a_step(tmp_path: Path, device: jax.Device) -> None:
         loop.solver.step(other, loop.next, loop.control, None, 0.01)
     with pytest.raises(ValueError, match=r"state_out.joint_q: got shape \(24,\); al"):
         loop.solver.step(loop.now, other, loop.control, None, 0.01)
+    nothing: Any = None
+    with pytest.raises(TypeError, match="state_out: got None; allowed: a new"):
+        loop.solver.step(loop.now, nothing, loop.control, None, 0.01)
+    with pytest.raises(TypeError, match="model: got None; allowed: a new"):
+        NewtonQDSolver(nothing, robot)
+    with pytest.raises(TypeError, match="robot: got None; allowed: a RobotSpec"):
+        NewtonQDSolver(loop.solver.model, nothing)
     loop.control.joint_f = None
     with pytest.raises(ValueError, match=r"control.joint_f: got None; allowed: shape"):
         loop.step(0.01)

@@ -33,6 +33,15 @@ def names(folder: Path, runs: tuple[tuple[str, int], ...]) -> dict[str, list[int
     return {key[1]: [run.seed for run in runs] for key, runs in found.items()}
 
 
+def test_a_folder_without_runs_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["study_scores.py", str(tmp_path / "none")])
+    with pytest.raises(SystemExit):
+        study_scores.main()
+    assert "none; allowed: a folder with runs.csv" in capsys.readouterr().err
+
+
 def test_the_chosen_variant_has_the_name(tmp_path: Path) -> None:
     runs = (("me@1", 0), ("me@3", 0), ("me@3", 1), ("me@3", 1000), ("me@cut", 0))
     expected = {"me": [0, 1], "me@1": [0], "me@cut": [0]}

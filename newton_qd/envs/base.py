@@ -216,8 +216,9 @@ class PhysicsEnv(Env):
             q: (nq,) coordinates of the default pose [m or rad].
 
         Returns:
-            (nq,) coordinates [m or rad]. A robot without ``rest_height`` is then moved
-            up or down until its lowest contact is on the ground.
+            (nq,) coordinates [m or rad]. Quaternions may have any length above 0. A
+            robot without ``rest_height`` is then moved up or down until its lowest
+            contact is on the ground.
         """
         del rng
         return q
@@ -242,8 +243,13 @@ class PhysicsEnv(Env):
         Row i is body ``system.body_names[i]``. ``reads_bodies = True`` makes it faster.
 
         Args:
-            state: State of one world.
+            state: State of one world: ``pipeline_state`` of a ``State``.
+
+        Raises:
+            TypeError: It is not a state of the physics.
         """
+        allowed = "a PhysicsState, such as state.pipeline_state"
+        checks.instance("state", state, PhysicsState, allowed)
         return physics.seen_bodies(self.system, state)
 
     def reset(self, rng: RNGKey) -> State:
@@ -259,6 +265,7 @@ class PhysicsEnv(Env):
         root_key, angle_key, velocity_key = jax.random.split(rng, 3)
         rest = split_as([rng], self._rest())
         q = self.reset_pose(root_key, rest.q)
+        q = physics.unit_quaternions(self.system, q)
         q = q.at[self._joint_q].add(self._noise(angle_key, self._angle_noise))
         if self._grounding is not None:
             coordinate, sign = self._grounding
@@ -294,7 +301,7 @@ class PhysicsEnv(Env):
         # numbers instead, so that its gradient is 0 and not 0 * nan ("double where").
         start: PhysicsState = state.pipeline_state
         sound = jnp.all(jnp.isfinite(action)) & (state.info["fault"] == 0)
-        control = self.control(start, action)
+        control = self._number(self.control(start, action))
         control = jnp.where(sound, control, jnp.full_like(control, jnp.nan))
         after, fault = physics.step(self.system, start, control, params)
         fault = jnp.maximum(state.info["fault"], fault)

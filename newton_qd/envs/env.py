@@ -69,12 +69,13 @@ class Env(abc.ABC):
         ``auto_reset=True``, the steps run one by one.
 
         Args:
-            state: State at the start, of one world.
+            state: State at the start. One of a batch has the batch axis in front.
             actions: (T, nu) actions of the environment's dtype, usually from -1 to 1.
+                For a batch: (T, batch, nu).
             params: Physical parameters of the world, as for ``step``.
 
         Returns:
-            The states after each step, leaves (T, ...).
+            The states after each step, leaves (T, ...); of a batch (T, batch, ...).
 
         Raises:
             TypeError: The state or an action has the wrong type.

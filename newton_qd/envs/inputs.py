@@ -154,7 +154,7 @@ def checked_layout(env: str, blocks: object) -> tuple[tuple[str, int], ...]:
 
     Raises:
         TypeError: It is not a dictionary with at least one block, or a block is not
-            an array.
+            an array of real numbers.
         ValueError: A block does not have exactly one axis.
     """
     if not isinstance(blocks, dict) or not blocks:
@@ -169,6 +169,7 @@ def checked_layout(env: str, blocks: object) -> tuple[tuple[str, int], ...]:
         if len(block.shape) != 1:
             given = Fact(f"shape {block.shape}")
             raise ValueError(message(f"{env}.observe: {name!r}", given, allowed))
+        require_real(f"{env}.observe: {name!r}", block)
     return tuple((name, block.shape[0]) for name, block in blocks.items())
 
 
@@ -180,7 +181,8 @@ def checked_outcome(env: str, found: object) -> tuple[str, ...]:
         found: Shapes of the result of ``outcome``.
 
     Raises:
-        TypeError: It is not a tuple of reward, done and metrics.
+        TypeError: It is not a tuple of reward, done and metrics, or one of these is not
+            a real number.
         ValueError: A number does not have the shape ().
     """
     if (
@@ -192,10 +194,25 @@ def checked_outcome(env: str, found: object) -> tuple[str, ...]:
         raise TypeError(message(f"{env}.outcome", found, allowed))
     reward, done, metrics = found
     for name, value in {"reward": reward, "done": done, **metrics}.items():
+        require_real(f"{env}.outcome: {name!r}", value)
         if jnp.shape(value) != ():
             given = Fact(f"shape {jnp.shape(value)}")
             raise ValueError(message(f"{env}.outcome: {name!r}", given, "shape ()"))
     return tuple(metrics)
+
+
+def require_real(name: str, value: object) -> None:
+    """Checks that what a method returns has real numbers.
+
+    Raises:
+        TypeError: It is no array and no number, or has complex numbers.
+    """
+    allowed = "real numbers"
+    if not checks.is_array(value) and not isinstance(value, (bool, int, float)):
+        given = Fact("None" if value is None else f"a {type(value).__name__}")
+        raise TypeError(message(name, given, allowed))
+    if jnp.issubdtype(jnp.result_type(value), jnp.complexfloating):
+        raise TypeError(message(name, Fact("complex numbers"), allowed))
 
 
 def checked_vector(name: str, found: object, size: int, *, meaning: str) -> None:
@@ -215,5 +232,6 @@ def checked_vector(name: str, found: object, size: int, *, meaning: str) -> None
     if not checks.is_array(found):
         given = Fact(f"a {type(found).__name__}")
         raise TypeError(message(name, given, allowed))
+    require_real(name, found)
     if jnp.shape(found) != (size,):
         raise ValueError(message(name, Fact(f"shape {jnp.shape(found)}"), allowed))

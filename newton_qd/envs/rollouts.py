@@ -42,10 +42,13 @@ def rollout(env: Any, state: State, actions: Action, params: Params) -> State:
         TypeError: The state or an action has the wrong type.
         ValueError: The state, the actions or ``params`` do not fit the environment.
     """
-    if jnp.ndim(actions) != 2 or jnp.shape(actions)[1] != env.action_size:
-        allowed = f"an array of shape (steps, {env.action_size})"
+    # a wrapper around a batch: ``VectorWrapper`` itself has a ``rollout`` of its own
+    batched = getattr(env, "batch_size", None) is not None
+    shape = (*(jnp.shape(state.done) if batched else ()), env.action_size)
+    if jnp.ndim(actions) == 0 or jnp.shape(actions)[1:] != shape:
+        allowed = f"an array of shape (steps, {', '.join(map(str, shape))})"
         raise ValueError(message("actions", actions, allowed))
-    order = _order(env)
+    order = RolloutOrder.ONE_BY_ONE if batched else _order(env)
     if order == RolloutOrder.ONE_BY_ONE:
         return _in_order(env, state, actions, params, known=False)
     base = env.unwrapped
@@ -101,6 +104,7 @@ def _foresee(base: Any, state: State, actions: Action, params: Params) -> Forese
     """Runs the physics of a :class:`~newton_qd.envs.base.PhysicsEnv` for a plan."""
     start = state.pipeline_state
     controls = jax.vmap(base.control, (None, 0))(start, actions)
+    controls = jnp.asarray(controls, base.dtype)
     # as in ``PhysicsEnv.step``: such a control tells the physics to freeze a world
     sound = jnp.all(jnp.isfinite(actions), axis=1) & (state.info["fault"] == 0)
     controls = jnp.where(sound[:, None], controls, jnp.full_like(controls, jnp.nan))

@@ -61,8 +61,9 @@ def checked_genotypes(
     """Returns genotypes in the dtype of the environment; cuts plans to ``length``.
 
     Raises:
-        ValueError: They are missing, their leaves have different numbers of worlds, or
-            plans are not actions (worlds, steps, nu) for all steps.
+        ValueError: They are missing, their leaves have different numbers of worlds, a
+            leaf for a policy is not floating-point, or plans are not actions (worlds,
+            steps, nu) for all steps.
     """
     if genotypes is None:
         raise ValueError(message("genotypes", None, "with a policy: what it acts by"))
@@ -77,6 +78,11 @@ def checked_genotypes(
     if len(worlds) != 1 or worlds & {(), (0,)}:
         raise ValueError(message("genotypes", given, "(worlds, ...) each"))
     if policy is not None:
+        for leaf in jax.tree.leaves(genotypes):
+            if not jnp.issubdtype(leaf.dtype, jnp.floating):
+                given = Fact(f"a leaf of {leaf.dtype}")
+                allowed = "floating-point leaves; the policy may keep other numbers"
+                raise ValueError(message("genotypes", given, allowed))
         return genotypes
     plan = (length, env.action_size)
     if len(shapes) > 1 or len(shapes[0]) != 3 or shapes[0][2] != plan[1]:
@@ -94,7 +100,7 @@ def made_env(env: Env | str) -> Env:
 
     Raises:
         TypeError: It is neither a name nor an environment.
-        ValueError: It is float32.
+        ValueError: It is float32, or has a batch.
     """
     if isinstance(env, str):
         return create(env, episode_length=None, auto_reset=False, dtype="float64")
@@ -106,4 +112,8 @@ def made_env(env: Env | str) -> Env:
             "under jax.enable_x64(True)"
         )
         raise ValueError(message("env", Fact(f"dtype {env.dtype}"), allowed))
+    batch = getattr(env, "batch_size", None)
+    if batch is not None:
+        given = Fact(f"an environment of {batch} worlds")
+        raise ValueError(message("env", given, "an environment of one world"))
     return env

@@ -17,7 +17,7 @@ from newton_qd.physics.model.rest import grounding_coordinate, raising_coordinat
 from newton_qd.physics.model.substeps import FewSubstepsWarning, recommended_substeps
 from newton_qd.physics.model.wall_speeds import SoftWallWarning, wall_speeds
 from newton_qd.physics.parameters import PhysicsParams, default_params
-from newton_qd.physics.step import initial_state, rollout, step
+from newton_qd.physics.step import initial_state, rollout, step, unit_quaternions
 from newton_qd.physics.system import Kinematics, PhysicsState, System
 
 quiet()
@@ -48,5 +48,6 @@ __all__ = [
     "seen_bodies",
     "step",
     "to_jax",
+    "unit_quaternions",
     "wall_speeds",
 ]

@@ -17,7 +17,12 @@ def _rotate(quaternion: jax.Array, vector: jax.Array) -> jax.Array:
     return vector + w * turned + jnp.cross(axis, turned)
 
 
-def _checked(system: System, name: str, value: jax.Array, size: int) -> jax.Array:
+def checked_vector(system: System, name: str, value: jax.Array, size: int) -> jax.Array:
+    """Returns a vector (size,) in the dtype of a system.
+
+    Raises:
+        ValueError: It has the wrong shape.
+    """
     value = jnp.asarray(value, jnp.dtype(system.dtype))
     if value.shape != (size,):
         raise ValueError(message(name, value, f"an array of shape ({size},)"))
@@ -38,8 +43,8 @@ def forward_kinematics(system: System, q: jax.Array, v: jax.Array) -> Kinematics
     Raises:
         ValueError: ``q`` or ``v`` has the wrong shape.
     """
-    q = _checked(system, "q", q, system.nq)
-    v = _checked(system, "v", v, system.nv)
+    q = checked_vector(system, "q", q, system.nq)
+    v = checked_vector(system, "v", v, system.nv)
     return bridge.kinematics(system)(q, v)
 
 
@@ -76,7 +81,7 @@ def mass_matrix(system: System, q: jax.Array) -> jax.Array:
     Raises:
         ValueError: ``q`` has the wrong shape.
     """
-    q = _checked(system, "q", q, system.nq)
+    q = checked_vector(system, "q", q, system.nq)
     return bridge.dynamics(system, q, jnp.zeros((system.nv,), q.dtype))[0]
 
 
@@ -96,8 +101,8 @@ def bias_forces(system: System, q: jax.Array, v: jax.Array) -> jax.Array:
     Raises:
         ValueError: ``q`` or ``v`` has the wrong shape.
     """
-    q = _checked(system, "q", q, system.nq)
-    v = _checked(system, "v", v, system.nv)
+    q = checked_vector(system, "q", q, system.nq)
+    v = checked_vector(system, "v", v, system.nv)
     return bridge.dynamics(system, q, v)[1]
 
 
@@ -117,7 +122,7 @@ def contact_gaps(system: System, q: jax.Array) -> jax.Array:
     Raises:
         ValueError: ``q`` has the wrong shape.
     """
-    q = _checked(system, "q", q, system.nq)
+    q = checked_vector(system, "q", q, system.nq)
     if not len(system.contact_body):
         return jnp.zeros((0,), q.dtype)
     return bridge.contact_gaps(system, q)
@@ -143,9 +148,9 @@ def contact_impulses(
     Raises:
         ValueError: The state or the control has the wrong shape.
     """
-    q = _checked(system, "q", state.q, system.nq)
-    v = _checked(system, "v", state.v, system.nv)
-    control = _checked(system, "control", control, system.nu)
+    q = checked_vector(system, "q", state.q, system.nq)
+    v = checked_vector(system, "v", state.v, system.nv)
+    control = checked_vector(system, "control", control, system.nu)
     if not len(system.contact_body):
         empty = jnp.zeros((system.substeps, 0, 4), q.dtype)
         return empty[..., :3], empty[..., 3]

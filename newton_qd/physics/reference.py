@@ -163,7 +163,10 @@ def origin_axes(system: System) -> np.ndarray:
     if system.joint_kind[0] == JointKind.FREE:
         return np.eye(3)
     axes = np.zeros((3, 3))
-    frames = body_frames(system, np.zeros(system.nq))
+    q = np.zeros(system.nq)
+    free = system.joint_kind == JointKind.FREE
+    q[system.q_start[free] + 6] = 1.0  # of a quaternion xyzw
+    frames = body_frames(system, q)
     for body in range(min(3, system.nb)):
         slides = system.joint_kind[body] == JointKind.PRISMATIC
         if not slides or system.parent[body] != body - 1:

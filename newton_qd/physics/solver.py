@@ -114,10 +114,13 @@ class NewtonQDSolver(SolverBase):
         Raises:
             ValueError: A world of ``model`` is not a copy of the robot. The message
                 names the array that differs.
-            TypeError: ``robot`` is not a ``RobotSpec``.
+            TypeError: ``model`` is not a ``newton.Model``, or ``robot`` not a
+                ``RobotSpec``.
             AssetNotFoundError: The robot's URDF file does not exist.
             RobotDescriptionError: The physics does not support the file or the robot.
         """
+        checks.instance("model", model, newton.Model, "a newton.Model")
+        checks.instance("robot", robot, RobotSpec, "a RobotSpec")
         super().__init__(model)
         self.robot = robot
         self._reference = _one_world(robot, model.device, packages)
@@ -163,12 +166,15 @@ class NewtonQDSolver(SolverBase):
             observables: Not supported. It must be ``None`` or empty.
 
         Raises:
+            TypeError: A state is not a ``newton.State``.
             ValueError: ``dt`` is not positive, an array has the wrong size, or the
                 value of an environment variable is not allowed.
             NotImplementedError: ``observables`` is not empty.
             RuntimeError: A ``wp.Tape`` is recording.
         """
         self.validate_observables(observables)
+        for name, state in (("state_in", state_in), ("state_out", state_out)):
+            checks.instance(name, state, newton.State, "a newton.State")
         checks.number("dt", dt, above=0)
         if tape_is_recording():
             raise RuntimeError(

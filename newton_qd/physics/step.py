@@ -9,9 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from newton_qd.physics import bridge
-from newton_qd.physics.inspection import forward_kinematics
+from newton_qd.physics.inspection import checked_vector, forward_kinematics
+from newton_qd.physics.kinds import JointKind
 from newton_qd.physics.parameters import PhysicsParams, parameter_row
 from newton_qd.physics.system import CONTACT_FRACTION, PhysicsState, System
+
+_ROUNDED = 1e-3
+"""Largest difference from 1 of the squared length of a quaternion that is kept."""
 
 
 def initial_state(system: System, q: jax.Array, v: jax.Array) -> PhysicsState:
@@ -19,18 +23,18 @@ def initial_state(system: System, q: jax.Array, v: jax.Array) -> PhysicsState:
 
     Args:
         system: The system.
-        q: (nq,) coordinates [m or rad].
+        q: (nq,) coordinates [m or rad]. Quaternions may have any length above 0.
         v: (nv,) velocities [m/s or rad/s].
 
     Returns:
         The state.
 
     Raises:
-        ValueError: ``q`` or ``v`` has the wrong shape. This is checked only if the
-            kinematics of the bodies are computed.
+        ValueError: ``q`` or ``v`` has the wrong shape.
     """
     dtype = jnp.dtype(system.dtype)
-    q, v = jnp.asarray(q, dtype), jnp.asarray(v, dtype)
+    q = unit_quaternions(system, checked_vector(system, "q", q, system.nq))
+    v = checked_vector(system, "v", v, system.nv)
     bodies = forward_kinematics(system, q, v) if system.reports_bodies else None
     start = int(system.q_start[system.torso])
     torso_xy = q[start : start + 2]
@@ -48,6 +52,26 @@ def initial_state(system: System, q: jax.Array, v: jax.Array) -> PhysicsState:
         torso_xy=torso_xy,
         bodies=bodies,
     )
+
+
+def unit_quaternions(system: System, q: jax.Array) -> jax.Array:
+    """Returns coordinates whose quaternions have the length 1.
+
+    One that has it already, but for rounding, stays bitwise the same. One of length 0
+    is no rotation: it becomes NaN, which a step reports as a fault.
+
+    Args:
+        system: The system.
+        q: (nq,) coordinates [m or rad].
+    """
+    for start in system.q_start[system.joint_kind == JointKind.FREE] + 3:
+        quaternion = q[start : start + 4]
+        square = jnp.sum(quaternion**2)
+        length = jnp.sqrt(jnp.where(square > 0, square, 1))
+        scaled = jnp.where(square > 0, quaternion / length, jnp.nan)
+        unit = jnp.where(jnp.abs(square - 1) <= _ROUNDED, quaternion, scaled)
+        q = q.at[start : start + 4].set(unit)
+    return q
 
 
 def _unloaded(system: System) -> float:

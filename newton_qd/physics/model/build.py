@@ -34,7 +34,7 @@ from newton_qd.physics.model.newton_input import (
 )
 from newton_qd.physics.model.rest import rest_coordinates
 from newton_qd.physics.model.robot_checks import check_robot, index_of, refusal
-from newton_qd.physics.model.scene import obstacle_tables, read_scene
+from newton_qd.physics.model.scene import check_scene, obstacle_tables, read_scene
 from newton_qd.physics.model.substeps import (
     FewSubstepsWarning,
     few_substeps,
@@ -363,8 +363,7 @@ def load_system(
     )
     checks.choice("feet_tail", feet_tail, TAILS)
     check_robot(robot)  # before the cache computes its hash
-    allowed = "a Scene such as newton_qd.scenes.TRAP"
-    checks.instance("scene", scene, Scene, allowed, optional=True)
+    check_scene(scene)
     files = [find_urdf(one.urdf) for one in (robot, scene) if one is not None]
     contents = tuple(file.read_bytes() for file in files)
     system = _cached_system(robot, dtype, scene, contents)

@@ -130,8 +130,22 @@ def _check_types(robot: RobotSpec) -> None:
         raise refusal(robot, "material", robot.material, "a Material")
 
 
+def _check_names(robot: RobotSpec, field: str, contact: Contact) -> None:
+    """Checks that the names of a contact are text."""
+    text = 'a name, such as "foot"'
+    if not isinstance(contact.link, str):
+        raise refusal(robot, f"{field}: link", contact.link, text)
+    if not isinstance(contact.collider, (str, type(None))):
+        raise refusal(robot, f"{field}: collider", contact.collider, f"None, {text}")
+
+
 def _check_contacts(robot: RobotSpec) -> None:
-    """Checks the ``end`` of each contact, also in pairs."""
+    """Checks names and ``end`` of each contact, also in pairs."""
+    for contact in robot.contacts:
+        _check_names(robot, "contacts", contact)
+    for pair in robot.pairs:
+        for contact in pair:
+            _check_names(robot, "pairs", contact)
     for contact in robot.contacts:
         if contact.end not in (-1, 0, 1):
             field = f"contacts: end of {contact.link!r}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Iterator
 
 import numpy as np
@@ -148,6 +149,31 @@ def whole_collider(body: int, obstacle: int, shape: Shape) -> ContactRow:
     return ContactRow(body, obstacle, shape.frame[:3], half, float(shape.size[0]))
 
 
+def check_scene(scene: Scene | None) -> None:
+    """Checks the types of a scene's fields.
+
+    Raises:
+        TypeError: ``scene`` is not a ``Scene``.
+        RobotDescriptionError: A field has the wrong type.
+    """
+    if scene is None:
+        return
+    allowed = "None, or a Scene such as newton_qd.scenes.TRAP"
+    checks.instance("scene", scene, Scene, allowed)
+    checks.text("scene, name", scene.name, error=RobotDescriptionError)
+    field = f"scene {scene.name!r}"
+    if not isinstance(scene.urdf, (str, os.PathLike)):
+        allowed = 'a path, such as "walls.urdf"'
+        raise RobotDescriptionError(message(f"{field}, urdf", scene.urdf, allowed))
+    names = scene.links
+    if names is not None and (
+        # a string is a sequence too: it would be read as one name per letter
+        not isinstance(names, tuple) or not all(isinstance(name, str) for name in names)
+    ):
+        allowed = 'None, a tuple of names of links, such as ("foot",)'
+        raise RobotDescriptionError(message(f"{field}, links", names, allowed))
+
+
 def wall_contacts(
     robot: RobotSpec,
     scene: Scene,
@@ -184,6 +210,8 @@ def wall_contacts(
             field = f"scene {scene.name!r}, links: colliders of {name!r}"
             found = Fact(listed([shape.kind for shape in shapes]))
             allowed = f"at least one, each of {listed(TOUCHING)}"
+            if scene.links is None:
+                allowed += "; Scene(links=(...)) names other links"
             raise RobotDescriptionError(message(field, found, allowed))
         for shape in shapes:
             for obstacle in range(1, obstacles):

@@ -43,7 +43,7 @@ def soft_walls(system: System) -> tuple[str, ...]:
     Args:
         system: The system.
     """
-    if system.scene is None:
+    if system.scene is None or system.scene.links == ():  # it touches nothing
         return ()
     speeds, texts = wall_speeds(system), []
     for wall in range(1, len(system.obstacle_kind)):

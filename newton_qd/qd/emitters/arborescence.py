@@ -26,10 +26,11 @@ from qdax.core.containers.mapelites_repertoire import get_cells_indices
 from qdax.core.emitters.emitter import Emitter
 
 from newton_qd import checks
-from newton_qd.checks import Fact, message
+from newton_qd.checks import Fact, listed, message
 from newton_qd.envs.state import select
 from newton_qd.qd.emitters.arborescence_state import ArborescenceState
 from newton_qd.qd.emitters.cma_es import CMAES, CMAESState
+from newton_qd.qd.emitters.optimizer_check import check_optimizer
 from newton_qd.qd.emitters.ranking import best_of
 from newton_qd.qd.emitters.restarts import RestartRule
 from newton_qd.qd.scoring.gradient_scores import (
@@ -90,8 +91,17 @@ class ArborescenceEmitter(Emitter, abc.ABC):
                 repertoire.
 
         Raises:
-            ValueError: A number is out of its range.
+            TypeError: ``scoring_function`` is no function, or ``optimizer`` is not one
+                of optax.
+            ValueError: A number is out of its range, or ``restart_rule`` is unknown.
         """
+        allowed = "a function of scores with gradients, as Episode.scoring makes it"
+        checks.function("scoring_function", scoring_function, allowed)
+        if optimizer is not None:
+            check_optimizer(optimizer)
+        rules = [rule.value for rule in RestartRule]
+        if restart_rule is not None and restart_rule not in {*RestartRule, *rules}:
+            raise ValueError(message("restart_rule", restart_rule, listed(rules)))
         for name, value, low in (
             ("batch_size", batch_size, 3),
             ("num_emitters", num_emitters, 1),

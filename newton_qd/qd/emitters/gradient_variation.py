@@ -13,6 +13,7 @@ from qdax.core.emitters.repertoire_selectors.selector import Selector
 
 from newton_qd.checks import Fact, message
 from newton_qd.qd.emitters.elite_gradients import EliteGradientEmitter, check_steps
+from newton_qd.qd.emitters.optimizer_check import check_optimizer
 from newton_qd.qd.scoring.gradient_scores import normalize, read_scores
 from newton_qd.types import (
     ExtraScores,
@@ -63,10 +64,12 @@ class GradientVariationEmitter(EliteGradientEmitter):
             selector: Selector of QDax; ``None``: uniform, with replacement.
 
         Raises:
+            TypeError: ``optimizer`` is not one of optax.
             ValueError: ``steps`` needs a ``scoring_function``, ``directions`` is not a
                 finite matrix, or a number is out of its range.
         """
         super().__init__(batch_size, selector)
+        check_optimizer(optimizer)
         check_steps(steps, scoring_function)
         if directions is not None:
             directions = np.asarray(directions)

@@ -65,7 +65,7 @@ def load_archive(folder: str | os.PathLike[str]) -> Archive:
     path = Path(folder) / ARCHIVE
     try:
         content = path.read_bytes()
-    except FileNotFoundError as error:
+    except (FileNotFoundError, NotADirectoryError) as error:
         allowed = "the folder of a run that has saved its archive or a checkpoint"
         missing = message("folder", Fact(f"{folder}, which has no {ARCHIVE}"), allowed)
         raise FileNotFoundError(missing) from error

@@ -200,7 +200,8 @@ class Run:
         """Evaluates elites again.
 
         Args:
-            cell: Row of the archive, or (N,) rows; ``None``: all elites.
+            cell: Row of the archive, a tuple of coordinates in the grid, or a list or
+                array of (N,) rows; ``None``: all elites.
             keys: Key or (K,) keys of the reset. ``None``: the key of the run. Then
                 fitness and descriptor are bitwise those of the archive, on the same
                 kind of machine with the same versions. With ``new_starts`` they are
@@ -216,6 +217,8 @@ class Run:
             require_key("keys", keys, several=True)
             if keys.size == 0:
                 raise ValueError(message("keys", Fact("no keys"), "one or more"))
+        if isinstance(cell, tuple):
+            cell = self.elite(cell).cell
         alone = cell is not None and np.ndim(cell) == 0
         rows = self.cells if cell is None else np.atleast_1d(np.asarray(cell))
         if not len(rows):

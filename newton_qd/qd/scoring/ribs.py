@@ -57,8 +57,8 @@ def make_ribs_evaluation(
         TypeError: ``limits`` are not two vectors.
         ValueError: ``worst`` is not finite, or a highest descriptor is not above the
             lowest one. The returned function raises ``GradientsError`` if gradients are
-            missing or have the wrong shape, and ``ValueError`` if the limits do not
-            have the shape of a descriptor.
+            missing or have the wrong shape, and ``ValueError`` if the solutions are no
+            matrix or the limits do not have the shape of a descriptor.
     """
     checks.number("worst", worst)
     low = jnp.asarray(_limits(limits)[0], jnp.float32)
@@ -81,6 +81,9 @@ def make_ribs_evaluation(
         return objectives, jnp.where(good[:, None], descriptors, low), *rows
 
     def evaluate(solutions: np.ndarray) -> tuple[np.ndarray, ...]:
+        if np.ndim(solutions) != 2:
+            allowed = "an array of shape (N, size)"
+            raise ValueError(message("solutions", solutions, allowed))
         results = run(jnp.asarray(solutions, jnp.float32))
         # copies, because pyribs normalizes the gradients in place
         return tuple(np.array(result) for result in results)

@@ -105,10 +105,17 @@ def make_policy(env: Environment, hidden: tuple[int, ...]) -> Policy:
     def apply(parameters: PyTree, observation: Observation) -> jax.Array:
         return jnp.asarray(network.apply(parameters, observation))
 
+    def parameters_of(weights: jax.Array) -> PyTree:
+        if jnp.shape(weights) != (flat.size,):
+            given = Fact(f"shape {jnp.shape(weights)}")
+            allowed = f"({flat.size},), those of this policy"
+            raise ValueError(message("weights", given, allowed))
+        return unravel(weights)
+
     return Policy(
         size=flat.size,
         init=init,
-        unravel=unravel,
+        unravel=parameters_of,
         apply=apply,
         ravel=lambda parameters: ravel_pytree(parameters)[0],
         network=network,
