@@ -119,7 +119,7 @@ SMALL = Protocol(
         *("ant_uni", "ant_omni", "anttrap", "antmaze"),
         *("halfcheetah_uni", "hopper_uni", "walker2d_uni", "humanoid_uni"),
     ),
-    algorithms=("me", "ascii-me", *OURS),
+    algorithms=(*BASELINES, *OURS),
     settings={**FIELD.settings, "batch_size": 256, "reevaluations": 4},
     own={},
     stops=(Stop("evaluations", 20_000), Stop("s", 20), Stop("s", 60)),
