@@ -13,6 +13,7 @@ import numpy as np
 
 from newton_qd import checks, registry
 from newton_qd.adapters.live_camera import LiveCamera
+from newton_qd.adapters.pickled import Pickled
 from newton_qd.adapters.worlds import one_world
 from newton_qd.envs.base import Env
 from newton_qd.envs.state import State
@@ -69,7 +70,7 @@ def _key(seed: int) -> jax.Array:
     return jax.random.key(seed % 2**32)  # JAX counts in 32 bits
 
 
-class GymnasiumEnv(gymnasium.Env):
+class GymnasiumEnv(Pickled, gymnasium.Env):
     """One world as an environment of Gymnasium.
 
     Observations, rewards and ends are bitwise those of ``jax.jit(env.step)``. An
@@ -82,6 +83,7 @@ class GymnasiumEnv(gymnasium.Env):
         state: Its present state.
     """
 
+    rebuilt = ("_reset", "_step")
     metadata: dict[str, Any] = {  # noqa: RUF012 - as in Gymnasium
         "render_modes": list(RENDER_MODES),
         "render_fps": 20,
@@ -116,10 +118,13 @@ class GymnasiumEnv(gymnasium.Env):
         self.render_mode = render_mode
         self.observation_space, self.action_space = spaces_of(self.env)
         self.state: State | None = None
-        self._reset, self._step = jax.jit(self.env.reset), jax.jit(self.env.step)
+        self._rebuild()
         self._camera = None
         if render_mode is not None:
             self._camera = LiveCamera(self.env, width, height)
+
+    def _rebuild(self) -> None:
+        self._reset, self._step = jax.jit(self.env.reset), jax.jit(self.env.step)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

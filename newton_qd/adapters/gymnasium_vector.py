@@ -17,6 +17,7 @@ from newton_qd.adapters.gymnasium import (
     spaces_of,
 )
 from newton_qd.adapters.live_camera import LiveCamera
+from newton_qd.adapters.pickled import Pickled
 from newton_qd.adapters.worlds import one_world
 from newton_qd.checks import message
 from newton_qd.envs.base import Env
@@ -32,7 +33,7 @@ except ModuleNotFoundError as error:
     raise MissingExtra("gymnasium", "gym") from error
 
 
-class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
+class GymnasiumVectorEnv(Pickled, gymnasium.vector.VectorEnv):
     """A batch of worlds as a vector environment of Gymnasium.
 
     A step of all worlds is one call. World ``i`` after ``reset(seed=n)`` begins as
@@ -50,6 +51,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         state: Its present state.
     """
 
+    rebuilt = ("_reset", "_step", "_place", "_keys")
     metadata: dict[str, Any] = {  # noqa: RUF012 - as in Gymnasium
         "render_modes": list(RENDER_MODES),
         "autoreset_mode": AutoresetMode.NEXT_STEP,
@@ -103,15 +105,19 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         self.observation_space = batch_space(seen, num_envs)
         self.action_space = batch_space(taken, num_envs)
         self.state: State | None = None
-        self._reset, self._step = jax.jit(jax.vmap(world.reset)), jax.jit(self.env.step)
-        self._place = jax.jit(_placed)
-        self._keys = jax.jit(jax.vmap(jax.random.key))
+        self._rebuild()
         self._eyes: list[LiveCamera] = []
         if render_mode is not None:
             self._eyes = [LiveCamera(world, width, height) for _ in range(num_envs)]
         self._ended = np.zeros(num_envs, bool)
         self._spare: State | None = None
         self._used = 0
+
+    def _rebuild(self) -> None:
+        self._reset = jax.jit(jax.vmap(self.env.env.reset))
+        self._step = jax.jit(self.env.step)
+        self._place = jax.jit(_placed)
+        self._keys = jax.jit(jax.vmap(jax.random.key))
 
     def reset(
         self,

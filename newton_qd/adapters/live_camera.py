@@ -6,14 +6,17 @@ from typing import Any
 
 import numpy as np
 
+from newton_qd.adapters.pickled import Pickled
 from newton_qd.envs.base import Env, PhysicsEnv
 from newton_qd.envs.state import State
 
 _AREA = 20.0  # half width of the grid on the ground [radii of the robot]
 
 
-class LiveCamera:
+class LiveCamera(Pickled):
     """Takes pictures; builds the scene again if a robot leaves its grid."""
+
+    rebuilt = ("_camera",)
 
     def __init__(self, env: Env, width: int, height: int) -> None:
         from newton_qd.viewing import drawing_of
@@ -21,8 +24,11 @@ class LiveCamera:
         self._drawing = drawing_of(env)
         self._physical = isinstance(env.unwrapped, PhysicsEnv)
         self._size = width, height
-        self._camera: Any = None
+        self._rebuild()
         self._centre = np.zeros(2)
+
+    def _rebuild(self) -> None:
+        self._camera: Any = None
 
     def picture(self, state: State) -> np.ndarray:
         """Returns a picture (height, width, 3), uint8, of the state of one world."""

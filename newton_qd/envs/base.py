@@ -83,7 +83,8 @@ class PhysicsEnv(Env):
         Raises:
             TypeError: An argument has the wrong type.
             ValueError: The robot or the scene cannot be built, the robot has no
-                actuators, or an overridden method returns a wrong shape.
+                actuators, or ``observe`` or ``outcome`` returns a wrong shape.
+                ``newton_qd.create`` checks the other methods, too.
             FileNotFoundError: A URDF file is missing.
         """
         self.robot = robot
