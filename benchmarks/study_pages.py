@@ -79,6 +79,7 @@ KINDS: dict[str, Callable[[str], str]] = {
     "best": lambda stop: study_scores.verdict(_field(), stop),
     "best on a CPU": lambda stop: study_scores.verdict(load(SMALL), stop),
     "scores": lambda stop: study_scores.table(_field(), stop, short=True),
+    "scores on a CPU": lambda stop: study_scores.table(load(SMALL), stop, short=True),
     "published": lambda _: study_scores.published(_field()),
     "long runs": lambda _: long_runs(),
     "equal runs": _equal_runs,
