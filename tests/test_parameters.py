@@ -259,6 +259,7 @@ def test_jacobian_of_an_episode(x64: None) -> None:
     np.testing.assert_allclose(gradient, jacobian[0], rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_worlds_are_independent(x64: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """Other parameters of one world, and numbers that are none, leave the rest alone.
 
@@ -297,6 +298,7 @@ def test_worlds_are_independent(x64: None, monkeypatch: pytest.MonkeyPatch) -> N
                 assert same(after[0][0][3], state.q[3])
 
 
+@pytest.mark.slow
 def test_value_with_gradient_is_the_value_without(x64: None) -> None:
     system = physics.load_system(ANT, "float64")
     state, control = inputs(system)
@@ -310,6 +312,7 @@ def test_value_with_gradient_is_the_value_without(x64: None) -> None:
     assert same(plain[0], recorded)
 
 
+@pytest.mark.slow
 def test_transformations_agree(x64: None) -> None:
     """Gradients of batches, of nested batches, of shared parameters, of a remat."""
     system = physics.load_system(ANT, "float64")
