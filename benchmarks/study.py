@@ -157,14 +157,7 @@ def checked(
                 parser.error(f"--run: got {value}; allowed: {', '.join(known)}")
     if args.seeds is None:
         args.seeds = protocol.seeds if protocol else 5
-    if protocol and args.seconds is not None:
-        parser.error("--seconds: got it without --protocol core; use --until")
-    if not protocol and args.until is not None:
-        parser.error("--until: got it with --protocol core; use --seconds")
-    args.seconds = 60.0 if args.seconds is None else args.seconds
-    if args.until is None:
-        stops = protocol.stops if protocol else ()
-        args.until = max((x.amount for x in stops if x.unit == "s"), default=math.inf)
+    _check_times(parser, args)
     if args.list:
         if not protocol:
             parser.error("--list: got it without --protocol field or small")
@@ -172,23 +165,34 @@ def checked(
             study_runs.listed(args.list, protocol, args.out)
         except (OSError, ValueError) as error:
             parser.error(f"--list: {error}")
-    if protocol and not args.reach_evaluations:
-        times = [x.amount for x in protocol.stops if x.unit == "s"]
-        if 0 < args.until < min(times):
-            allowed = ", ".join(f"{x:g}" for x in times)
-            parser.error(f"--until: got {args.until:g}; allowed: {allowed}")
     if args.paced and (not protocol or args.device != "cuda"):
         parser.error("--paced: got it without --protocol field or small and a GPU")
     for name in ("seeds", "gpus", "workers"):
         value = getattr(args, name)
         if value < 1:
             parser.error(f"--{name}: got {value}; allowed: an integer from 1")
+    return args
+
+
+def _check_times(parser: argparse.ArgumentParser, args: argparse.Namespace) -> None:
+    """Fills in the times of a protocol, and ends the command at a wrong one."""
+    protocol = PROTOCOLS.get(args.protocol)
+    if protocol and args.seconds is not None:
+        parser.error("--seconds: got it without --protocol core; use --until")
+    if not protocol and args.until is not None:
+        parser.error("--until: got it with --protocol core; use --seconds")
+    stops = [x.amount for x in protocol.stops if x.unit == "s"] if protocol else []
+    args.seconds = 60.0 if args.seconds is None else args.seconds
+    args.until = max(stops, default=math.inf) if args.until is None else args.until
     for name in ("seconds", "until", "stop_after", "start_until"):
         value = getattr(args, name)
         if not value > 0:
             option = name.replace("_", "-")
             parser.error(f"--{option}: got {value}; allowed: a number above 0")
-    return args
+    # a shorter run would reach none of them, and its work would be lost
+    if args.until < min(stops, default=0.0) and not args.reach_evaluations:
+        allowed = ", ".join(f"{x:g}" for x in stops)
+        parser.error(f"--until: got {args.until:g}; allowed: {allowed}")
 
 
 def coming(args: argparse.Namespace) -> Iterator[tuple[float, tuple[str, ...]]]:

@@ -57,8 +57,8 @@ def initial_state(system: System, q: jax.Array, v: jax.Array) -> PhysicsState:
 def unit_quaternions(system: System, q: jax.Array) -> jax.Array:
     """Returns coordinates whose quaternions have the length 1.
 
-    One that has it already, but for rounding, stays bitwise the same. One of length 0
-    is no rotation: it becomes NaN, which a step reports as a fault.
+    One whose length differs from 1 by less than about 0.0005 stays bitwise the same.
+    One of length 0 is no rotation: it becomes NaN, which a step reports as a fault.
 
     Args:
         system: The system.
