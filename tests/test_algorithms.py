@@ -121,6 +121,7 @@ def test_a_stop_changes_nothing(
         options=OPTIONS[name],  # pyright: ignore[reportArgumentType]
     )
     common: dict[str, Any] = {"progress": False, "checkpoint_seconds": 1e9}
+    monkeypatch.setattr(evolve_module, "archive_png", lambda *arguments: b"picture")
     try:
         # one search for both, which is traced once; the third run makes its own
         search = Search(config, make_task(config))

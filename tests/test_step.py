@@ -165,18 +165,20 @@ def test_ten_thousand_steps_are_finite(name: str) -> None:
 
     @jax.jit
     def play(state: Any, key: jax.Array) -> Any:
-        def advance(carry: Any, key: jax.Array) -> Any:
+        def advance(carry: Any, action: jax.Array) -> Any:
             state, finite = carry
-            shape = (worlds, env.action_size)
-            action = jax.random.uniform(key, shape, np.float32, -1.0, 1.0)
             state = jax.vmap(env.step)(state, action)
-            for leaf in jax.tree.leaves(state):
+            for leaf in (state.obs, state.reward, state.pipeline_state.v):
                 finite &= jnp.isfinite(leaf).all()
             finite &= (state.info["fault"] == 0).all()
             return (state, finite), None
 
-        keys = jax.random.split(key, chunk)
-        return jax.lax.scan(advance, (state, jnp.array(True)), keys)[0]
+        shape = (chunk, worlds, env.action_size)
+        actions = jax.random.uniform(key, shape, np.float32, -1.0, 1.0)
+        state, finite = jax.lax.scan(advance, (state, jnp.array(True)), actions)[0]
+        for leaf in jax.tree.leaves(state):
+            finite &= jnp.isfinite(leaf).all()
+        return state, finite
 
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), worlds))
     for key in jax.random.split(jax.random.key(1), steps // chunk):
