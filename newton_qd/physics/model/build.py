@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,10 +28,8 @@ from newton_qd.physics.model.description import (
 )
 from newton_qd.physics.model.elements import UNLIMITED, Shape
 from newton_qd.physics.model.inertia import check_inertia
-from newton_qd.physics.model.newton_input import (
-    NewtonInput,
-    merge_fixed_bodies,
-)
+from newton_qd.physics.model.kept_models import kept_or_built
+from newton_qd.physics.model.newton_input import NewtonInput, merge_fixed_bodies
 from newton_qd.physics.model.rest import rest_coordinates
 from newton_qd.physics.model.robot_checks import check_robot, index_of, refusal
 from newton_qd.physics.model.scene import check_scene, obstacle_tables, read_scene
@@ -244,11 +242,32 @@ def build_system(robot: RobotSpec, dtype: str, scene: Scene | None = None) -> Sy
         ModelMismatchError: Newton's model differs from the file.
         ValueError: ``dtype`` is not allowed, or needs JAX's 64-bit mode.
     """
+    return _system(robot, dtype, scene, _verified)
+
+
+def _kept(robot: RobotSpec, description: Description) -> BuiltModel:
+    """Returns the model that ``_verified`` builds, if possible from an earlier process.
+
+    Raises:
+        RobotDescriptionError: The kind of a joint is not supported.
+        ModelMismatchError: Newton's model differs from the file.
+    """
+    build = functools.partial(_verified, robot, description)
+    return kept_or_built(description, robot.gravity, build)
+
+
+def _system(
+    robot: RobotSpec,
+    dtype: str,
+    scene: Scene | None,
+    newton_model: Callable[[RobotSpec, Description], BuiltModel],
+) -> System:
+    """Does what ``build_system`` says, with Newton's model of the robot."""
     dtype = checks.precision(dtype).name
     check_robot(robot)
     description = read_description(find_urdf(robot.urdf), robot.fixed_base)
     warn_unbounded(description)
-    built = _verified(robot, description)
+    built = newton_model(robot, description)
     bodies = [description.bodies[name] for name in built.body_names]
     links = () if scene is None else read_scene(scene)
     still = description.still | {link.name: link.frame for link in links}
@@ -300,7 +319,7 @@ def _cached_system(
     robot: RobotSpec, dtype: str, scene: Scene | None, files: tuple[bytes, ...]
 ) -> System:
     del files  # a file that somebody has edited is another robot
-    return build_system(robot, dtype, scene)
+    return _system(robot, dtype, scene, _kept)
 
 
 @functools.cache

@@ -1,0 +1,124 @@
+"""Keeps what Newton built from a file, so that the next process starts faster.
+
+To import Newton takes two to three seconds, which is half of the time that the first
+``create`` of a process takes. Newton gets nothing but the text of the file and two
+numbers. So its answer is kept in the folder of compiled kernels, under a hash of these,
+of the versions of Newton and Warp, and of the code that reads its answer. What was kept
+is compared with the file again, as if Newton had just built it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import importlib.metadata
+import io
+import os
+import tempfile
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from newton_qd.physics.model.description import Description
+from newton_qd.physics.model.elements import Shape
+from newton_qd.physics.model.newton_input import NewtonInput
+from newton_qd.physics.model.verify import BuiltModel, ModelMismatchError, verify
+from newton_qd.physics.precision import kernel_cache
+
+_FOLDER = "newton_qd_models"
+_PACKAGES = ("newton", "warp-lang")
+_CODE = ("build.py", "kept_models.py", "newton_input.py")  # what makes a BuiltModel
+_NAMES = ("body_names", "joint_names")
+_ARRAYS = (
+    *("parent", "joint_kind", "q_start", "v_start", "parent_frame", "child_frame"),
+    *("axis", "lower", "upper", "damping", "mass", "com", "inertia"),
+)
+
+
+def kept_or_built(
+    description: Description, gravity: float, build: Callable[[], BuiltModel]
+) -> BuiltModel:
+    """Returns Newton's model of a file: what an earlier process kept, or a new one.
+
+    A file that is damaged, or does not equal the robot, is replaced. A folder that
+    cannot be written is no error: then nothing is kept.
+
+    Args:
+        description: The robot in the file.
+        gravity: Downward acceleration [m/s^2].
+        build: Builds the model with Newton, and compares it with the file.
+    """
+    path = _path(description, gravity)
+    if path is not None and (found := _read(path)) is not None:
+        with contextlib.suppress(ModelMismatchError):
+            verify(found, description)
+            return found
+    model = build()
+    if path is not None:
+        _write(path, model)
+    return model
+
+
+def _path(description: Description, gravity: float) -> Path | None:
+    """Returns where the model is kept; ``None`` if Newton has no version."""
+    try:
+        versions = [importlib.metadata.version(name) for name in _PACKAGES]
+    except importlib.metadata.PackageNotFoundError:
+        return None
+    text = NewtonInput(Path(description.path), False, ()).text()
+    code = [Path(__file__).with_name(name).read_bytes() for name in _CODE]
+    given = (text, description.floating, gravity, *versions)
+    digest = hashlib.sha256(repr(given).encode())
+    for content in code:
+        digest.update(content)
+    return Path(kernel_cache()) / _FOLDER / f"{digest.hexdigest()[:32]}.npz"
+
+
+def _read(path: Path) -> BuiltModel | None:
+    """Returns a model that was kept; ``None`` without a complete one."""
+    try:
+        # NumPy leaves a damaged file open
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
+            kept = {name: file[name] for name in file.files}
+        rows = zip(
+            *(kept[f"shape_{name}"] for name in ("body", "kind", "frame", "size")),
+            strict=True,
+        )
+        shapes: list[list[Shape]] = [[] for _ in kept["mass"]]
+        for body, kind, frame, size in rows:
+            shapes[body].append(Shape("", str(kind), frame, size))
+        return BuiltModel(
+            **{name: tuple(kept[name].tolist()) for name in _NAMES},
+            **{name: kept[name] for name in _ARRAYS},
+            shapes=tuple(map(tuple, shapes)),
+        )
+    except (OSError, ValueError, LookupError, EOFError, zipfile.BadZipFile):
+        return None
+
+
+def _write(path: Path, model: BuiltModel) -> None:
+    """Keeps a model, if the folder can be written."""
+    shapes = [(body, x) for body, found in enumerate(model.shapes) for x in found]
+    content = io.BytesIO()
+    np.savez(
+        content,
+        shape_body=np.array([body for body, _ in shapes], dtype=np.int32),
+        shape_kind=np.array([x.kind for _, x in shapes], dtype=np.str_),
+        shape_frame=np.array([x.frame for _, x in shapes]).reshape(-1, 7),
+        shape_size=np.array([x.size for _, x in shapes]).reshape(-1, 3),
+        **{name: np.array(getattr(model, name), dtype=np.str_) for name in _NAMES},
+        **{name: getattr(model, name) for name in _ARRAYS},
+    )
+    with contextlib.suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        # a name of its own: another process may write the same model now
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(content.getvalue())
+            os.replace(temporary, path)
+        except BaseException:
+            os.unlink(temporary)
+            raise
