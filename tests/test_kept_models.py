@@ -68,22 +68,21 @@ def test_a_kept_robot_is_a_built_one(
     assert len(builds) == 2  # build_system always asks Newton
 
 
+def flipped(path: Path, place: int) -> None:
+    content = bytearray(path.read_bytes())
+    content[place] ^= 1
+    path.write_bytes(content)
+
+
 DAMAGES: dict[str, Callable[[Path], object]] = {
     "empty": lambda path: path.write_bytes(b""),
     "cut": lambda path: path.write_bytes(path.read_bytes()[:-200]),
-    "text": lambda path: path.write_text("no archive"),
-    "another archive": lambda path: np.savez(path, mass=np.ones(2)),
-    "another robot": lambda path: np.savez(
-        path, **{**dict(np.load(path)), "mass": np.full(9, 3.0)}
-    ),
+    "text": lambda path: path.write_text("no model"),
+    "first bit": lambda path: flipped(path, 0),
+    "a bit of the digest's end": lambda path: flipped(path, 31),
+    "a bit of the content": lambda path: flipped(path, 400),
+    "last bit": lambda path: flipped(path, -1),
     "a folder": lambda path: (path.unlink(), path.mkdir()),
-    "too few shapes": lambda path: np.savez(
-        path, **{**dict(np.load(path)), "shape_kind": np.array(["sphere"])}
-    ),
-    "a shape of nobody": lambda path: np.savez(
-        path,
-        **{**dict(np.load(path)), "shape_body": np.full(9, 99, dtype=np.int32)},
-    ),
 }
 
 
@@ -99,6 +98,21 @@ def test_a_damaged_file_is_built_again(
     assert_equal(load(ANT), expected)
     if damage != "a folder":  # which no file replaces
         assert len(builds) == 2 and list(folder.iterdir()) == [path]
+
+
+def test_a_model_that_is_not_the_robot_is_built_again(
+    folder: Path, builds: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    expected = load(ANT)
+    read = kept_models._read
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            kept_models,
+            "_read",
+            lambda path: dataclasses.replace(read(path), mass=expected.mass * 1.01),  # type: ignore[type-var]
+        )
+        assert_equal(load(ANT), expected)
+    assert len(builds) == 2
 
 
 def test_a_folder_that_cannot_be_written_is_no_error(

@@ -60,7 +60,8 @@ def _devices() -> list[str]:
 
 def _kernel_cache() -> dict[str, Any]:
     """Returns the folder of compiled kernels, and whether it can be written."""
-    from newton_qd.physics.precision import kernel_cache, quiet
+    from newton_qd.physics.cache import kernel_cache
+    from newton_qd.physics.precision import quiet
 
     quiet()
     folder = Path(kernel_cache())

@@ -187,9 +187,3 @@ def pack_width(dtype: str, device: wp.Device) -> int:
 def quiet() -> None:
     """Turns off Warp's messages; importing ``newton_qd.physics`` does it already."""
     messages.quiet()
-
-
-def kernel_cache() -> str:
-    """Returns the folder of compiled kernels."""
-    wp.init()
-    return str(wp.config.kernel_cache_dir)

@@ -15,21 +15,21 @@ import importlib.metadata
 import io
 import os
 import tempfile
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
+from newton_qd.physics.cache import kernel_cache
 from newton_qd.physics.model.description import Description
 from newton_qd.physics.model.elements import Shape
 from newton_qd.physics.model.newton_input import NewtonInput
 from newton_qd.physics.model.verify import BuiltModel, ModelMismatchError, verify
-from newton_qd.physics.precision import kernel_cache
 
 _FOLDER = "newton_qd_models"
 _PACKAGES = ("newton", "warp-lang")
 _CODE = ("build.py", "kept_models.py", "newton_input.py")  # what makes a BuiltModel
+_DIGEST = hashlib.sha256().digest_size  # [bytes], before what it is of
 _NAMES = ("body_names", "joint_names")
 _ARRAYS = (
     *("parent", "joint_kind", "q_start", "v_start", "parent_frame", "child_frame"),
@@ -73,37 +73,36 @@ def _path(description: Description, gravity: float) -> Path | None:
     digest = hashlib.sha256(repr(given).encode())
     for content in code:
         digest.update(content)
-    return Path(kernel_cache()) / _FOLDER / f"{digest.hexdigest()[:32]}.npz"
+    return Path(kernel_cache()) / _FOLDER / f"{digest.hexdigest()[:32]}.model"
 
 
 def _read(path: Path) -> BuiltModel | None:
     """Returns a model that was kept; ``None`` without a complete one."""
     try:
-        # NumPy leaves a damaged file open
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
-            kept = {name: file[name] for name in file.files}
-        rows = zip(
-            *(kept[f"shape_{name}"] for name in ("body", "kind", "frame", "size")),
-            strict=True,
-        )
-        shapes: list[list[Shape]] = [[] for _ in kept["mass"]]
-        for body, kind, frame, size in rows:
-            shapes[body].append(Shape("", str(kind), frame, size))
-        return BuiltModel(
-            **{name: tuple(kept[name].tolist()) for name in _NAMES},
-            **{name: kept[name] for name in _ARRAYS},
-            shapes=tuple(map(tuple, shapes)),
-        )
-    except (OSError, ValueError, LookupError, EOFError, zipfile.BadZipFile):
+        content = path.read_bytes()
+    except OSError:
         return None
+    if hashlib.sha256(content[_DIGEST:]).digest() != content[:_DIGEST]:
+        return None
+    with np.load(io.BytesIO(content[_DIGEST:]), allow_pickle=False) as file:
+        kept = {name: file[name] for name in file.files}
+    shapes: list[list[Shape]] = [[] for _ in kept["mass"]]
+    columns = [kept[f"shape_{name}"] for name in ("body", "kind", "frame", "size")]
+    for body, kind, frame, size in zip(*columns, strict=True):
+        shapes[body].append(Shape("", str(kind), frame, size))
+    return BuiltModel(
+        **{name: tuple(kept[name].tolist()) for name in _NAMES},
+        **{name: kept[name] for name in _ARRAYS},
+        shapes=tuple(map(tuple, shapes)),
+    )
 
 
 def _write(path: Path, model: BuiltModel) -> None:
     """Keeps a model, if the folder can be written."""
     shapes = [(body, x) for body, found in enumerate(model.shapes) for x in found]
-    content = io.BytesIO()
+    file = io.BytesIO()
     np.savez(
-        content,
+        file,
         shape_body=np.array([body for body, _ in shapes], dtype=np.int32),
         shape_kind=np.array([x.kind for _, x in shapes], dtype=np.str_),
         shape_frame=np.array([x.frame for _, x in shapes]).reshape(-1, 7),
@@ -111,13 +110,15 @@ def _write(path: Path, model: BuiltModel) -> None:
         **{name: np.array(getattr(model, name), dtype=np.str_) for name in _NAMES},
         **{name: getattr(model, name) for name in _ARRAYS},
     )
+    content = file.getvalue()
+    content = hashlib.sha256(content).digest() + content
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
         # a name of its own: another process may write the same model now
         handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
         try:
-            with os.fdopen(handle, "wb") as file:
-                file.write(content.getvalue())
+            with os.fdopen(handle, "wb") as part:
+                part.write(content)
             os.replace(temporary, path)
         except BaseException:
             os.unlink(temporary)
