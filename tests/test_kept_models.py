@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+import stat
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -113,6 +115,16 @@ def test_a_model_that_is_not_the_robot_is_built_again(
         )
         assert_equal(load(ANT), expected)
     assert len(builds) == 2
+
+
+def test_other_users_can_read_what_is_kept(folder: Path) -> None:
+    before = os.umask(0o022)
+    try:
+        load(ANT)
+    finally:
+        os.umask(before)
+    (path,) = folder.iterdir()
+    assert stat.S_IMODE(path.stat().st_mode) == 0o644
 
 
 def test_a_folder_that_cannot_be_written_is_no_error(

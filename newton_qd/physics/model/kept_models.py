@@ -3,8 +3,8 @@
 To import Newton takes two to three seconds, which is half of the time that the first
 ``create`` of a process takes. Newton gets nothing but the text of the file and two
 numbers. So its answer is kept in the folder of compiled kernels, under a hash of these,
-of the versions of Newton and Warp, and of the code that reads its answer. What was kept
-is compared with the file again, as if Newton had just built it.
+of the versions of Newton and Warp, and of the code of this folder. What was kept is
+compared with the file again, as if Newton had just built it.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import hashlib
 import importlib.metadata
 import io
 import os
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -28,7 +27,6 @@ from newton_qd.physics.model.verify import BuiltModel, ModelMismatchError, verif
 
 _FOLDER = "newton_qd_models"
 _PACKAGES = ("newton", "warp-lang")
-_CODE = ("build.py", "kept_models.py", "newton_input.py")  # what makes a BuiltModel
 _DIGEST = hashlib.sha256().digest_size  # [bytes], before what it is of
 _NAMES = ("body_names", "joint_names")
 _ARRAYS = (
@@ -68,7 +66,7 @@ def _path(description: Description, gravity: float) -> Path | None:
     except importlib.metadata.PackageNotFoundError:
         return None
     text = NewtonInput(Path(description.path), False, ()).text()
-    code = [Path(__file__).with_name(name).read_bytes() for name in _CODE]
+    code = [file.read_bytes() for file in sorted(Path(__file__).parent.glob("*.py"))]
     given = (text, description.floating, gravity, *versions)
     digest = hashlib.sha256(repr(given).encode())
     for content in code:
@@ -115,11 +113,11 @@ def _write(path: Path, model: BuiltModel) -> None:
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
         # a name of its own: another process may write the same model now
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+        temporary = path.with_name(f".{path.name}.{os.getpid()}")
         try:
-            with os.fdopen(handle, "wb") as part:
-                part.write(content)
+            temporary.write_bytes(content)
             os.replace(temporary, path)
         except BaseException:
-            os.unlink(temporary)
+            with contextlib.suppress(OSError):
+                temporary.unlink()
             raise
