@@ -32,6 +32,7 @@ from newton_qd.physics.model.scene import read_scene
 from newton_qd.qd.config import ConfigError, read_config
 from newton_qd.qd.run.archive import ArchiveError, load_archive
 from newton_qd.qd.run.checkpoint import CheckpointError, load_checkpoint
+from newton_qd.robots import ANT
 from newton_qd.scenes import Scene
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("no_network")]
@@ -90,6 +91,7 @@ def folder(tmp_path: Path) -> Iterator[Path]:
     for name, text in hostile.MESHES.items():
         (inside / name).write_text(text, encoding="utf-8")
     newton_builder(str(robot_file(inside, MESH.encode())), True, 9.81)
+    build_system(ANT, "float32")  # what Newton loads once is no file of a case
     yield inside
     assert not (tmp_path / "evil.npy").exists() and not (inside / "evil").exists()
 
