@@ -13,12 +13,12 @@ import contextlib
 import hashlib
 import importlib.metadata
 import io
-import os
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
+from newton_qd.files import write_atomically
 from newton_qd.physics.cache import kernel_cache
 from newton_qd.physics.model.description import Description
 from newton_qd.physics.model.elements import Shape
@@ -112,12 +112,6 @@ def _write(path: Path, model: BuiltModel) -> None:
     content = hashlib.sha256(content).digest() + content
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        # a name of its own: another process may write the same model now
-        temporary = path.with_name(f".{path.name}.{os.getpid()}")
-        try:
-            temporary.write_bytes(content)
-            os.replace(temporary, path)
-        except BaseException:
-            with contextlib.suppress(OSError):
-                temporary.unlink()
-            raise
+        # Another process may write the same model now, under the same temporary name.
+        # It writes the same bytes, and who reads a part of them sees it by the digest.
+        write_atomically(path, content)
