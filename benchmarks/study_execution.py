@@ -218,7 +218,9 @@ def _to_the_end(
     """Advances a run past its stops that are not done, and writes a line at each."""
     wall = clock != "processor"
     save = here.save if limits.states else lambda: None
-    left = [stop for stop in here.stops if str(stop) not in done]
+    # a state may come from another folder, which has the lines of its stops
+    passed = _reached(here, wall)
+    left = [stop for stop in here.stops if str(stop) not in {*done, *passed}]
     saved = here.seconds(wall)
 
     def shared() -> contextlib.AbstractContextManager[None]:
@@ -228,9 +230,9 @@ def _to_the_end(
     while left:
         with shared():
             here.advance()
-        evaluations = here.state.metrics[-1][1]
         seconds = here.seconds(wall)
-        for stop in [x for x in left if x.reached(evaluations, seconds)]:
+        reached = _reached(here, wall)
+        for stop in [x for x in left if str(x) in reached]:
             left.remove(stop)
             with shared():
                 _write(protocol, here, stop, clock, out)
@@ -250,6 +252,14 @@ def _to_the_end(
     if len(here.stops) == len(protocol.stops):
         here.forget()
     return True
+
+
+def _reached(here: Progress, wall: bool) -> set[str]:
+    """Returns the stops that a run has reached."""
+    if not len(here.state.metrics):
+        return set()
+    evaluations, seconds = here.state.metrics[-1][1], here.seconds(wall)
+    return {str(stop) for stop in here.stops if stop.reached(evaluations, seconds)}
 
 
 def _write(

@@ -201,6 +201,21 @@ def test_a_run_can_go_on_to_its_evaluations(
     assert run.seconds(False) == (5.0 if reach else 3.0)
 
 
+def test_stops_before_a_saved_state_are_not_written(
+    tmp_path: Path, monkeypatch: Any
+) -> None:
+    written = []
+    monkeypatch.setattr(
+        study_execution, "_write", lambda _, run, stop, *rest: written.append(str(stop))
+    )
+    run: Any = Clockwork()
+    for _ in range(3):
+        run.advance()  # the lines of this part are in another folder
+    limits = study_execution.Limits(9.0)
+    study_execution._to_the_end(PROTOCOL, run, set(), tmp_path, limits, "processor")
+    assert written == ["50 evaluations"]
+
+
 @pytest.mark.parametrize("states", [False, True])
 def test_a_run_need_not_save_its_state(
     tmp_path: Path, monkeypatch: Any, states: bool
