@@ -27,7 +27,9 @@ DOCS = BENCHMARKS.parent / "docs"
 FIELD = BENCHMARKS / "results" / "field"
 REPEATS = BENCHMARKS / "results" / "field_repeats.csv"
 SMALL = BENCHMARKS / "results" / "small"
-PAGES = tuple(DOCS / name for name in ("study.md", "study_scores.md", "study_runs.md"))
+PAGES = tuple(
+    DOCS / f"study{name}.md" for name in ("", "_details", "_scores", "_runs")
+)
 TABLE = re.compile(
     r"(?P<head><!-- table: (?P<kind>[^,\n]+)(?:, (?P<stop>[^\n]+))?; "
     r"benchmarks/study_pages\.py -->\n\n)(?P<rows>(?:\|.*\n)*)"
@@ -73,6 +75,7 @@ def long_runs() -> str:
 KINDS: dict[str, Callable[[str], str]] = {
     "ratios": lambda _: study_scores.overview(_field()),
     "ratios to MAP-Elites": lambda _: study_scores.overview(_field(), "me"),
+    "each": lambda stop: study_scores.each(_field(), stop),
     "ours and DCRL-ME": lambda stops: study_scores.against(
         _field(), "dcrl-me", stops.split(", ")
     ),

@@ -39,6 +39,14 @@ PUBLISHED = {
 }
 """Medians of QD scores [thousands] at a million evaluations (Mitsides et al. 2025)."""
 
+OTHERS = {
+    "me": "MAP-Elites",
+    "dcrl-me": "DCRL-ME",
+    "pga-me": "PGA-ME",
+    "ascii-me": "ASCII-ME",
+    "cma-me": "CMA-ME",
+}
+"""Names of the baselines."""
 
 LONG = (
     *("corrected mean fitness over common cells", "QD score", "coverage [%]"),
@@ -134,6 +142,15 @@ def _ratio(results: Results, task: str, stop: str, rival: str | None) -> str:
     mark = "**" if word == "apart" else ""
     few = f" ({seeds} seed{'s' * (seeds > 1)})" if seeds < LEAST_SEEDS else ""
     return f"{mark}{ratio:.2f}{mark}{few}"
+
+
+def each(results: Results, stop: str) -> str:
+    """Markdown table: our ratio to each other algorithm, with its best variant."""
+    rows = [
+        [task, *(_ratio(results, task, stop, rival) for rival in OTHERS)]
+        for task in sorted({key[0] for key in results})
+    ]
+    return markdown(["task", *OTHERS.values()], rows)
 
 
 def named(stop: str) -> str:

@@ -129,6 +129,19 @@ def test_enough_seeds_count_first() -> None:
         assert study_scores.overview(results, rival).splitlines()[2].startswith(start)
 
 
+def test_ours_are_compared_with_each_baseline() -> None:
+    results = {}
+    scores = {"me": 4.0, "dcrl-me": 1.0, "dcrl-me@1": 2.0, "me-actor-critic": 8.0}
+    for name, score in scores.items():
+        row = line(name.split("@")[0], 0, "60 s", corrected_qd_score=score)
+        run = study_results.Scored(0, row, np.empty(0), np.empty(0))
+        results[TASK, name, "60 s"] = [run] * (1 if name == "me" else 3)
+    assert study_scores.each(results, "60 s").splitlines()[::2] == [
+        "| task | MAP-Elites | DCRL-ME | PGA-ME | ASCII-ME | CMA-ME |",
+        f"| {TASK} | 2.00 (1 seed) | **4.00** | - | - | - |",
+    ]
+
+
 def test_published_ratios_are_of_single_evaluations() -> None:
     stop = "1000000 evaluations"
     results = {}
