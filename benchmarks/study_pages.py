@@ -27,9 +27,7 @@ DOCS = BENCHMARKS.parent / "docs"
 FIELD = BENCHMARKS / "results" / "field"
 REPEATS = BENCHMARKS / "results" / "field_repeats.csv"
 SMALL = BENCHMARKS / "results" / "small"
-PAGES = tuple(
-    DOCS / f"study{name}.md" for name in ("", "_details", "_scores", "_runs")
-)
+PAGES = tuple(DOCS / f"study{name}.md" for name in ("", "_details", "_scores", "_runs"))
 TABLE = re.compile(
     r"(?P<head><!-- table: (?P<kind>[^,\n]+)(?:, (?P<stop>[^\n]+))?; "
     r"benchmarks/study_pages\.py -->\n\n)(?P<rows>(?:\|.*\n)*)"
