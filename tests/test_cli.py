@@ -235,6 +235,8 @@ def test_a_signal_before_the_first_generation(
         (["evolve", "ant_uni", "--checkpoint-seconds", "nan"], "checkpoint_seconds"),
         (["evolve", "--config", "none.json"], "cannot read none.json"),
         (["evolve", "ant_uni", "--grid", "5"], "5, which has 1 dimension;"),
+        (["evolve", "--study"], "ENV: got None; allowed: the name of an environment"),
+        (["evolve", "reacher", "--study"], "env_name: got 'reacher'; allowed: env"),
     ],
 )
 def test_bad_arguments_write_nothing(
@@ -266,6 +268,7 @@ def test_bad_arguments_write_nothing(
             "got '8x8'; allowed: integers like 8,8",
         ),
         (["evolve", "a", "--grid", "5x5", "--centroids", "9"], "not allowed with"),
+        (["evolve", "a", "--study", "--config", "b.toml"], "not allowed with"),
         (["evolve", "ant_uni", "--bogus"], "--bogus"),
     ],
 )

@@ -26,6 +26,7 @@ from newton_qd.qd.config import (
 from newton_qd.qd.facts import environment_facts
 from newton_qd.qd.run.evolution import evolve
 from newton_qd.qd.scoring.task import make_task
+from newton_qd.qd.study import study_config
 from newton_qd.scenes import MAZE
 
 TESTS = Path(__file__).resolve().parent
@@ -92,6 +93,21 @@ def test_options_of_the_environment_on_the_command_line(
     found = dict(settings("--config", str(toml)).env_options)
     assert found["material"] == {"friction": 0.8}
     assert found["qdax_wrappers_kwargs"] == ({"minval": (-1, -1)},)
+
+
+def test_settings_of_the_study_are_a_base(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    arguments = ["evolve", "hopper_uni", "--algorithm", "me-actor-critic", "--study"]
+    arguments += ["--quiet", "--iterations", "9", "--option", "copies=8"]
+    with pytest.raises(Seen) as seen:
+        cli.main([*arguments, "--grid", "64"], task_factory=stop)
+    base = study_config("hopper_uni", "me-actor-critic")
+    options = {**dict(base.options), "copies": 8}
+    changes = {"iterations": 9, "options": options, "grid": (64,), "centroids": None}
+    assert seen.value.config == base.replace(**changes)
+    assert base.starts == 16 and options["actors"] == 16
 
 
 def test_cells_replace_those_of_a_config(

@@ -56,6 +56,7 @@ ROOMS = (
     "extras",
     "facts",
     "config",
+    "study",
     "scoring",
     "emitters",
     "algorithms",

@@ -16,6 +16,7 @@ from newton_qd.cli import modules
 from newton_qd.cli.arguments import Commands, integers, warn_of_changes, widths
 from newton_qd.qd.algorithms import ALGORITHMS
 from newton_qd.qd.config import ConfigError, EvolveConfig, read_config
+from newton_qd.qd.study import study_config
 
 _DEFAULTS = EvolveConfig()
 
@@ -73,11 +74,18 @@ def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="start from the elites of another results folder, not a random population",
     )
-    parser.add_argument(
+    base = parser.add_mutually_exclusive_group()
+    base.add_argument(
         "--config",
         type=Path,
         metavar="FILE",
         help="read settings from a TOML file, or from config.json of an earlier run",
+    )
+    base.add_argument(
+        "--study",
+        action="store_true",
+        help="take the settings that the algorithm has for ENV in the study "
+        "(docs/study.md), which are for a GPU",
     )
     parser.add_argument(
         "--checkpoint-seconds",
@@ -268,6 +276,11 @@ def settle(arguments: argparse.Namespace) -> tuple[EvolveConfig, Path]:
     if arguments.config is not None:
         base, facts = read_config(arguments.config, given.get("env_name"))
         warn_of_changes(facts, "when this config was written")
+    if arguments.study:
+        if "env_name" not in given:
+            raise ConfigError(_UNNAMED)
+        algorithm = given.get("algorithm", _DEFAULTS.algorithm)
+        base = study_config(given["env_name"], algorithm)
     out = arguments.out
     if out is None:
         named = _other_cells(base or _DEFAULTS, given).replace(**given)

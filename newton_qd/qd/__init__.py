@@ -1,6 +1,7 @@
 """Quality-Diversity with the environments: settings, loop and results.
 
 - ``evolve(EvolveConfig(...), out=...)``: MAP-Elites on a registered environment
+- ``study_config("ant_uni", "me-actor-critic")``: the settings of the study
 - ``register_algorithm(AlgorithmSpec(...))``: an algorithm of your own for ``evolve``
 - ``newton_qd.qd.emitters``: emitters for QDax that use exact gradients, and
   ``AnnealedRepertoire`` for one of them
@@ -53,6 +54,7 @@ if TYPE_CHECKING:
     from newton_qd.qd.scoring.scatter import Scatter
     from newton_qd.qd.scoring.sharding import device_mesh, shard_scoring
     from newton_qd.qd.scoring.task import Task, make_task
+    from newton_qd.qd.study import study_config
 
 __all__ = [
     "AlgorithmSpec",
@@ -88,6 +90,7 @@ __all__ = [
     "register_algorithm",
     "robust_scoring",
     "shard_scoring",
+    "study_config",
     "to_ribs",
 ]
 
@@ -125,6 +128,7 @@ _HOME = {
     "register_algorithm": "algorithms",
     "robust_scoring": "scoring.robust",
     "shard_scoring": "scoring.sharding",
+    "study_config": "study",
     "to_ribs": "scoring.ribs",
 }
 
