@@ -68,25 +68,7 @@ def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
         help="continue the run in the results folder, with its settings; start it if "
         "the folder has none; with more --iterations it goes on beyond its end",
     )
-    parser.add_argument(
-        "--start-from",
-        type=Path,
-        metavar="DIR",
-        help="start from the elites of another results folder, not a random population",
-    )
-    base = parser.add_mutually_exclusive_group()
-    base.add_argument(
-        "--config",
-        type=Path,
-        metavar="FILE",
-        help="read settings from a TOML file, or from config.json of an earlier run",
-    )
-    base.add_argument(
-        "--study",
-        action="store_true",
-        help="take the settings that the algorithm has for ENV in the study "
-        "(docs/study.md), which are for a GPU",
-    )
+    _add_beginnings(parser)
     parser.add_argument(
         "--checkpoint-seconds",
         type=float,
@@ -113,6 +95,29 @@ def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
     )
     modules.add_argument(parser)
     parser.add_argument("--quiet", action="store_true", help="show no progress")
+
+
+def _add_beginnings(parser: argparse.ArgumentParser) -> None:
+    """Adds where elites and settings come from."""
+    parser.add_argument(
+        "--start-from",
+        type=Path,
+        metavar="DIR",
+        help="start from the elites of another results folder, not a random population",
+    )
+    base = parser.add_mutually_exclusive_group()
+    base.add_argument(
+        "--config",
+        type=Path,
+        metavar="FILE",
+        help="read settings from a TOML file, or from config.json of an earlier run",
+    )
+    base.add_argument(
+        "--study",
+        action="store_true",
+        help="take the settings that the algorithm has for ENV in the study "
+        "(docs/study.md), which are for a GPU",
+    )
 
 
 def _add_setting_arguments(parser: argparse.ArgumentParser) -> None:
