@@ -381,3 +381,14 @@ def resting_gap(system: System, gravity: float) -> float:
         else:
             high = middle
     return low
+
+
+def single_states(worlds: int, seed: int = 0) -> tuple[System, Arrays]:
+    """The ant in float32 with random states."""
+    system = physics.load_system(ROBOTS["ant"])
+    states = random_states(system, np.random.default_rng(seed), worlds)
+    return system, tuple(x.astype(np.float32) for x in states)
+
+
+def outputs(system: System, states: Arrays) -> Arrays:
+    return tuple(np.asarray(x) for x in batched_step(system)(*states))
