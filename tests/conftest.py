@@ -197,3 +197,13 @@ def no_network(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("socket.connect", "socket.connect_ex", "socket.sendto"):
         monkeypatch.setattr(f"socket.{name}", refuse)
     monkeypatch.setattr("socket.getaddrinfo", refuse)
+
+
+@pytest.fixture
+def modules_of_qdax() -> Iterator[None]:
+    """The modules that QDax has dropped."""
+    import newton_qd.compat
+
+    newton_qd.compat.install()
+    yield
+    newton_qd.compat.uninstall()
