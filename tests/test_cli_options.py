@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import runpy
 import sys
 from pathlib import Path
@@ -15,6 +16,7 @@ from point_runs import SMALL, point_task
 
 import newton_qd
 from newton_qd import cli
+from newton_qd.cli.evolve_arguments import add_arguments, settle
 from newton_qd.qd import register_algorithm
 from newton_qd.qd.algorithms import ALGORITHMS, algorithm_named, algorithms
 from newton_qd.qd.config import (
@@ -108,6 +110,21 @@ def test_settings_of_the_study_are_a_base(
     changes = {"iterations": 9, "options": options, "grid": (64,), "centroids": None}
     assert seen.value.config == base.replace(**changes)
     assert base.starts == 16 and options["actors"] == 16
+
+
+def test_a_resumed_run_of_the_study_keeps_its_generations(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    kept = study_config("hopper_uni").replace(iterations=250)
+    Path("run").mkdir()
+    Path("run", "config.json").write_text(config_to_json(kept, environment_facts()))
+    arguments = ["evolve", "hopper_uni", "--study", "--resume", "--out", "run"]
+    parser = argparse.ArgumentParser()
+    add_arguments(parser.add_subparsers(), lambda *_: 0)
+    for more, iterations in (([], 250), (["--iterations", "300"], 300)):
+        config, _ = settle(parser.parse_args([*arguments, *more]))
+        assert config == kept.replace(iterations=iterations)
 
 
 def test_cells_replace_those_of_a_config(

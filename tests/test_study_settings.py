@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -33,7 +34,11 @@ def test_every_setting_is_one_of_evolve() -> None:
 
 
 def test_what_did_not_run_is_told() -> None:
-    with pytest.raises(ConfigError, match=r"env_name: got 'reacher'; .*: ant_uni, "):
+    with pytest.raises(ConfigError, match=r"env_name: got 'reacher'; .* \(ant_uni, "):
         study_config("reacher")
-    with pytest.raises(ConfigError, match=r"algorithm: got 'me-es'; .* ant_uni: me, "):
+    with pytest.raises(ConfigError, match=r"algorithm: got 'me-es'; .* ant_uni \(me, "):
         study_config("ant_uni", "me-es")
+    wrong: Any = ["a"]
+    for name, given in (("env_name", (wrong,)), ("algorithm", ("ant_uni", wrong))):
+        with pytest.raises(ConfigError, match=rf"{name}: got \['a'\]; allowed: text"):
+            study_config(*given)

@@ -74,7 +74,8 @@ def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
         type=float,
         default=5.0,
         metavar="S",
-        help="minimum time between two checkpoints [s] (default: 5)",
+        help="minimum time between two checkpoints [s] (default: 5); longer where one "
+        "takes long, 0: one after each generation",
     )
     parser.add_argument(
         "--tensorboard",
@@ -263,7 +264,9 @@ def _grid(text: str) -> tuple[int, ...]:
 
 
 def settle(arguments: argparse.Namespace) -> tuple[EvolveConfig, Path]:
-    """Combines the settings of the arguments, the config file and the run to resume.
+    """Combines the settings of the arguments, and of what they are based on.
+
+    That is a config file, the study, or the run to resume.
 
     Raises:
         ConfigError: No environment is named, or a setting is not allowed. The results
@@ -295,8 +298,12 @@ def settle(arguments: argparse.Namespace) -> tuple[EvolveConfig, Path]:
         checks.identifier("env_name", named.env_name, error=ConfigError)
         out = Path("results") / f"{named.env_name}-seed{named.seed}"
     folder = RunFolder(out)
-    if base is None and arguments.resume and folder.has_config:
-        base = read_config(out / CONFIG)[0]
+    if arguments.resume and folder.has_config:
+        kept = read_config(out / CONFIG)[0]
+        if base is None:
+            base = kept
+        elif arguments.study:  # which has no number of generations
+            base = base.replace(iterations=kept.iterations)
     if base is None and "env_name" not in given:
         folder.check(resume=arguments.resume)
         if not arguments.resume:

@@ -7,6 +7,7 @@ import tomllib
 from importlib.resources import files
 from typing import Any
 
+from newton_qd import checks
 from newton_qd.checks import listed, message
 from newton_qd.qd.config import ConfigError, EvolveConfig
 
@@ -35,12 +36,15 @@ def study_config(env_name: str, algorithm: str = "me") -> EvolveConfig:
     Raises:
         ConfigError: The study has no such run.
     """
+    checks.text("env_name", env_name, error=ConfigError)
+    checks.text("algorithm", algorithm, error=ConfigError)
     tables = _tables()
     if env_name not in tables:
-        names = f"environments of the study: {listed(tables)}"
+        names = f"environments of the study ({listed(tables)})"
         raise ConfigError(message("env_name", env_name, names))
     if algorithm not in tables[env_name]:
-        names = f"algorithms of the study on {env_name}: {listed(tables[env_name])}"
+        own = listed(tables[env_name])
+        names = f"algorithms of the study on {env_name} ({own})"
         raise ConfigError(message("algorithm", algorithm, names))
-    own = tables[env_name][algorithm]
-    return EvolveConfig(env_name=env_name, algorithm=algorithm, **own)
+    settings = tables[env_name][algorithm]
+    return EvolveConfig(env_name=env_name, algorithm=algorithm, **settings)

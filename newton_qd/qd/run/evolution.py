@@ -106,8 +106,9 @@ def evolve(
             ``None``: a random population.
         progress: Whether to show progress on standard error.
         tensorboard: Whether to write the metrics for TensorBoard too.
-        checkpoint_seconds: Shortest time between two checkpoints [s]; infinite: one
-            at the end. It does not change the result.
+        checkpoint_seconds: Shortest time between two checkpoints [s], which becomes
+            longer where a checkpoint takes long; 0: one after each generation;
+            infinite: one at the end. It does not change the result.
         devices: Number of devices that share each evaluation. It does not change the
             result. ``None``: only the default device.
         device: Device of the whole run, such as ``"cpu"``, ``"gpu"`` or ``"gpu:1"``;

@@ -9,6 +9,10 @@ from newton_qd.qd.run.folder import COLUMNS, RunFolder
 from newton_qd.qd.run.interrupt import StopFlag
 from newton_qd.qd.run.search import Search, SearchState
 
+_WAIT = 19.0
+"""Shortest time between checkpoints, as a multiple of the time that one takes: so they
+take at most a twentieth of a run."""
+
 
 class Saver:
     """Writes checkpoints, with a shortest time between them."""
@@ -21,23 +25,29 @@ class Saver:
         Args:
             search: Search that makes the checkpoints.
             folder: Folder of the checkpoints; ``None``: nothing is saved.
-            least_seconds: Shortest time between two checkpoints [s].
+            least_seconds: Shortest time between two checkpoints [s]. It becomes longer
+                if a checkpoint takes long; 0: one after each generation.
         """
         self._search = search
         self._folder = folder
         self._least_seconds = least_seconds
+        self._wait = least_seconds
         self._saved_at = time.monotonic()
 
     def sometimes(self, state: SearchState) -> None:
         """Saves if the last checkpoint is old enough."""
-        if time.monotonic() - self._saved_at >= self._least_seconds:
+        if time.monotonic() - self._saved_at >= self._wait:
             self.now(state)
 
     def now(self, state: SearchState) -> None:
         """Saves, if there is a state and a folder."""
+        begin = time.monotonic()
         if self._folder is not None and state.iteration >= 0:
             self._folder.save(self._search.checkpoint(state))
         self._saved_at = time.monotonic()
+        if self._least_seconds:
+            took = self._saved_at - begin
+            self._wait = max(self._least_seconds, _WAIT * took)
 
 
 def run_generations(
