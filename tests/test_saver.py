@@ -23,7 +23,7 @@ def test_checkpoints_that_take_long_come_seldom(
         now += 2.0
         written.append(state)
 
-    monkeypatch.setattr(loop.time, "monotonic", lambda: now)
+    monkeypatch.setattr(loop, "time", SimpleNamespace(monotonic=lambda: now))
     search: Any = SimpleNamespace(checkpoint=lambda state: state)
     folder: Any = SimpleNamespace(save=write)
     saver = loop.Saver(search, folder, seconds)

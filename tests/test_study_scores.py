@@ -129,13 +129,20 @@ def test_enough_seeds_count_first() -> None:
         assert study_scores.overview(results, rival).splitlines()[2].startswith(start)
 
 
-def test_ours_are_compared_with_each_baseline() -> None:
-    results = {}
-    scores = {"me": 4.0, "dcrl-me": 1.0, "dcrl-me@1": 2.0, "me-actor-critic": 8.0}
+def scored(stop: str, scores: dict[str, float], seeds: int) -> study_results.Results:
+    """Runs of variants, each with so many seeds."""
+    found = {}
     for name, score in scores.items():
-        row = line(name.split("@")[0], 0, "60 s", corrected_qd_score=score)
+        row = line(name.split("@")[0], 0, stop, corrected_qd_score=score)
         run = study_results.Scored(0, row, np.empty(0), np.empty(0))
-        results[TASK, name, "60 s"] = [run] * (1 if name == "me" else 3)
+        found[TASK, name, stop] = [run] * seeds
+    return found
+
+
+def test_ours_are_compared_with_each_baseline() -> None:
+    results = scored("60 s", {"me": 4.0}, seeds=1)
+    others = {"dcrl-me": 1.0, "dcrl-me@1": 2.0, "me-actor-critic": 8.0}
+    results |= scored("60 s", others, seeds=3)
     assert study_scores.each(results, "60 s").splitlines()[::2] == [
         "| task | MAP-Elites | DCRL-ME | PGA-ME | ASCII-ME | CMA-ME |",
         f"| {TASK} | 2.00 (1 seed) | **4.00** | - | - | - |",
@@ -161,12 +168,8 @@ def test_published_ratios_are_of_single_evaluations() -> None:
 
 
 def test_ours_are_compared_with_the_best_variant_of_a_rival() -> None:
-    results = {}
     scores = {"dcrl-me": 2.0, "dcrl-me@1": 3.0, "me": 9.0, "me-actor-critic": 1500.0}
-    for name, score in scores.items():
-        row = line(name.split("@")[0], 0, "20 s", corrected_qd_score=score)
-        run = study_results.Scored(0, row, np.empty(0), np.empty(0))
-        results[TASK, name, "20 s"] = [run]
+    results = scored("20 s", scores, seeds=1)
     assert study_scores.against(results, "dcrl-me", ["20 s"]).splitlines()[::2] == [
         "| task | 20 s: ours | dcrl-me | ratio |",
         f"| {TASK} | 1,500 | 3 | 500.00 (too few seeds) |",

@@ -298,12 +298,10 @@ def settle(arguments: argparse.Namespace) -> tuple[EvolveConfig, Path]:
         checks.identifier("env_name", named.env_name, error=ConfigError)
         out = Path("results") / f"{named.env_name}-seed{named.seed}"
     folder = RunFolder(out)
-    if arguments.resume and folder.has_config:
+    if arguments.resume and folder.has_config and arguments.config is None:
         kept = read_config(out / CONFIG)[0]
-        if base is None:
-            base = kept
-        elif arguments.study:  # which has no number of generations
-            base = base.replace(iterations=kept.iterations)
+        # the study has no number of generations
+        base = kept if base is None else base.replace(iterations=kept.iterations)
     if base is None and "env_name" not in given:
         folder.check(resume=arguments.resume)
         if not arguments.resume:
