@@ -18,8 +18,11 @@ from newton_qd.physics.warp_internals import cpu_entry
 Arrays = tuple[wp.array, ...]
 
 LANES = (1, 2, 4, 8, 16, 32)
-# Modules of the kernels that are not in ``inspect``. Warp compiles whole modules.
+# Module of each kernel. Warp compiles whole modules, so each has one of its own.
 _MODULES = {
+    "kinematics_forward": "bodies",
+    "kinematics_backward": "bodies_backward",
+    "dynamics_forward": "dynamics",
     "step_forward": "forward",
     "step_backward": "backward",
     "contact_gaps": "gaps",
@@ -237,7 +240,7 @@ class Launcher:
                 command.send(arrays, first, count, threads, 1, number, side * number)
 
     def _kernel(self, name: str) -> wp.Kernel:
-        return getattr(getattr(self.kernels, _MODULES.get(name, "inspect")), name)
+        return getattr(getattr(self.kernels, _MODULES[name]), name)
 
     def _build_plan(self, name: str) -> Plan:
         adjoint = name.endswith("_backward")

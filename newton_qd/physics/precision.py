@@ -28,11 +28,11 @@ _VECTOR_BYTES = 32
 _OPTIMIZATION = 2
 # Modules in a folder of the package.
 _FILES = {"memory": "cpp.memory"}
-# Modules that are the same with and without boxes and pairs. Variants share them, and
-# Warp compiles `inspect` once for all. It is the only one that needs others: it takes
-# the kinematics from `simulate`.
-SHARED = ("answers", "box", "cpp", "inertia", "inspect", "integration", "joints")
-SHARED += ("kinematics", "parameters", "readings", "rows", "structs", "world")
+# Modules that are the same with and without boxes and pairs. Variants share them, so
+# Warp compiles the kernels that are among them once for all.
+SHARED = ("answers", "bodies", "bodies_backward", "box", "cpp", "dynamics", "inertia")
+SHARED += ("integration", "joints", "kinematics", "parameters", "readings", "rows")
+SHARED += ("structs", "views", "world")
 SCALARS = {"float32": wp.float32, "float64": wp.float64}
 
 
@@ -78,7 +78,9 @@ class Kernels:
         world: Functions that read inputs and write outputs.
         forward: Kernel ``step_forward``.
         backward: Kernel ``step_backward``.
-        inspect: Kernels for kinematics and dynamics.
+        bodies: Kernel ``kinematics_forward``.
+        bodies_backward: Kernel ``kinematics_backward``.
+        dynamics: Kernel ``dynamics_forward``.
         gaps: Kernel ``contact_gaps``.
         impulses: Kernel ``contact_impulses``.
         episodes: Kernels for descriptors of episodes.
@@ -90,7 +92,9 @@ class Kernels:
     world: ModuleType
     forward: ModuleType
     backward: ModuleType
-    inspect: ModuleType
+    bodies: ModuleType
+    bodies_backward: ModuleType
+    dynamics: ModuleType
     gaps: ModuleType
     impulses: ModuleType
     episodes: ModuleType

@@ -17,7 +17,8 @@ hand, in :mod:`.multipliers` and :mod:`.parts`.
 and where these begin (``Offsets``); :mod:`.rows` where the fields of a row of inputs or
 outputs begin. :mod:`.world` moves these rows, with :mod:`.parameters` for parameters
 of each world. :mod:`.forward` and :mod:`.backward` are the kernels of a step;
-:mod:`.inspect`, :mod:`.gaps` and :mod:`.impulses` show a system from inside;
+:mod:`.bodies` with :mod:`.bodies_backward`, :mod:`.dynamics`, :mod:`.gaps` and
+:mod:`.impulses` show a system from inside, with :mod:`.views` in common;
 :mod:`.episodes` and :mod:`.conventions` do not use packs. :mod:`.cpp.memory` says how
 the intermediates lie in memory.
 

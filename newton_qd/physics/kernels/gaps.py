@@ -1,6 +1,6 @@
 """The kernel that shows how far apart everything is that can touch.
 
-Inputs: q and v of each world, as in :mod:`.inspect`. Outputs: the gap of each contact.
+Inputs: ``Coordinates`` of :mod:`.rows`. Outputs: the gap of each contact.
 """
 
 import warp as wp
@@ -8,11 +8,11 @@ import warp as wp
 from . import real, scalar, vec3
 from .cpp.memory import load, write_output
 from .cpp.place import place
-from .inspect import load_views
+from .kinematics import kinematics
 from .nearest import touch_obstacle
 from .pair import touch_partner
-from .simulate import kinematics
 from .structs import Model, Offsets, Scratch, offsets_at
+from .views import load_views
 from .world import pack_at
 
 

@@ -10,7 +10,7 @@ import warp as wp
 
 from newton_qd.physics.kinds import JointKind
 
-from . import real, scalar, stage, vec3
+from . import real, scalar, stage, sync, vec3
 from .cpp.algebra import cross, quaternion, rigid, rotate, rotation, translation, vector
 from .cpp.memory import constant, load, store
 from .cpp.numbers import uniform
@@ -160,3 +160,45 @@ def axis_motion(m: Model, sc: Scratch, offsets: Offsets, i: int):
         offsets.motion + i,
         load(sc.bias_v, p) + vk * (cross(vw, sv) + cross(vv, sw)),
     )
+
+
+@stage
+def limb_kinematics(m: Model, sc: Scratch, offsets: Offsets, n: int, moved: int):
+    """Poses and axes (unless ``moved`` is 1), twists and bias accelerations of a limb.
+
+    Reads: m.joint_kind, m.limb_start, m.limb_body.
+    """
+    for p in range(load(m.limb_start, n), load(m.limb_start, n + 1)):
+        i = load(m.limb_body, p)
+        if load(m.joint_kind, i) == JointKind.FREE:
+            if moved == 0:
+                free_joint(m, sc, offsets, i)
+            free_motion(m, sc, offsets, i)
+        else:
+            if moved == 0:
+                axis_joint(m, sc, offsets, i)
+            axis_motion(m, sc, offsets, i)
+
+
+@stage
+def kinematics(
+    m: Model, sc: Scratch, offsets: Offsets, moved: int, lane: int, lanes: int
+):
+    """Poses and axes, then twists and bias accelerations, root to leaves.
+
+    ``moved`` is 1 for twists and bias accelerations alone, at other velocities.
+
+    Reads: m.levels, m.roots, m.limb_level.
+    """
+    if lane == 0:
+        if moved == 0:
+            world_frame(m, sc, offsets)
+        world_motion(m, sc, offsets)
+    # the lane of the world has the first root as well
+    if m.roots > 1:
+        sync(lane)
+    for level in range(m.levels):
+        first = load(m.limb_level, level) + lane
+        for n in range(first, load(m.limb_level, level + 1), lanes):
+            limb_kinematics(m, sc, offsets, n, moved)
+        sync(lane)

@@ -9,7 +9,7 @@ import warp as wp
 
 @wp.struct
 class Coordinates:
-    """A row that a kernel of :mod:`.inspect` reads."""
+    """A row that a kernel reads which shows a system from inside."""
 
     size: int
     q: int

@@ -2,8 +2,6 @@
 
 import warp as wp
 
-from newton_qd.physics.kinds import JointKind
-
 from . import part, scalar, stage, sync
 from .contact import (
     contact_corrector,
@@ -11,63 +9,13 @@ from .contact import (
     contact_impulse,
     contact_predictor,
 )
-from .cpp.memory import load
 from .inertia import bias_wrench, rigid_inertia
 from .integration import mean_velocity, new_coordinates, new_velocity
-from .kinematics import (
-    axis_joint,
-    axis_motion,
-    free_joint,
-    free_motion,
-    world_frame,
-    world_motion,
-)
+from .kinematics import kinematics
 from .readings import body_impulse, body_reading, foot_contact, torso_position
 from .solve import linear_solve
 from .structs import Model, Offsets, Scratch, offsets_after, offsets_at, offsets_in
 from .world import Pack, detect_fault, freeze_faulty
-
-
-@stage
-def limb_kinematics(m: Model, sc: Scratch, offsets: Offsets, n: int, moved: int):
-    """Poses and axes (unless ``moved`` is 1), twists and bias accelerations of a limb.
-
-    Reads: m.joint_kind, m.limb_start, m.limb_body.
-    """
-    for p in range(load(m.limb_start, n), load(m.limb_start, n + 1)):
-        i = load(m.limb_body, p)
-        if load(m.joint_kind, i) == JointKind.FREE:
-            if moved == 0:
-                free_joint(m, sc, offsets, i)
-            free_motion(m, sc, offsets, i)
-        else:
-            if moved == 0:
-                axis_joint(m, sc, offsets, i)
-            axis_motion(m, sc, offsets, i)
-
-
-@stage
-def kinematics(
-    m: Model, sc: Scratch, offsets: Offsets, moved: int, lane: int, lanes: int
-):
-    """Poses and axes, then twists and bias accelerations, root to leaves.
-
-    ``moved`` is 1 for twists and bias accelerations alone, at other velocities.
-
-    Reads: m.levels, m.roots, m.limb_level.
-    """
-    if lane == 0:
-        if moved == 0:
-            world_frame(m, sc, offsets)
-        world_motion(m, sc, offsets)
-    # the lane of the world has the first root as well
-    if m.roots > 1:
-        sync(lane)
-    for level in range(m.levels):
-        first = load(m.limb_level, level) + lane
-        for n in range(first, load(m.limb_level, level + 1), lanes):
-            limb_kinematics(m, sc, offsets, n, moved)
-        sync(lane)
 
 
 @stage

@@ -1,107 +1,23 @@
-"""Kernels that show a system from inside: bodies, mass matrix, bias forces.
+"""The kernel that shows the mass matrix and the bias forces.
 
-Inputs and outputs are rows as in :mod:`.rows`: ``Coordinates``, and ``Bodies`` or
-``Dynamics``.
+Inputs and outputs are rows as in :mod:`.rows`: ``Coordinates`` and ``Dynamics``.
 """
 
 import warp as wp
 
 from newton_qd.physics.kinds import JointKind
 
-from . import part, real, scalar, sym33, sync, vec3
+from . import real, scalar, sym33, vec3
 from .cpp.algebra import add_diagonal, cross, dot, skew, translation, vector
-from .cpp.memory import constant, load, read_input, store, write_output
+from .cpp.memory import constant, load, store, write_output
 from .cpp.numbers import uniform
 from .cpp.operators import add, mul  # noqa: F401
 from .cpp.place import place
 from .inertia import bias_wrench, rigid_inertia
-from .readings import body_reading, seed_bodies, store_bodies
-from .simulate import kinematics
+from .kinematics import kinematics
 from .structs import Model, Offsets, Scratch, offsets_at
+from .views import load_views
 from .world import Pack, pack_at
-
-
-@part
-def load_views(
-    m: Model,
-    sc: Scratch,
-    g: Scratch,
-    offsets: Offsets,
-    x: wp.array[scalar],
-    x_bar: wp.array[scalar],
-    pack: Pack,
-):
-    """Copy coordinates and velocities of a pack into its slot.
-
-    Reads: m.nq, m.nv, m.coordinates, x.
-    Writes: sc.q, sc.v.
-    """
-    size = m.coordinates.size
-    q = pack.first * size + m.coordinates.q
-    v = pack.first * size + m.coordinates.v
-    for k in range(m.nq):
-        store(sc.q, offsets.q + k, read_input(x, q + k, size, pack.count))
-    for k in range(m.nv):
-        store(sc.v, offsets.v + k, read_input(x, v + k, size, pack.count))
-
-
-@wp.func_grad(load_views)
-def adj_load_views(
-    m: Model,
-    sc: Scratch,
-    g: Scratch,
-    offsets: Offsets,
-    x: wp.array[scalar],
-    x_bar: wp.array[scalar],
-    pack: Pack,
-):
-    """Hand the adjoints of coordinates and velocities to the caller.
-
-    Reads: m.nq, m.nv, m.coordinates, g.q, g.v.
-    Writes: g.q, g.v, x_bar.
-    """
-    size = m.coordinates.size
-    q = pack.first * size + m.coordinates.q
-    v = pack.first * size + m.coordinates.v
-    for k in range(m.nq):
-        write_output(x_bar, q + k, size, pack.count, load(g.q, offsets.q + k))
-        store(g.q, offsets.q + k, real())
-    for k in range(m.nv):
-        write_output(x_bar, v + k, size, pack.count, load(g.v, offsets.v + k))
-        store(g.v, offsets.v + k, real())
-
-
-@part
-def read_bodies(m: Model, sc: Scratch, offsets: Offsets):
-    """Kinematics of substep 0 with one lane; replayed by the adjoint kernel.
-
-    Reads: m.nb.
-    """
-    kinematics(m, sc, offsets, 0, 0, 1)
-    for i in range(1, m.nb + 1):
-        body_reading(m, sc, offsets, i)
-
-
-@part
-def seed_views(
-    m: Model, g: Scratch, offsets: Offsets, y_bar: wp.array[scalar], pack: Pack
-):
-    """Start the reverse pass with the caller's adjoints of the bodies.
-
-    Reads: m.bodies, y_bar.
-    Writes: g.pose, g.twist_w, g.position, g.com, g.com_velocity.
-    """
-    size = m.bodies.size
-    at = pack.first * size
-    seed_bodies(m, g, offsets, real(), y_bar, m.bodies, at, size, pack.count, 0, 1)
-
-
-@wp.func_grad(seed_views)
-def adj_seed_views(
-    m: Model, g: Scratch, offsets: Offsets, y_bar: wp.array[scalar], pack: Pack
-):
-    """Nothing: seeding is not part of the kinematics."""
-    sync(0)
 
 
 @wp.func
@@ -255,56 +171,3 @@ def dynamics_forward(
     load_views(m, sc, sc, offsets, x, x, pack)
     kinematics(m, sc, offsets, 0, 0, 1)
     store_dynamics(m, sc, offsets, y, pack)
-
-
-@wp.kernel(enable_backward=False)
-def kinematics_forward(
-    m: Model,
-    first: int,
-    slot_stride: int,
-    worlds: int,
-    lanes: int,
-    scratch: Scratch,
-    x: wp.array[scalar],
-    y: wp.array[scalar],
-):
-    """Where the bodies are and how they move.
-
-    Reads: x.
-    Writes: y.
-    """
-    pack = pack_at(wp.tid(), first, worlds, slot_stride, 1)
-    sc = place(scratch, pack.column)
-    offsets = offsets_at(m, pack.slot, 0, 0, 0)
-    load_views(m, sc, sc, offsets, x, x, pack)
-    read_bodies(m, sc, offsets)
-    size = m.bodies.size
-    at = pack.first * size
-    store_bodies(m, sc, offsets, y, m.bodies, at, size, pack.count, 0, 1)
-
-
-@wp.kernel
-def kinematics_backward(
-    m: Model,
-    first: int,
-    slot_stride: int,
-    worlds: int,
-    lanes: int,
-    scratch: Scratch,
-    adjoints: Scratch,
-    x: wp.array[scalar],
-    y_bar: wp.array[scalar],
-    x_bar: wp.array[scalar],
-):
-    """Adjoint of the kinematics; launched with ``adjoint=True``.
-
-    Reads: x, y_bar.
-    Writes: x_bar.
-    """
-    pack = pack_at(wp.tid(), first, worlds, slot_stride, 1)
-    sc = place(scratch, pack.column)
-    g = place(adjoints, pack.column)
-    offsets = offsets_at(m, pack.slot, 1, 0, 0)
-    load_views(m, sc, g, offsets, x, x_bar, pack)
-    read_bodies(m, sc, offsets)
-    seed_views(m, g, offsets, y_bar, pack)
