@@ -19,7 +19,7 @@ Arrays = tuple[wp.array, ...]
 
 LANES = (1, 2, 4, 8, 16, 32)
 # Module of each kernel. Warp compiles whole modules, so each has one of its own.
-_MODULES = {
+MODULES = {
     "kinematics_forward": "bodies",
     "kinematics_backward": "bodies_backward",
     "dynamics_forward": "dynamics",
@@ -240,7 +240,7 @@ class Launcher:
                 command.send(arrays, first, count, threads, 1, number, side * number)
 
     def _kernel(self, name: str) -> wp.Kernel:
-        return getattr(getattr(self.kernels, _MODULES[name]), name)
+        return getattr(getattr(self.kernels, MODULES[name]), name)
 
     def _build_plan(self, name: str) -> Plan:
         adjoint = name.endswith("_backward")
