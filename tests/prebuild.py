@@ -19,12 +19,12 @@ KERNELS = {
         ("ant", "step_backward"),
         ("ant", "step_forward"),
         ("antmaze", "step_forward"),
-        ("ant", "kinematics_forward"),
+        ("ant", "bodies_forward"),
     ),
     "float64": (
         ("ant", "step_backward"),
         ("ant", "step_forward"),
-        ("ant", "kinematics_forward"),
+        ("ant", "bodies_forward"),
     ),
 }
 TIMEOUT_S = 600.0

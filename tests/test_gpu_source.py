@@ -1,7 +1,8 @@
-"""Every kernel compiles for a GPU, also on a machine that has none.
+"""Kernels compile for a GPU, also on a machine that has none.
 
 The CUDA of a kernel is other code than its C++ (one world in a pack, barriers, lanes),
-and tests on a CPU do not see it. Warp's compiler for GPUs needs no driver.
+and tests on a CPU do not see it. Warp's compiler makes PTX of it without a driver. The
+assembler of the driver is not run.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 import warp as wp
@@ -18,32 +20,41 @@ from newton_qd.physics.precision import Variant, build_kernels
 
 COMPUTE_CAPABILITY = 90
 PLAIN = Variant("float32", 1)
-CASES = [(PLAIN, name) for name in MODULES if name != "contact_impulses"]
-# the features, each in the kernel that has most of its code
-CASES += [
-    (dataclasses.replace(PLAIN, boxes=True, pairs=True), "contact_gaps"),
-    (dataclasses.replace(PLAIN, parametric=True), "step_forward"),
-]
+EVERYTHING = dataclasses.replace(PLAIN, parametric=True, boxes=True, pairs=True)
+# a whole step takes about ten seconds
+WHOLE_STEPS = ("step_forward", "step_backward", "contact_impulses")
 
 
-@pytest.mark.slow
+def case(variant: Variant, name: str) -> Any:
+    """The parameters of a test, marked as slow where they are."""
+    marks = [pytest.mark.slow] if name in WHOLE_STEPS else []
+    features = variant.package.split("kernels_")[1]
+    return pytest.param(variant, name, marks=marks, id=f"{features}-{name}")
+
+
 @pytest.mark.skipif(sys.platform == "darwin", reason="Warp for macOS has no CUDA")
 @pytest.mark.parametrize(
     ("variant", "name"),
-    CASES,
-    ids=[f"{variant.package.split('kernels_')[1]}-{name}" for variant, name in CASES],
+    [
+        *(case(PLAIN, name) for name in MODULES),
+        # their geometry, and everything with its adjoint
+        case(EVERYTHING, "contact_gaps"),
+        case(EVERYTHING, "step_backward"),
+    ],
 )
 def test_a_kernel_compiles_for_a_gpu(
     variant: Variant, name: str, tmp_path: Path
 ) -> None:
+    """It is alone in its module, and has an adjoint if it is launched backwards."""
     module = getattr(build_kernels(variant), MODULES[name])
     wp.compile_aot_module(
         module, arch=COMPUTE_CAPABILITY, module_dir=tmp_path, use_ptx=True
     )
     (program,) = tmp_path.glob("*.ptx")
-    text = program.read_text(encoding="utf-8")
-    entries = [line for line in text.splitlines() if ".entry" in line]
-    assert any(name in entry for entry in entries)
-    # only what is launched backwards has an adjoint
-    has_adjoint = any("_cuda_kernel_backward" in entry for entry in entries)
-    assert has_adjoint == name.endswith("_backward")
+    lines = program.read_text(encoding="utf-8").splitlines()
+    entries = [line for line in lines if ".entry" in line]
+    directions = ["forward", "backward"] if name.endswith("_backward") else ["forward"]
+    assert len(entries) == len(directions)
+    for direction, entry in zip(directions, sorted(entries, reverse=True), strict=True):
+        assert f" {name}_" in entry
+        assert f"_cuda_kernel_{direction}" in entry

@@ -145,7 +145,7 @@ def test_a_plan_belongs_to_what_it_computes() -> None:
     system = physics.load_system(HOPPER)
     equal = physics.load_system(HOPPER)
     other = physics.load_system(dataclasses.replace(HOPPER, gravity=9.0))
-    names = ("step_forward", "kinematics_forward")
+    names = ("step_forward", "bodies_forward")
     plans = [
         bridge.launcher(own, device).plan(name)
         for own in (system, equal, other)

@@ -256,7 +256,7 @@ def kinematics(system: System) -> Callable[[jax.Array, jax.Array], Kinematics]:
     """
     read, written = layout.coordinates(system), layout.bodies(system)
     call = functools.partial(_kernel_call, system, size=read.size)
-    views = differentiable(call, "kinematics", read.size, written.size)
+    views = differentiable(call, "bodies", read.size, written.size)
 
     def run(q: jax.Array, v: jax.Array) -> Kinematics:
         row = _row(system, read.shapes, q=q, v=v)

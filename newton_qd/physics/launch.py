@@ -18,10 +18,10 @@ from newton_qd.physics.warp_internals import cpu_entry
 Arrays = tuple[wp.array, ...]
 
 LANES = (1, 2, 4, 8, 16, 32)
-# Module of each kernel. Warp compiles whole modules, so each has one of its own.
+# Module of each kernel of packs. Warp compiles whole modules, so each has its own.
 MODULES = {
-    "kinematics_forward": "bodies",
-    "kinematics_backward": "bodies_backward",
+    "bodies_forward": "bodies",
+    "bodies_backward": "bodies_backward",
     "dynamics_forward": "dynamics",
     "step_forward": "forward",
     "step_backward": "backward",

@@ -162,7 +162,7 @@ def rows(
         return inputs(system, parametric), outputs(system)
     if name == "contact_impulses":
         return inputs(system), impulses(system)
-    written = {"kinematics": bodies, "dynamics": dynamics, "contact_gaps": gaps}
+    written = {"bodies": bodies, "dynamics": dynamics, "contact_gaps": gaps}
     return coordinates(system), written[name](system)
 
 

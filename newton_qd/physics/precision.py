@@ -28,8 +28,8 @@ _VECTOR_BYTES = 32
 _OPTIMIZATION = 2
 # Modules in a folder of the package.
 _FILES = {"memory": "cpp.memory"}
-# Modules that are the same with and without boxes and pairs. Variants share them, so
-# Warp compiles the kernels that are among them once for all.
+# Modules that variants with and without boxes and pairs share. Warp compiles their
+# kernels once.
 SHARED = ("answers", "bodies", "bodies_backward", "box", "cpp", "dynamics", "inertia")
 SHARED += ("integration", "joints", "kinematics", "parameters", "readings", "rows")
 SHARED += ("structs", "views", "world")
@@ -78,8 +78,8 @@ class Kernels:
         world: Functions that read inputs and write outputs.
         forward: Kernel ``step_forward``.
         backward: Kernel ``step_backward``.
-        bodies: Kernel ``kinematics_forward``.
-        bodies_backward: Kernel ``kinematics_backward``.
+        bodies: Kernel ``bodies_forward``.
+        bodies_backward: Kernel ``bodies_backward``.
         dynamics: Kernel ``dynamics_forward``.
         gaps: Kernel ``contact_gaps``.
         impulses: Kernel ``contact_impulses``.

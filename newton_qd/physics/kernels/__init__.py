@@ -17,8 +17,8 @@ hand, in :mod:`.multipliers` and :mod:`.parts`.
 and where these begin (``Offsets``); :mod:`.rows` where the fields of a row of inputs or
 outputs begin. :mod:`.world` moves these rows, with :mod:`.parameters` for parameters
 of each world. :mod:`.forward` and :mod:`.backward` are the kernels of a step;
-:mod:`.bodies` with :mod:`.bodies_backward`, :mod:`.dynamics`, :mod:`.gaps` and
-:mod:`.impulses` show a system from inside, with :mod:`.views` in common;
+:mod:`.bodies`, :mod:`.bodies_backward`, :mod:`.dynamics` and :mod:`.gaps` show a system
+from inside and share :mod:`.views`; :mod:`.impulses` runs a whole step for that;
 :mod:`.episodes` and :mod:`.conventions` do not use packs. :mod:`.cpp.memory` says how
 the intermediates lie in memory.
 

@@ -14,7 +14,7 @@ from .world import pack_at
 
 
 @wp.kernel(enable_backward=False)
-def kinematics_forward(
+def bodies_forward(
     m: Model,
     first: int,
     slot_stride: int,

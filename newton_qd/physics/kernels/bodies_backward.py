@@ -33,7 +33,7 @@ def adj_seed_views(
 
 
 @wp.kernel
-def kinematics_backward(
+def bodies_backward(
     m: Model,
     first: int,
     slot_stride: int,

@@ -9,7 +9,7 @@ import warp as wp
 
 @wp.struct
 class Coordinates:
-    """A row that a kernel reads which shows a system from inside."""
+    """Coordinates and velocities, for kernels that use :mod:`.views`."""
 
     size: int
     q: int

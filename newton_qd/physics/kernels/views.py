@@ -1,4 +1,4 @@
-"""What the kernels that show a system from inside have in common.
+"""What kernels share that show a system at given coordinates and velocities.
 
 They read ``Coordinates`` of :mod:`.rows`. Each of them is a module of its own, because
 Warp compiles whole modules: a reset shows the bodies, and needs neither their adjoint
