@@ -30,9 +30,9 @@ _OPTIMIZATION = 2
 _FILES = {"memory": "cpp.memory"}
 # Modules that variants with and without boxes and pairs share. Warp compiles their
 # kernels once.
-SHARED = ("answers", "bodies", "bodies_backward", "box", "cpp", "dynamics", "inertia")
-SHARED += ("integration", "joints", "kinematics", "parameters", "readings", "rows")
-SHARED += ("structs", "views", "world")
+SHARED = ("answers", "bodies", "bodies_backward", "box", "coordinates", "cpp")
+SHARED += ("dynamics", "inertia", "integration", "joints", "kinematics", "parameters")
+SHARED += ("readings", "rows", "structs", "world")
 SCALARS = {"float32": wp.float32, "float64": wp.float64}
 
 

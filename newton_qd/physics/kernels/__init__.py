@@ -18,7 +18,7 @@ and where these begin (``Offsets``); :mod:`.rows` where the fields of a row of i
 outputs begin. :mod:`.world` moves these rows, with :mod:`.parameters` for parameters
 of each world. :mod:`.forward` and :mod:`.backward` are the kernels of a step;
 :mod:`.bodies`, :mod:`.bodies_backward`, :mod:`.dynamics` and :mod:`.gaps` show a system
-from inside and share :mod:`.views`; :mod:`.impulses` runs a whole step for that;
+from inside and share :mod:`.coordinates`; :mod:`.impulses` runs a whole step for that;
 :mod:`.episodes` and :mod:`.conventions` do not use packs. :mod:`.cpp.memory` says how
 the intermediates lie in memory.
 

@@ -6,10 +6,10 @@ Inputs and outputs are rows as in :mod:`.rows`: ``Coordinates`` and ``Bodies``.
 import warp as wp
 
 from . import scalar
+from .coordinates import load_coordinates, read_bodies
 from .cpp.place import place
 from .readings import store_bodies
 from .structs import Model, Scratch, offsets_at
-from .views import load_views, read_bodies
 from .world import pack_at
 
 
@@ -32,7 +32,7 @@ def bodies_forward(
     pack = pack_at(wp.tid(), first, worlds, slot_stride, 1)
     sc = place(scratch, pack.column)
     offsets = offsets_at(m, pack.slot, 0, 0, 0)
-    load_views(m, sc, sc, offsets, x, x, pack)
+    load_coordinates(m, sc, sc, offsets, x, x, pack)
     read_bodies(m, sc, offsets)
     size = m.bodies.size
     at = pack.first * size

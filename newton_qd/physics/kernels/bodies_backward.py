@@ -3,15 +3,15 @@
 import warp as wp
 
 from . import part, real, scalar, sync
+from .coordinates import load_coordinates, read_bodies
 from .cpp.place import place
 from .readings import seed_bodies
 from .structs import Model, Offsets, Scratch, offsets_at
-from .views import load_views, read_bodies
 from .world import Pack, pack_at
 
 
 @part
-def seed_views(
+def seed_reverse(
     m: Model, g: Scratch, offsets: Offsets, y_bar: wp.array[scalar], pack: Pack
 ):
     """Start the reverse pass with the caller's adjoints of the bodies.
@@ -24,8 +24,8 @@ def seed_views(
     seed_bodies(m, g, offsets, real(), y_bar, m.bodies, at, size, pack.count, 0, 1)
 
 
-@wp.func_grad(seed_views)
-def adj_seed_views(
+@wp.func_grad(seed_reverse)
+def adj_seed_reverse(
     m: Model, g: Scratch, offsets: Offsets, y_bar: wp.array[scalar], pack: Pack
 ):
     """Nothing: seeding is not part of the kinematics."""
@@ -54,6 +54,6 @@ def bodies_backward(
     sc = place(scratch, pack.column)
     g = place(adjoints, pack.column)
     offsets = offsets_at(m, pack.slot, 1, 0, 0)
-    load_views(m, sc, g, offsets, x, x_bar, pack)
+    load_coordinates(m, sc, g, offsets, x, x_bar, pack)
     read_bodies(m, sc, offsets)
-    seed_views(m, g, offsets, y_bar, pack)
+    seed_reverse(m, g, offsets, y_bar, pack)

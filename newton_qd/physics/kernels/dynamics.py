@@ -8,6 +8,7 @@ import warp as wp
 from newton_qd.physics.kinds import JointKind
 
 from . import real, scalar, sym33, vec3
+from .coordinates import load_coordinates
 from .cpp.algebra import add_diagonal, cross, dot, skew, translation, vector
 from .cpp.memory import constant, load, store, write_output
 from .cpp.numbers import uniform
@@ -16,7 +17,6 @@ from .cpp.place import place
 from .inertia import bias_wrench, rigid_inertia
 from .kinematics import kinematics
 from .structs import Model, Offsets, Scratch, offsets_at
-from .views import load_views
 from .world import Pack, pack_at
 
 
@@ -168,6 +168,6 @@ def dynamics_forward(
     pack = pack_at(wp.tid(), first, worlds, slot_stride, 1)
     sc = place(scratch, pack.column)
     offsets = offsets_at(m, pack.slot, 0, 0, 0)
-    load_views(m, sc, sc, offsets, x, x, pack)
+    load_coordinates(m, sc, sc, offsets, x, x, pack)
     kinematics(m, sc, offsets, 0, 0, 1)
     store_dynamics(m, sc, offsets, y, pack)

@@ -6,13 +6,13 @@ Inputs: ``Coordinates`` of :mod:`.rows`. Outputs: the gap of each contact.
 import warp as wp
 
 from . import real, scalar, vec3
+from .coordinates import load_coordinates
 from .cpp.memory import load, write_output
 from .cpp.place import place
 from .kinematics import kinematics
 from .nearest import touch_obstacle
 from .pair import touch_partner
 from .structs import Model, Offsets, Scratch, offsets_at
-from .views import load_views
 from .world import pack_at
 
 
@@ -51,7 +51,7 @@ def contact_gaps(
     pack = pack_at(wp.tid(), first, worlds, slot_stride, 1)
     sc = place(scratch, pack.column)
     offsets = offsets_at(m, pack.slot, 0, 0, 0)
-    load_views(m, sc, sc, offsets, x, x, pack)
+    load_coordinates(m, sc, sc, offsets, x, x, pack)
     kinematics(m, sc, offsets, 0, 0, 1)
     for c in range(m.nc):
         write_output(

@@ -9,7 +9,7 @@ import warp as wp
 
 @wp.struct
 class Coordinates:
-    """Coordinates and velocities, for kernels that use :mod:`.views`."""
+    """Coordinates and velocities, for kernels that use :mod:`.coordinates`."""
 
     size: int
     q: int

@@ -16,7 +16,7 @@ from .world import Pack
 
 
 @part
-def load_views(
+def load_coordinates(
     m: Model,
     sc: Scratch,
     g: Scratch,
@@ -39,8 +39,8 @@ def load_views(
         store(sc.v, offsets.v + k, read_input(x, v + k, size, pack.count))
 
 
-@wp.func_grad(load_views)
-def adj_load_views(
+@wp.func_grad(load_coordinates)
+def adj_load_coordinates(
     m: Model,
     sc: Scratch,
     g: Scratch,
