@@ -142,6 +142,12 @@ def pytest_collection_finish() -> None:
     gc.enable()
 
 
+def pytest_sessionfinish() -> None:
+    """Looks for garbage once: pytest looks five times after this."""
+    gc.collect()
+    gc.freeze()
+
+
 @pytest.fixture(scope="session", autouse=True)
 def device(request: pytest.FixtureRequest) -> Iterator[Any]:
     """JAX device that the test runs on; arrays and jitted code go there."""

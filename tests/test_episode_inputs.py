@@ -49,6 +49,7 @@ def test_a_state_and_its_key_begin_the_same_episode() -> None:
     assert later.reward + part == pytest.approx(float(whole), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_gradients_to_first_state_and_parameters(x64: None) -> None:
     """Of fitness and descriptor, along a random direction of each: below 1e-6."""
     env, episode, _, plan = hopping()
