@@ -242,6 +242,12 @@ def test_check_names_what_is_not_finite(part: str, words: str) -> None:
             "Bad.outcome: 'lean': got complex numbers; allowed: real numbers",
         ),
         (
+            "outcome",
+            (0.0, False, {"lean": 0.0, 1: 0.0}),
+            TypeError,
+            "Bad.outcome: the name of a metric: got 1; allowed: text",
+        ),
+        (
             "observe",
             {"x": jnp.zeros(2, complex)},
             TypeError,
@@ -368,41 +374,6 @@ def test_old_names_of_the_methods() -> None:
     assert seen[0].filename == __file__
     assert Old.outcome is vars(Old)["_outcome"]
     assert vars(nq.Locomotion)["_outcome"] is nq.Locomotion.outcome
-
-
-@pytest.fixture
-def names(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Registrations that the test makes are forgotten after it."""
-    monkeypatch.setattr(tasks, "ENVIRONMENTS", dict(tasks.ENVIRONMENTS))
-
-
-def test_register_gives_the_robot_and_options(names: None) -> None:
-    robot = newton_qd.create("ant").unwrapped.robot  # pyright: ignore
-    limits = {"minval": (-1, -1), "maxval": (1, 1)}
-    nq.register(
-        "mine",
-        nq.Locomotion,
-        robot=robot,
-        descriptor=nq.WrapperSpec(nq.XYPositionWrapper, limits),
-        healthy_reward=3.0,
-    )
-    spec = tasks.ENVIRONMENTS["mine"]
-    assert spec.descriptor_extractor is nq.get_final_xy_position
-    assert spec.forward_reward == "reward_forward" and spec.torso == "torso"
-    env: Any = nq.create("mine")
-    assert env.unwrapped._healthy_reward == 3.0
-    assert env.state_descriptor_limits[1].tolist() == [1, 1]
-    env = nq.create("mine", healthy_reward=4.0)
-    assert env.unwrapped._healthy_reward == 4.0
-    with pytest.raises(
-        TypeError, match=r"heatlhy: got 1, .* not an argument of 'other'; a"
-    ):
-        nq.register("other", nq.Locomotion, robot=robot, heatlhy=1)
-    with pytest.raises(
-        TypeError, match="descriptor: got 3; allowed: None, a class such as"
-    ):
-        nq.register("other", nq.Locomotion, descriptor=3)  # pyright: ignore
-    assert "other" not in nq.registered_envs()
 
 
 def test_everything_is_in_one_module() -> None:

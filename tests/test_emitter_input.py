@@ -72,6 +72,10 @@ def test_errors_name_what_is_wrong() -> None:
         GradientsError, match=r"start: got .*\(3,\); allowed: .*\(20,\)"
     ):
         begin(CMAMEGAEmitter(score, sigma_g=1.0, start=jnp.zeros(3)))
+    with pytest.raises(
+        TypeError, match="selector: got 'best'; allowed: .*selector of Q"
+    ):
+        OMGMEGAEmitter(4, 1.0, selector="best")  # pyright: ignore[reportArgumentType]
     with pytest.raises(TypeError, match="AnnealedRepertoire"):
         begin(CMAMAEGAEmitter(score, sigma_g=1.0))
     with pytest.raises(ValueError, match=r"got 2 columns; allowed: 1 \+ D = 3 columns"):
@@ -129,6 +133,12 @@ def line(**changes: Any) -> GradientLineEmitter:
         (
             lambda: GradientVariationEmitter(4, optax.sgd(1.0), directions=[1.0]),
             "directions: got .*; allowed: finite numbers",
+        ),
+        (
+            lambda: GradientVariationEmitter(
+                4, optax.sgd(1.0), directions=[[1], [1, 2]]
+            ),
+            r"directions: got \[\[1\], \[1, 2\]\]; allowed: finite numbers",
         ),
         (
             lambda: line(parents=0),

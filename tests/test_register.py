@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import newton_qd
+import newton_qd.authoring as nq
 from newton_qd import tasks
 from newton_qd.envs.ant import Ant
 from newton_qd.envs.pointmaze import PointMaze
@@ -174,3 +175,32 @@ def test_a_base_makes_an_environment(rows: None) -> None:
 def test_register_takes_numbers_of_numpy(rows: None) -> None:
     newton_qd.register("mine", Ant, reward_offset=np.float32(2.0))  # pyright: ignore
     assert newton_qd.tables.reward_offset["mine"] == 2.0
+
+
+def test_register_gives_the_robot_and_options(rows: None) -> None:
+    robot = nq.create("ant").unwrapped.robot  # pyright: ignore
+    limits = {"minval": (-1, -1), "maxval": (1, 1)}
+    nq.register(
+        "mine",
+        nq.Locomotion,
+        robot=robot,
+        descriptor=nq.WrapperSpec(nq.XYPositionWrapper, limits),
+        healthy_reward=3.0,
+    )
+    spec = tasks.ENVIRONMENTS["mine"]
+    assert spec.descriptor_extractor is nq.get_final_xy_position
+    assert spec.forward_reward == "reward_forward" and spec.torso == "torso"
+    env: Any = nq.create("mine")
+    assert env.unwrapped._healthy_reward == 3.0
+    assert env.state_descriptor_limits[1].tolist() == [1, 1]
+    env = nq.create("mine", healthy_reward=4.0)
+    assert env.unwrapped._healthy_reward == 4.0
+    with pytest.raises(
+        TypeError, match=r"heatlhy: got 1, .* not an argument of 'other'; a"
+    ):
+        nq.register("other", nq.Locomotion, robot=robot, heatlhy=1)
+    with pytest.raises(
+        TypeError, match="descriptor: got 3; allowed: None, a class such as"
+    ):
+        nq.register("other", nq.Locomotion, descriptor=3)  # pyright: ignore
+    assert "other" not in nq.registered_envs()

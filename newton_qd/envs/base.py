@@ -112,9 +112,8 @@ class PhysicsEnv(Env):
         rest = jax.eval_shape(self._rest)
         action = jax.ShapeDtypeStruct((self.action_size,), self._dtype)
         self._layout: tuple[tuple[str, int], ...] = ()
-        jax.eval_shape(self._record_layout, rest, action)
-        found = jax.eval_shape(self.outcome, rest, rest, action)
-        self._metrics = inputs.checked_outcome(type(self).__name__, found)
+        self._metrics: tuple[str, ...] = ()
+        jax.eval_shape(self._record_names, rest, action)
 
     def with_scene(self, scene: Scene | None) -> PhysicsEnv:
         """Returns the same environment in another scene; this one does not change.
@@ -370,10 +369,12 @@ class PhysicsEnv(Env):
         v = jnp.zeros((self.system.nv,), self._dtype)
         return physics.initial_state(self.system, q, v)
 
-    def _record_layout(self, state: PhysicsState, action: Action) -> None:
+    def _record_names(self, state: PhysicsState, action: Action) -> None:
         # stored here because eval_shape would return the blocks sorted by name
-        blocks = self.observe(state, action)
-        self._layout = inputs.checked_layout(type(self).__name__, blocks)
+        name, blocks = type(self).__name__, self.observe(state, action)
+        self._layout = inputs.checked_layout(name, blocks)
+        found = self.outcome(state, state, action)
+        self._metrics = inputs.checked_outcome(name, found)
 
     def _number(self, value: jax.Array) -> jax.Array:
         return jnp.asarray(value, self._dtype)

@@ -178,11 +178,11 @@ def checked_outcome(env: str, found: object) -> tuple[str, ...]:
 
     Args:
         env: Name of the class with this ``outcome``.
-        found: Shapes of the result of ``outcome``.
+        found: Result of ``outcome``, while JAX traces it.
 
     Raises:
-        TypeError: It is not a tuple of reward, done and metrics, or one of these is not
-            a real number.
+        TypeError: It is not a tuple of reward, done and metrics, one of these is not a
+            real number, or the name of a metric is not text.
         ValueError: A number does not have the shape ().
     """
     if (
@@ -193,6 +193,8 @@ def checked_outcome(env: str, found: object) -> tuple[str, ...]:
         allowed = "reward, done and a dictionary of metrics"
         raise TypeError(message(f"{env}.outcome", found, allowed))
     reward, done, metrics = found
+    for name in metrics:
+        checks.text(f"{env}.outcome: the name of a metric", name, error=TypeError)
     for name, value in {"reward": reward, "done": done, **metrics}.items():
         require_real(f"{env}.outcome: {name!r}", value)
         if jnp.shape(value) != ():

@@ -107,9 +107,12 @@ class EliteGradientEmitter(Emitter, abc.ABC):
             selector: Selector of QDax; ``None``: uniform, with replacement.
 
         Raises:
+            TypeError: ``selector`` is not one of QDax.
             ValueError: The batch is empty.
         """
         checks.integer("batch_size", batch_size, most=None)
+        allowed = "a selector of QDax"
+        checks.instance("selector", selector, Selector, allowed, optional=True)
         self._batch_size = batch_size
         self._selector = selector
 

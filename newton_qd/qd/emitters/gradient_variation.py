@@ -64,7 +64,8 @@ class GradientVariationEmitter(EliteGradientEmitter):
             selector: Selector of QDax; ``None``: uniform, with replacement.
 
         Raises:
-            TypeError: ``optimizer`` is not one of optax.
+            TypeError: ``optimizer`` is not one of optax, or ``selector`` is not one of
+                QDax.
             ValueError: ``steps`` needs a ``scoring_function``, ``directions`` is not a
                 finite matrix, or a number is out of its range.
         """
@@ -72,10 +73,7 @@ class GradientVariationEmitter(EliteGradientEmitter):
         check_optimizer(optimizer)
         check_steps(steps, scoring_function)
         if directions is not None:
-            directions = np.asarray(directions)
-            if directions.ndim != 2 or not np.all(np.isfinite(directions)):
-                allowed = "finite numbers (K, 1 + D)"
-                raise ValueError(message("directions", directions.tolist(), allowed))
+            directions = _matrix(directions)
         self._optimizer = optimizer
         self._steps = steps
         self._scoring_function = scoring_function
@@ -141,3 +139,19 @@ class GradientVariationEmitter(EliteGradientEmitter):
             raise ValueError(message("directions", given, f"1 + D = {rows} columns"))
         drawn = jax.random.randint(key, (count,), 0, len(directions))
         return jnp.asarray(directions, gradients.dtype)[drawn]
+
+
+def _matrix(directions: ArrayLike) -> np.ndarray:
+    """Returns directions (K, 1 + D) as an array.
+
+    Raises:
+        ValueError: They are not a finite matrix.
+    """
+    allowed = "finite numbers (K, 1 + D)"
+    try:
+        found = np.asarray(directions, np.float64)
+    except (TypeError, ValueError) as failure:  # rows of several lengths, or text
+        raise ValueError(message("directions", directions, allowed)) from failure
+    if found.ndim != 2 or not np.all(np.isfinite(found)):
+        raise ValueError(message("directions", directions, allowed))
+    return found

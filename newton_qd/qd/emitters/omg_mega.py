@@ -40,6 +40,7 @@ class OMGMEGAEmitter(EliteGradientEmitter):
             selector: Selector of QDax; ``None``: uniform, with replacement.
 
         Raises:
+            TypeError: ``selector`` is not one of QDax.
             ValueError: ``sigma_g`` is not positive, or the batch is empty.
         """
         super().__init__(batch_size, selector)
