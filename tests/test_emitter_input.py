@@ -73,7 +73,7 @@ def test_errors_name_what_is_wrong() -> None:
     ):
         begin(CMAMEGAEmitter(score, sigma_g=1.0, start=jnp.zeros(3)))
     with pytest.raises(
-        TypeError, match="selector: got 'best'; allowed: .*selector of Q"
+        TypeError, match=r"selector: got 'best'; allowed: .*selector of Q"
     ):
         OMGMEGAEmitter(4, 1.0, selector="best")  # pyright: ignore[reportArgumentType]
     with pytest.raises(TypeError, match="AnnealedRepertoire"):
