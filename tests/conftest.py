@@ -143,7 +143,7 @@ def pytest_collection_finish() -> None:
 
 
 def pytest_sessionfinish() -> None:
-    """Looks for garbage once: pytest looks five times after this."""
+    """Looks for garbage once: what is left now costs pytest's own looks nothing."""
     gc.collect()
     gc.freeze()
 

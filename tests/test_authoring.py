@@ -134,6 +134,15 @@ def test_defaults_of_the_methods(page: dict[str, Any]) -> None:
     assert after.reward.dtype == after.done.dtype == np.float32 and after.reward == 1
 
 
+def test_numbers_of_numpy_are_numbers(page: dict[str, Any]) -> None:
+    found = np.float32(2.0), np.bool_(False), {"height": np.int32(3)}
+    plain = type("Plain", (Still,), {"outcome": lambda self, *given: found})
+    env = plain(page["ROBOT"])
+    state = env.reset(jax.random.key(0))
+    after = jax.jit(env.step)(state, jnp.zeros(env.action_size))
+    assert (after.reward, after.done, after.metrics["height"]) == (2.0, 0.0, 3.0)
+
+
 def test_a_control_of_another_type_is_converted(page: dict[str, Any]) -> None:
     """As what ``observe`` and ``outcome`` return."""
 
@@ -246,6 +255,12 @@ def test_check_names_what_is_not_finite(part: str, words: str) -> None:
             (0.0, False, {"lean": 0.0, 1: 0.0}),
             TypeError,
             "Bad.outcome: the name of a metric: got 1; allowed: text",
+        ),
+        (
+            "outcome",
+            (jnp.zeros(3), False, {"reward": 0.0}),
+            ValueError,
+            r"Bad.outcome: 'reward': got shape \(3,\); allowed: shape \(\)",
         ),
         (
             "observe",

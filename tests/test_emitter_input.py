@@ -72,9 +72,7 @@ def test_errors_name_what_is_wrong() -> None:
         GradientsError, match=r"start: got .*\(3,\); allowed: .*\(20,\)"
     ):
         begin(CMAMEGAEmitter(score, sigma_g=1.0, start=jnp.zeros(3)))
-    with pytest.raises(
-        TypeError, match=r"selector: got 'best'; allowed: .*selector of Q"
-    ):
+    with pytest.raises(TypeError, match=r"selector: got 'best'; allowed: .*of a sel"):
         OMGMEGAEmitter(4, 1.0, selector="best")  # pyright: ignore[reportArgumentType]
     with pytest.raises(TypeError, match="AnnealedRepertoire"):
         begin(CMAMAEGAEmitter(score, sigma_g=1.0))
@@ -110,6 +108,10 @@ def test_lengths_of_large_gradients_do_not_overflow(size: float) -> None:
         np.testing.assert_allclose(found[0], [0.6, 0.8], rtol=1e-6)
 
 
+def variation(directions: Any) -> GradientVariationEmitter:
+    return GradientVariationEmitter(4, optax.sgd(1.0), directions=directions)
+
+
 def line(**changes: Any) -> GradientLineEmitter:
     given = {"parents": 2, "branches": 2, "shortest": 0.1, "longest": 1.0, **changes}
     return GradientLineEmitter(along(score), **given)
@@ -131,15 +133,28 @@ def line(**changes: Any) -> GradientLineEmitter:
             "steps: got 2; allowed: 1 without a scoring_function",
         ),
         (
-            lambda: GradientVariationEmitter(4, optax.sgd(1.0), directions=[1.0]),
+            lambda: variation([1.0]),
             "directions: got .*; allowed: finite numbers",
         ),
         (
-            lambda: GradientVariationEmitter(
-                4, optax.sgd(1.0), directions=[[1], [1, 2]]
-            ),
+            lambda: variation([[1], [1, 2]]),
             r"directions: got \[\[1\], \[1, 2\]\]; allowed: finite numbers",
         ),
+        (lambda: variation(np.zeros((0, 3))), r"directions: got \[\]; .*K from 1"),
+        (lambda: variation([[np.nan, 1.0]]), r"directions: got \[\[nan, 1.0\]\]; all"),
+        (
+            lambda: variation([[1e300, 0.0]]),
+            r"directions: got \[\[1e\+300, 0.0\]\]; all",
+        ),
+        (
+            lambda: variation([[10**400, 1]]),
+            "directions: got .*; allowed: finite numbers",
+        ),
+        (
+            lambda: variation([["1", "2"]]),
+            "directions: got .*'1', '2'.*; allowed: finite",
+        ),
+        (lambda: variation([[1j, 0]]), "directions: got .*; allowed: finite numbers"),
         (
             lambda: line(parents=0),
             "parents: got 0; allowed: .* from 1",

@@ -194,8 +194,8 @@ def checked_outcome(env: str, found: object) -> tuple[str, ...]:
         raise TypeError(message(f"{env}.outcome", found, allowed))
     reward, done, metrics = found
     for name in metrics:
-        checks.text(f"{env}.outcome: the name of a metric", name, error=TypeError)
-    for name, value in {"reward": reward, "done": done, **metrics}.items():
+        checks.instance(f"{env}.outcome: the name of a metric", name, str, "text")
+    for name, value in [("reward", reward), ("done", done), *metrics.items()]:
         require_real(f"{env}.outcome: {name!r}", value)
         if jnp.shape(value) != ():
             given = Fact(f"shape {jnp.shape(value)}")
@@ -210,7 +210,8 @@ def require_real(name: str, value: object) -> None:
         TypeError: It is no array and no number, or has complex numbers.
     """
     allowed = "real numbers"
-    if not checks.is_array(value) and not isinstance(value, (bool, int, float)):
+    scalars = (bool, int, float, np.bool_, np.number)
+    if not checks.is_array(value) and not isinstance(value, scalars):
         given = Fact("None" if value is None else f"a {type(value).__name__}")
         raise TypeError(message(name, given, allowed))
     if jnp.issubdtype(jnp.result_type(value), jnp.complexfloating):

@@ -107,11 +107,11 @@ class EliteGradientEmitter(Emitter, abc.ABC):
             selector: Selector of QDax; ``None``: uniform, with replacement.
 
         Raises:
-            TypeError: ``selector`` is not one of QDax.
+            TypeError: ``selector`` is not an instance of QDax's ``Selector``.
             ValueError: The batch is empty.
         """
         checks.integer("batch_size", batch_size, most=None)
-        allowed = "a selector of QDax"
+        allowed = "an instance of a selector of QDax, such as UniformSelector()"
         checks.instance("selector", selector, Selector, allowed, optional=True)
         self._batch_size = batch_size
         self._selector = selector

@@ -64,10 +64,10 @@ class GradientVariationEmitter(EliteGradientEmitter):
             selector: Selector of QDax; ``None``: uniform, with replacement.
 
         Raises:
-            TypeError: ``optimizer`` is not one of optax, or ``selector`` is not one of
-                QDax.
+            TypeError: ``optimizer`` is not one of optax, or ``selector`` is not an
+                instance of QDax's ``Selector``.
             ValueError: ``steps`` needs a ``scoring_function``, ``directions`` is not a
-                finite matrix, or a number is out of its range.
+                finite matrix with a row, or a number is out of its range.
         """
         super().__init__(batch_size, selector)
         check_optimizer(optimizer)
@@ -145,13 +145,15 @@ def _matrix(directions: ArrayLike) -> np.ndarray:
     """Returns directions (K, 1 + D) as an array.
 
     Raises:
-        ValueError: They are not a finite matrix.
+        ValueError: They are not a finite matrix with at least one row.
     """
-    allowed = "finite numbers (K, 1 + D)"
+    allowed = "finite numbers (K, 1 + D), K from 1"
     try:
-        found = np.asarray(directions, np.float64)
-    except (TypeError, ValueError) as failure:  # rows of several lengths, or text
+        found = np.asarray(directions)
+    except ValueError as failure:  # rows of several lengths
         raise ValueError(message("directions", directions, allowed)) from failure
-    if found.ndim != 2 or not np.all(np.isfinite(found)):
-        raise ValueError(message("directions", directions, allowed))
+    real = found.dtype.kind in "biuf" and found.ndim == 2 and len(found) > 0
+    # optimizers work with single precision
+    if not real or not np.all(np.abs(found) <= np.finfo(np.float32).max):
+        raise ValueError(message("directions", found.tolist(), allowed))
     return found

@@ -40,7 +40,7 @@ class OMGMEGAEmitter(EliteGradientEmitter):
             selector: Selector of QDax; ``None``: uniform, with replacement.
 
         Raises:
-            TypeError: ``selector`` is not one of QDax.
+            TypeError: ``selector`` is not an instance of QDax's ``Selector``.
             ValueError: ``sigma_g`` is not positive, or the batch is empty.
         """
         super().__init__(batch_size, selector)
