@@ -19,7 +19,7 @@ from pathlib import Path
 
 import study_repeats
 import study_scores
-from study_results import Results, load
+from study_results import Results, load, references
 from study_runs import TUNING_SEED, lines
 
 BENCHMARKS = Path(__file__).resolve().parent
@@ -27,12 +27,33 @@ DOCS = BENCHMARKS.parent / "docs"
 FIELD = BENCHMARKS / "results" / "field"
 REPEATS = BENCHMARKS / "results" / "field_repeats.csv"
 SMALL = BENCHMARKS / "results" / "small"
-PAGES = tuple(DOCS / f"study{name}.md" for name in ("", "_details", "_scores", "_runs"))
+NAMES = ("", "_details", "_reasons", "_scores", "_runs")
+PAGES = tuple(DOCS / f"study{name}.md" for name in NAMES)
 TABLE = re.compile(
     r"(?P<head><!-- table: (?P<kind>[^,\n]+)(?:, (?P<stop>[^\n]+))?; "
     r"benchmarks/study_pages\.py -->\n\n)(?P<rows>(?:\|.*\n)*)"
 )
 LONG, BEFORE = "1000 s", "250 s"
+SCATTER = {
+    "ant_omni": {"none": 12, "1": 17, "1, sixteen starts": 20},
+    "ant_uni": {"none": 12, "1, sixteen starts": 20},
+    "anttrap": {"none": 12, "1": 17, "1, sixteen starts": 20},
+    "hopper_uni": {
+        "none": 13,
+        "1": "me-actor-critic@13-scatter-1",
+        "3, sixteen starts": 21,
+        "none, DCRL-ME": "dcrl-me@6-median",
+        "10, sixteen starts, DCRL-ME": "dcrl-me@12-median",
+    },
+    "walker2d_uni": {
+        "none": 14,
+        "3": 19,
+        "1, sixteen starts, noise on weights": 22,
+        "none, DCRL-ME": "dcrl-me@6-median",
+        "1, sixteen starts, DCRL-ME": "dcrl-me@11-median",
+    },
+}
+"""Variants with and without scatter, of each task; a number is a variant of ours."""
 
 
 @functools.cache
@@ -46,6 +67,32 @@ def _equal_runs(stop: str) -> str:
 
 def _repeats(stop: str) -> str:
     return study_repeats.ratios(*study_repeats.load(FIELD, REPEATS, stop))
+
+
+def scatter(stop: str) -> str:
+    """Markdown table: scores with and without scatter."""
+    results = _field()
+    limits = references(results)
+    found = {
+        (task, runs[0].line["variant"]): runs
+        for (task, _, at), runs in results.items()
+        if at == stop
+    }
+    rows = []
+    for task, variants in SCATTER.items():
+        for label, variant in variants.items():
+            own = isinstance(variant, int)
+            runs = found[task, f"me-actor-critic@{variant}" if own else variant]
+            rows.append(
+                [
+                    task,
+                    f"{label} ({variant})" if own else f"{label} (`{variant}`)",
+                    str(len(runs)),
+                    *study_scores.corrected(runs, limits[task]),
+                ]
+            )
+    head = ("task", "scatter", "seeds", "corrected QD score", "without offset")
+    return study_scores.markdown([*head, "corrected coverage [%]"], rows)
 
 
 def long_runs() -> str:
@@ -82,6 +129,7 @@ KINDS: dict[str, Callable[[str], str]] = {
     "scores": lambda stop: study_scores.table(_field(), stop, short=True),
     "scores on a CPU": lambda stop: study_scores.table(load(SMALL), stop, short=True),
     "published": lambda _: study_scores.published(_field()),
+    "scatter": scatter,
     "long runs": lambda _: long_runs(),
     "equal runs": _equal_runs,
     "other runs": _repeats,

@@ -65,6 +65,14 @@ def text(values: list[float], spec: str) -> str:
     return f"{middle:{spec}} ({low:{spec}} to {high:{spec}})"
 
 
+def corrected(runs: Sequence[Scored], limits: tuple[float, float]) -> list[str]:
+    """Corrected QD score, the same without offset, and corrected coverage [%]."""
+    scores = [float(run.line["corrected_qd_score"]) for run in runs]
+    shares = [float(run.line["corrected_coverage"]) for run in runs]
+    plain = [normalized(run, limits) for run in runs]
+    return [text(scores, ",.0f"), text(plain, ".4f"), text(shares, ".1f")]
+
+
 def table(results: Results, stop: str, *, short: bool = False) -> str:
     """Markdown table of all tasks and algorithms at a stop.
 
@@ -85,19 +93,18 @@ def table(results: Results, stop: str, *, short: bool = False) -> str:
             def column(name: str, runs: list[Scored] = runs) -> list[float]:
                 return [float(run.line[name]) for run in runs]
 
+            score, plain, share = corrected(runs, limits[task])
             clock = "wall_s" if runs[0].line["device"] == "cuda" else "processor_s"
             row = {
                 "task": task,
                 "algorithm": key[1],
                 "seeds": str(len(runs)),
-                "**corrected QD score**": text(column("corrected_qd_score"), ",.0f"),
-                "**without offset**": text(
-                    [normalized(run, limits[task]) for run in runs], ".4f"
-                ),
+                "**corrected QD score**": score,
+                "**without offset**": plain,
                 "corrected mean fitness over common cells": text(
                     shared.get(key[1], []), ".4g"
                 ),
-                "corrected coverage [%]": text(column("corrected_coverage"), ".1f"),
+                "corrected coverage [%]": share,
                 "corrected best": text(column("corrected_max_fitness"), ".4g"),
                 "QD score": text(column("qd_score"), ",.0f"),
                 "coverage [%]": text(column("coverage"), ".1f"),
