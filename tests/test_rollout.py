@@ -110,6 +110,24 @@ class Height(DescriptorWrapper):
         return state.pipeline_state.q[1:2]
 
 
+class Highest(Height):
+    """The highest root so far, which only the last state descriptor knows."""
+
+    def describe(self, state: Any) -> jax.Array:
+        old = state.info.get("state_descriptor")
+        height = super().describe(state)
+        return height if old is None else jnp.maximum(old, height)
+
+
+class Said(Highest):
+    """Reads the physics alone, and says so."""
+
+    rollout_order = RolloutOrder.AT_ONCE
+
+    def describe(self, state: Any) -> jax.Array:
+        return state.pipeline_state.q[1:2]
+
+
 class Shifted(Height):
     """Overrides ``step``, but not the order of its base class."""
 
@@ -124,8 +142,16 @@ def test_a_class_that_steps_in_its_own_way_steps_one_by_one() -> None:
         own = kind(env) if kind is Doubled else Shifted(env, "hopper")
         assert _order(own) == RolloutOrder.ONE_BY_ONE
         check(own)
-    assert _order(Height(env, "hopper")) == RolloutOrder.AT_ONCE
-    check(Height(env, "hopper"))
+
+
+def test_state_descriptors_are_written_in_order() -> None:
+    env = newton_qd.create("hopper", auto_reset=False, episode_length=None)
+    assert _order(Highest(env, "hopper")) == RolloutOrder.IN_ORDER
+    check(Highest(env, "hopper"))
+    assert _order(Said(env, "hopper")) == RolloutOrder.AT_ONCE
+    for name in ("hopper_uni", "ant_omni"):
+        own = newton_qd.create(name, auto_reset=False, episode_length=None)
+        assert _order(own) == RolloutOrder.AT_ONCE
 
 
 def test_wrong_actions_are_refused() -> None:

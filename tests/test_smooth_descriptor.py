@@ -89,3 +89,6 @@ def test_smooth_descriptor_leaves_the_environment_as_it_was() -> None:
         with_smooth_descriptor(env, 0.1, tail="none")
     with pytest.raises(ValueError, match=r"smooth_width: got None.*width above 0"):
         newton_qd.create("ant_uni", qdax_wrappers_kwargs=[{"straight_through": True}])
+    options = [{"smooth_width": 0.1, "straight_through": "no"}]
+    with pytest.raises(TypeError, match="straight_through: got 'no'; allowed: True, F"):
+        newton_qd.create("ant_uni", qdax_wrappers_kwargs=options)

@@ -10,7 +10,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from newton_qd import checks
 from newton_qd.checks import message
 from newton_qd.envs import inputs
 from newton_qd.envs.state import State
@@ -23,8 +25,9 @@ from newton_qd.types import Action, Params
 class RolloutOrder(enum.IntEnum):
     """How the steps of a plan may be run when the plan is known at the start.
 
-    A class that overrides ``step`` or ``control`` sets its own ``rollout_order``.
-    Without one, its steps run one by one.
+    A class that overrides ``step``, ``control`` or ``describe`` sets its own
+    ``rollout_order``. Without one, its steps run one by one, or in order if it only has
+    another ``describe``.
     """
 
     AT_ONCE = 0
@@ -35,6 +38,14 @@ class RolloutOrder(enum.IntEnum):
     """A step may change the state or the control of the physics."""
 
 
+_UNLESS_SAID = {
+    "step": RolloutOrder.ONE_BY_ONE,
+    "control": RolloutOrder.ONE_BY_ONE,
+    "describe": RolloutOrder.IN_ORDER,  # it may read the last state descriptor
+}
+"""The order of a class with its own version of a method, unless it says another."""
+
+
 def rollout(env: Any, state: State, actions: Action, params: Params) -> State:
     """Runs a plan of actions: see :meth:`~newton_qd.envs.env.Env.rollout`.
 
@@ -42,11 +53,13 @@ def rollout(env: Any, state: State, actions: Action, params: Params) -> State:
         TypeError: The state or an action has the wrong type.
         ValueError: The state, the actions or ``params`` do not fit the environment.
     """
+    inputs.require_state(state)
     # a wrapper around a batch: ``VectorWrapper`` itself has a ``rollout`` of its own
     batched = getattr(env, "batch_size", None) is not None
     shape = (*(jnp.shape(state.done) if batched else ()), env.action_size)
+    allowed = f"an array of shape (steps, {', '.join(map(str, shape))})"
+    checks.instance("actions", actions, (jax.Array, np.ndarray), allowed)
     if jnp.ndim(actions) == 0 or jnp.shape(actions)[1:] != shape:
-        allowed = f"an array of shape (steps, {', '.join(map(str, shape))})"
         raise ValueError(message("actions", actions, allowed))
     order = RolloutOrder.ONE_BY_ONE if batched else _order(env)
     if order == RolloutOrder.ONE_BY_ONE:
@@ -79,11 +92,12 @@ def _own_order(env: Any) -> RolloutOrder:
 
     A class that overrides a method may need another order than its base class has.
     """
-    for name in ("step", "control"):
+    orders = [getattr(env, "rollout_order", RolloutOrder.ONE_BY_ONE)]
+    for name, order in _UNLESS_SAID.items():
         owner = next((kind for kind in type(env).__mro__ if name in vars(kind)), None)
         if owner is not None and "rollout_order" not in vars(owner):
-            return RolloutOrder.ONE_BY_ONE
-    return getattr(env, "rollout_order", RolloutOrder.ONE_BY_ONE)
+            orders.append(order)
+    return max(orders)
 
 
 def _in_order(

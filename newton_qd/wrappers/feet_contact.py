@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from newton_qd import checks
 from newton_qd.checks import message
 from newton_qd.envs.base import Env, PhysicsEnv
+from newton_qd.envs.rollouts import RolloutOrder
 from newton_qd.envs.state import State
 from newton_qd.extractors import get_feet_contact_proportion
 from newton_qd.physics.system import TAILS, PhysicsState
@@ -23,6 +24,7 @@ class FeetContactWrapper(DescriptorWrapper):
     If actions are repeated, the last repetition counts.
     """
 
+    rollout_order = RolloutOrder.AT_ONCE
     descriptor_extractor = staticmethod(get_feet_contact_proportion)
 
     def __init__(
@@ -49,7 +51,8 @@ class FeetContactWrapper(DescriptorWrapper):
 
         Raises:
             NotImplementedError: The environment is not a simulated robot with feet.
-            TypeError: The width is not a number.
+            TypeError: The width is not a number, or ``straight_through`` is not
+                ``True`` or ``False``.
             ValueError: The width is not finite or not above 0, or is missing for a
                 straight-through gradient; or the tail is not allowed.
         """
@@ -61,6 +64,7 @@ class FeetContactWrapper(DescriptorWrapper):
             raise NotImplementedError(unsupported(env, env_name, allowed))
         checks.number("smooth_width", smooth_width, above=0, optional=True)
         checks.choice("smooth_tail", smooth_tail, TAILS)
+        checks.flag("straight_through", straight_through)
         if straight_through and smooth_width is None:
             allowed = (
                 "a width above 0 with straight_through=True, over which the gradient "

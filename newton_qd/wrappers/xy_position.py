@@ -12,6 +12,7 @@ from newton_qd import checks, physics
 from newton_qd.checks import message
 from newton_qd.envs.base import Env, PhysicsEnv
 from newton_qd.envs.points import point
+from newton_qd.envs.rollouts import RolloutOrder
 from newton_qd.envs.state import State
 from newton_qd.extractors import get_final_xy_position
 from newton_qd.types import Descriptor
@@ -30,6 +31,7 @@ class XYPositionWrapper(DescriptorWrapper):
     not move, so its position carries no information: ``link`` is another one.
     """
 
+    rollout_order = RolloutOrder.AT_ONCE
     descriptor_extractor = staticmethod(get_final_xy_position)
 
     def __init__(
@@ -118,11 +120,8 @@ def _limit(name: str, given: Limits | None, unlimited: float) -> np.ndarray:
     if given is None:
         return np.full(2, unlimited)
     refusal = message(name, given, "None, or two finite numbers")
-    try:
-        limit = np.asarray(given, np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(refusal) from error
-    if limit.shape != (2,) or not np.all(np.isfinite(limit)):
+    limit = checks.real_numbers(given)
+    if limit is None or limit.shape != (2,) or not np.all(np.isfinite(limit)):
         raise ValueError(refusal)
     return limit
 
