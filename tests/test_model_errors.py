@@ -248,6 +248,7 @@ BAD_ROWS = {
         "feet: got 'aux_1', .* no contact; allowed: foot_1",
     ),
     "twice": (changed(feet=FEET + FEET), "feet: got foot_1, .* twice"),
+    "servo twice": (changed(servos=("hip_1", "hip_1")), "servos: got hip_1 twice"),
     "sphere end": (changed(contacts=(Contact("aux_1"),), feet=()), "needs a sphere"),
     "capsule end": (
         changed(contacts=(Contact("torso", 1),), feet=()),

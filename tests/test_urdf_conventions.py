@@ -197,6 +197,33 @@ def test_other_joints_need_no_bounds(kind: str, limit: str, tmp_path: Path) -> N
     assert (system.limit_lower[6], system.limit_upper[6]) == (-math.inf, math.inf)
 
 
+# Misspelt names.
+
+SLIPS = {
+    '<dynamics dampng="0.5"/>': "<dynamics>: attribute: got dampng, .*: damping, fric",
+    '<orgin xyz="1 0 0"/>': "<orgin>: element: got <orgin>, .*: <origin>, <parent>",
+    '<origin xzy="1 0 0"/>': "<origin>: attribute: got xzy, .*allowed: xyz, rpy",
+}
+
+
+@pytest.mark.parametrize("slip", SLIPS)
+def test_misspelt_names_are_noticed(slip: str, tmp_path: Path) -> None:
+    hinge = joint("hinge", "continuous", "a", "b", slip)
+    text = robot_text(link("a"), link("b"), hinge)
+    with pytest.warns(RobotDescriptionWarning, match=SLIPS[slip]):
+        built(tmp_path, text, "a")
+
+
+def test_names_of_simulators_are_not(tmp_path: Path) -> None:
+    inside = '<gazebo/><transmission/><dynamics spring_stiffness="1" damping="0"/>'
+    other = '<contact><lateral_friction value="1"/></contact><self_collide/>'
+    hinge = joint("hinge", "continuous", "a", "b", inside)
+    text = robot_text(link("a", other), link("b"), hinge)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        built(tmp_path, text, "a")
+
+
 # Fixed bases.
 
 ARM = robot_text(

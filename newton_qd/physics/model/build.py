@@ -24,7 +24,7 @@ from newton_qd.physics.model.contacts import body_of, contact_tables
 from newton_qd.physics.model.description import (
     Description,
     read_description,
-    warn_unbounded,
+    warn_about,
 )
 from newton_qd.physics.model.elements import UNLIMITED, Shape
 from newton_qd.physics.model.inertia import check_inertia
@@ -266,7 +266,7 @@ def _system(
     dtype = checks.precision(dtype).name
     check_robot(robot)
     description = read_description(find_urdf(robot.urdf), robot.fixed_base)
-    warn_unbounded(description)
+    warn_about(description)
     built = newton_model(robot, description)
     bodies = [description.bodies[name] for name in built.body_names]
     links = () if scene is None else read_scene(scene)

@@ -24,6 +24,7 @@ from newton_qd.physics.model.elements import (
     read_joint,
     read_link,
 )
+from newton_qd.physics.model.spelling import misspelt
 from newton_qd.physics.model.xml_reader import (
     IDENTITY,
     RobotDescriptionError,
@@ -69,6 +70,7 @@ class Description:
         still: World frames (7,) of the links that are fixed to the world, by name.
         fixed: Names of the fixed joints.
         unbounded: Names of the revolute joints for which the file gives no bounds.
+        misspelt: Texts about names in the file that are almost known ones.
     """
 
     path: Path
@@ -78,6 +80,7 @@ class Description:
     still: dict[str, np.ndarray]
     fixed: tuple[str, ...]
     unbounded: tuple[str, ...]
+    misspelt: tuple[str, ...]
 
 
 def read_joints(reader: XmlReader, links: dict[str, Link]) -> dict[str, list[Joint]]:
@@ -239,8 +242,10 @@ def _check_floating(path: Path, joint: Joint, fixed: bool) -> None:
         raise RobotDescriptionError(message(name, given, allowed))
 
 
-def warn_unbounded(description: Description) -> None:
-    """Warns about revolute joints for which the file gives no bounds."""
+def warn_about(description: Description) -> None:
+    """Warns about misspelt names, and about revolute joints without bounds."""
+    for text in description.misspelt:
+        warnings.warn(text, RobotDescriptionWarning, stacklevel=3)
     if description.unbounded:
         names = listed(description.unbounded)
         name = f"{description.path}: limits of revolute joint(s) {names}"
@@ -312,4 +317,5 @@ def read_description(path: Path, fixed_base: bool | None = None) -> Description:
         still,
         fixed=tuple(joint.name for joint in joints if joint.kind == "fixed"),
         unbounded=tuple(joint.name for joint in joints if not joint.names_bounds),
+        misspelt=misspelt(reader),
     )

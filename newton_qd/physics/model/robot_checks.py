@@ -193,6 +193,7 @@ def check_robot(robot: RobotSpec) -> None:
     )
     _check_contacts(robot)
     _check_unique(robot, "actuators", [joint for joint, _ in robot.actuators])
+    _check_unique(robot, "servos", list(robot.servos))
     _check_unique(robot, "rest_pose", [joint for joint, _ in robot.rest_pose])
     _check_unique(robot, "feet", list(robot.feet))
     _check_unique(robot, "pairs", [_pair_name(pair) for pair in robot.pairs])

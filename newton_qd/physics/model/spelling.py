@@ -1,0 +1,103 @@
+"""Finds misspelt names in a URDF file, which would silently mean nothing.
+
+A URDF file may have elements and attributes of simulators, so a name that this package
+does not know is no error. But one that is almost a known name is a slip.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterator
+from xml.etree import ElementTree
+
+from newton_qd.checks import Fact, message
+from newton_qd.physics.model.xml_reader import XmlReader
+
+_CLOSE = 0.6  # similarity of two names, from 0 to 1
+
+_CHILDREN = {
+    "link": ("inertial", "visual", "collision"),
+    "joint": (
+        "origin",
+        "parent",
+        "child",
+        "axis",
+        "limit",
+        "dynamics",
+        "mimic",
+        "calibration",
+        "safety_controller",
+    ),
+    "inertial": ("origin", "mass", "inertia"),
+    "visual": ("origin", "geometry", "material"),
+    "collision": ("origin", "geometry"),
+    "geometry": ("box", "sphere", "cylinder", "capsule", "mesh"),
+    "material": ("color", "texture"),
+}
+"""Elements inside each element."""
+
+_ATTRIBUTES = {
+    "link": ("name",),
+    "joint": ("name", "type"),
+    "visual": ("name",),
+    "collision": ("name",),
+    "material": ("name",),
+    "origin": ("xyz", "rpy"),
+    "mass": ("value",),
+    "inertia": ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"),
+    "box": ("size",),
+    "sphere": ("radius",),
+    "cylinder": ("radius", "length"),
+    "capsule": ("radius", "length", "height"),
+    "mesh": ("filename", "scale"),
+    "color": ("rgba",),
+    "parent": ("link",),
+    "child": ("link",),
+    "axis": ("xyz",),
+    "limit": ("lower", "upper", "effort", "velocity"),
+    "dynamics": ("damping", "friction"),
+}
+"""Attributes of each element."""
+
+
+def misspelt(reader: XmlReader) -> tuple[str, ...]:
+    """Returns a text about each name in links and joints that is almost a known one."""
+    return tuple(
+        text
+        for tag in ("link", "joint")
+        for element in reader.root.findall(tag)
+        for text in _inside(reader, element)
+    )
+
+
+def _inside(reader: XmlReader, element: ElementTree.Element) -> Iterator[str]:
+    """Yields the texts about an element and those inside it."""
+    known = _ATTRIBUTES.get(element.tag, ())
+    for name in element.keys():
+        if _almost(name, known):
+            yield str(_ignored(reader, element, "attribute", name, known))
+    known = _CHILDREN.get(element.tag, ())
+    for child in element:
+        if child.tag in known:
+            yield from _inside(reader, child)
+        elif _almost(child.tag, known):
+            tags = tuple(f"<{tag}>" for tag in known)
+            yield str(_ignored(reader, child, "element", f"<{child.tag}>", tags))
+
+
+def _almost(name: str, known: tuple[str, ...]) -> bool:
+    """Returns whether a name is not known, but almost."""
+    return name not in known and bool(
+        difflib.get_close_matches(name, known, n=1, cutoff=_CLOSE)
+    )
+
+
+def _ignored(
+    reader: XmlReader,
+    element: ElementTree.Element,
+    kind: str,
+    name: str,
+    known: tuple[str, ...],
+) -> Exception:
+    why = "which is not known and ignored"
+    return reader.error(element, message(kind, Fact(name), ", ".join(known), why=why))
