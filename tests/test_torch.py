@@ -156,6 +156,21 @@ def test_one_world_and_physical_parameters(torch: Any, door: Any) -> None:
         step(reset(0), torch.zeros(2), torch.ones(2))
 
 
+def test_physical_parameters_are_checked(torch: Any, door: Any, hopper: Any) -> None:
+    reset, step = door.make_torch_step(hopper)
+    state, params = reset(0), hopper.default_params
+    for name in ("friction", "gear_scale"):
+        wrong = params.replace(**{name: -getattr(params, name)})
+        with pytest.raises(ValueError, match=rf"^params\.{name}: got -.*from 0$"):
+            step(state, torch.zeros(WORLDS, 3), wrong)
+
+
+def test_a_state_has_no_other_attributes(door: Any, maze: Any) -> None:
+    state = door.make_torch_step(maze).reset(0)
+    with pytest.raises(TypeError, match=r"^rewrad: got 5; allowed: one of pipe"):
+        state.replace(rewrad=5)
+
+
 def test_errors(torch: Any, door: Any, maze: Any) -> None:
     reset, step = door.make_torch_step(maze)
     state = reset(0)

@@ -22,12 +22,14 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from newton_qd import checks
 from newton_qd.checks import Fact, message
 from newton_qd.envs.base import Env
 from newton_qd.envs.state import State
 from newton_qd.errors import MissingExtra
+from newton_qd.physics.parameters import FIELDS, PhysicsParams, check_bounds
 from newton_qd.types import Params, PyTree
 
 try:
@@ -86,7 +88,16 @@ class TorchState:
         return {name: getattr(self, name) for name in _FIELDS}
 
     def replace(self, **changes: Any) -> TorchState:
-        """Returns a copy with some attributes replaced."""
+        """Returns a copy with some attributes replaced.
+
+        Raises:
+            TypeError: A state has no such attribute.
+        """
+        for name, value in changes.items():
+            if name not in _FIELDS:
+                raise TypeError(
+                    message(name, value, f"one of {checks.listed(_FIELDS)}")
+                )
         return TorchState(None, {**self.parts, **changes})
 
 
@@ -205,7 +216,8 @@ class _Door:
 
         Raises:
             TypeError: The state is not one of PyTorch, or the action is not a tensor.
-            ValueError: The action is on another device than the state.
+            ValueError: The action is on another device than the state, or a physical
+                parameter is out of bounds.
         """
         checks.instance("state", state, TorchState, "a state of reset or step")
         checks.instance("action", action, torch.Tensor, "a tensor of PyTorch")
@@ -217,6 +229,7 @@ class _Door:
         else:
             parts = {name: getattr(state.arrays, name) for name in _FIELDS}
         given = jax.tree.map(to_jax, params)
+        self._check(given)
         tracked = action.requires_grad or state.tracked
         tracked = tracked or (params is not None and _tracked(params))
         if not tracked or not torch.is_grad_enabled():
@@ -232,6 +245,16 @@ class _Door:
         results = _Step.apply(self, inputs, found, *leaves)
         structure = jax.tree.structure(_parts(found[0]))
         return TorchState(found[0], jax.tree.unflatten(structure, results))
+
+    def _check(self, params: Params) -> None:
+        """Checks the values of physical parameters, which are traced in the step.
+
+        Raises:
+            ValueError: A value is out of bounds.
+        """
+        if isinstance(params, PhysicsParams):
+            for name in FIELDS:
+                check_bounds(name, np.asarray(getattr(params, name)))
 
 
 def _parts(state: State) -> dict[str, Any]:
