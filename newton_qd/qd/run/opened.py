@@ -177,11 +177,12 @@ class Run:
         """
         checks.integer("count", count)
         length = self.task.descriptor_length
-        try:
-            wanted = np.asarray(descriptor, np.float64)
-        except (TypeError, ValueError):
-            wanted = np.full(length, np.nan)
-        if wanted.shape != (length,) or not np.all(np.isfinite(wanted)):
+        wanted = checks.real_numbers(descriptor)
+        if (
+            wanted is None
+            or wanted.shape != (length,)
+            or not np.all(np.isfinite(wanted))
+        ):
             numbers = "1 finite number" if length == 1 else f"{length} finite numbers"
             allowed = f"{numbers}: {', '.join(self.task.labels)}"
             raise ValueError(message("descriptor", descriptor, allowed))
@@ -200,8 +201,8 @@ class Run:
         """Evaluates elites again.
 
         Args:
-            cell: Row of the archive, a tuple of coordinates in the grid, or a list or
-                array of (N,) rows; ``None``: all elites.
+            cell: Row of the archive, or a list or array of (N,) rows; ``None``: all
+                elites. A tuple is one cell of a grid: its indices along each dimension.
             keys: Key or (K,) keys of the reset. ``None``: the key of the run. Then
                 fitness and descriptor are bitwise those of the archive, on the same
                 kind of machine with the same versions. With ``new_starts`` they are
@@ -211,19 +212,13 @@ class Run:
             IndexError: A cell does not exist.
             LookupError: A cell is empty, or there is none.
             TypeError: ``keys`` are no keys.
-            ValueError: ``keys`` are none at all.
+            ValueError: ``keys`` are none at all, or ``cell`` has more axes than one.
         """
         if keys is not None:
             require_key("keys", keys, several=True)
             if keys.size == 0:
                 raise ValueError(message("keys", Fact("no keys"), "one or more"))
-        if isinstance(cell, tuple):
-            cell = self.elite(cell).cell
-        alone = cell is not None and np.ndim(cell) == 0
-        rows = self.cells if cell is None else np.atleast_1d(np.asarray(cell))
-        if not len(rows):
-            allowed = "at least one; without cell, an archive with elites"
-            raise LookupError(message("cell", cell, allowed, why="which names none"))
+        rows, alone = self._rows(cell)
         genotypes = np.stack([self.elite(row).genotype for row in rows.tolist()])
         if keys is None:
             fitnesses, found = self._chunks(self._score, genotypes)
@@ -252,6 +247,26 @@ class Run:
         from newton_qd.qd.run.plot_curves import curves_figure
 
         return curves_figure(self.metrics, self.config, self.reevaluated)
+
+    def _rows(
+        self, cell: int | Sequence[int] | np.ndarray | None
+    ) -> tuple[np.ndarray, bool]:
+        """Returns rows (N,) of the archive, and whether ``cell`` was a single one.
+
+        Raises:
+            LookupError: There are none, or a cell of the grid is empty.
+            ValueError: ``cell`` has more axes than one.
+        """
+        if isinstance(cell, tuple):
+            cell = self.elite(cell).cell
+        rows = self.cells if cell is None else np.asarray(cell)
+        if rows.ndim > 1:
+            allowed = "a row, rows (N,), or a tuple with the indices of one cell"
+            raise ValueError(message("cell", cell, allowed))
+        if not rows.size:
+            allowed = "at least one; without cell, an archive with elites"
+            raise LookupError(message("cell", cell, allowed, why="which names none"))
+        return np.atleast_1d(rows), rows.ndim == 0
 
     def _row(self, cell: int | Sequence[int]) -> int:
         """Returns the row of a cell.

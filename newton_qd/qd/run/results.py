@@ -72,8 +72,8 @@ def _metrics(path: Path) -> dict[str, np.ndarray]:
 def read_reevaluated(path: Path) -> Reevaluated | None:
     """Reads ``corrected.json``, if there is one.
 
-    Raises:
-        ConfigError: It has other content.
+    Returns:
+        Its metrics; ``None``, with a warning, if it is damaged.
     """
     if not path.is_file():
         return None
@@ -81,5 +81,7 @@ def read_reevaluated(path: Path) -> Reevaluated | None:
         return Reevaluated(**json.loads(path.read_text(encoding="utf-8")))
     except (TypeError, ValueError) as error:
         names = ", ".join(f.name for f in dataclasses.fields(Reevaluated))
-        given = Fact("other content")
-        raise ConfigError(message(str(path), given, f"an object of {names}")) from error
+        text = message(str(path), Fact("other content"), f"an object of {names}")
+        text += f" ({error}); the run is opened without these metrics"
+        warnings.warn(text, stacklevel=3)
+        return None
