@@ -79,6 +79,12 @@ def test_gymnasiums_own_check(registered: bool) -> None:
     assert only_unbounded_spaces(caught)
 
 
+@pytest.mark.parametrize("size", ["width", "height"])
+def test_sizes_of_pictures_are_checked_at_the_start(size: str) -> None:
+    with pytest.raises(ValueError, match=f"^{size}: got 0; allowed: integers from 1"):
+        make_gymnasium(limited(100), render_mode="rgb_array", **{size: 0})
+
+
 @pytest.mark.slow
 def test_gymnasiums_own_check_of_a_robot() -> None:
     from gymnasium.utils.env_checker import check_env
@@ -205,7 +211,7 @@ def test_the_numbers_are_those_of_env_step() -> None:
             assert np.array_equal(found[4]["state_descriptor"], described)
 
 
-@pytest.mark.parametrize("number", [None, 2])
+@pytest.mark.parametrize("number", [None, pytest.param(2, marks=pytest.mark.slow)])
 def test_an_environment_goes_to_other_processes(number: int | None) -> None:
     if number is None:
         env: Any = make_gymnasium("pointmaze")

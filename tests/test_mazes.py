@@ -104,14 +104,8 @@ STEPS = 1000
 SETTLED = 100  # steps until who starts in a wall is out of it
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "antmaze_u",
-        pytest.param("humanoid_maze", marks=pytest.mark.slow),
-        pytest.param("walker2d_trap", marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["antmaze_u", "humanoid_maze", "walker2d_trap"])
 def test_random_steps_beside_walls(name: str) -> None:
     """1,000 of them are finite, and nothing gets through."""
     env: Any = newton_qd.create(name, auto_reset=False, episode_length=None)

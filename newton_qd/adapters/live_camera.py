@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from newton_qd import checks
 from newton_qd.adapters.pickled import Pickled
 from newton_qd.envs.base import Env, PhysicsEnv
 from newton_qd.envs.state import State
@@ -19,8 +20,20 @@ class LiveCamera(Pickled):
     rebuilt = ("_camera",)
 
     def __init__(self, env: Env, width: int, height: int) -> None:
+        """Prepares the pictures; the scene is built at the first one.
+
+        Args:
+            env: The environment.
+            width: Width of a picture [px].
+            height: Height of a picture [px].
+
+        Raises:
+            ValueError: ``width`` or ``height`` is not an integer from 1.
+        """
         from newton_qd.viewing import drawing_of
 
+        checks.integer("width", width)
+        checks.integer("height", height)
         self._drawing = drawing_of(env)
         self._physical = isinstance(env.unwrapped, PhysicsEnv)
         self._size = width, height
