@@ -139,6 +139,18 @@ def number(
     )
 
 
+def real_numbers(value: object) -> np.ndarray | None:
+    """Returns numbers as an array, float64; ``None`` if they are no real numbers.
+
+    Text such as ``"1"`` is no number, though NumPy would convert it.
+    """
+    try:
+        found = np.asarray(value)
+    except (TypeError, ValueError):  # rows of several lengths, a value under ``jit``
+        return None
+    return found.astype(np.float64) if found.dtype.kind in "iuf" else None
+
+
 def integer(
     name: str,
     value: object,

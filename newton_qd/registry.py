@@ -28,6 +28,7 @@ from newton_qd.wrappers import (
     EvalWrapper,
     FixedInitialStateWrapper,
     VectorWrapper,
+    Wrapper,
 )
 
 _MOVED = {
@@ -211,6 +212,11 @@ def _check_wrappers(wrappers: object) -> None:
         allowed = "a WrapperSpec, such as WrapperSpec(FeetContactWrapper)"
         checks.instance(name, spec, WrapperSpec, allowed)
         checks.function(f"{name}.wrapper", spec.wrapper, "a class or a function")
+        kind = spec.wrapper
+        if isinstance(kind, type) and issubclass(kind, Env):
+            if not issubclass(kind, Wrapper):
+                allowed = "a subclass of Wrapper, such as FeetContactWrapper"
+                raise TypeError(message(f"{name}.wrapper", kind, allowed))
         allowed = "a mapping of keyword arguments"
         checks.instance(f"{name}.options", spec.options, Mapping, allowed)
         spec.check_options(f"{name}.options", spec.options)

@@ -202,6 +202,10 @@ def test_states_of_another_environment_are_named(
 @pytest.mark.parametrize("name", ("ant_uni", "pointmaze"))
 def test_wrong_keys_are_named(name: str) -> None:
     for env in (make(name), make(name, "batch")):
+        with pytest.raises(
+            ValueError, match=r"^rng: got an array .*; allowed: one key"
+        ):
+            env.reset(jnp.array([1, 2, 3], jnp.uint32))
         for wrong in (0, None, jnp.zeros(2), np.zeros(2, np.int64)):
             with pytest.raises(
                 TypeError, match=r"^rng: got .*; allowed: one key, such"

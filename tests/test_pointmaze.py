@@ -189,7 +189,9 @@ def test_state_descriptor_follows_the_auto_reset() -> None:
     [
         ({"scale_action_space": 0.0}, r"scale_action_space: got 0.0.*above 0"),
         ({"zone_width": -1.0}, r"zone_width: got -1.0.*above 0"),
-        ({"wall_width_ratio": np.nan}, r"wall_width_ratio: got nan.*finite"),
+        ({"wall_width_ratio": np.nan}, r"wall_width_ratio: got nan.*from 0 to 1"),
+        ({"wall_width_ratio": -1.0}, r"wall_width_ratio: got -1.0.*from 0 to 1"),
+        ({"x_max": np.inf}, r"x_max: got inf.*finite"),
         ({"x_min": 2.0}, r"x_min, x_max: got \(2.0, 1.0\).*x_min below"),
         ({"y_min": -0.5}, r"y_min, y_max: got \(-0.5.*below -0.7"),
         ({"upper_wall_height_offset": -0.6}, r"upper_wall_height_offset: got .*-0.6"),
@@ -199,6 +201,14 @@ def test_state_descriptor_follows_the_auto_reset() -> None:
 def test_settings_that_make_no_maze(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         PointMaze(**settings)
+
+
+@pytest.mark.parametrize("name", ["x_min", "y_max", "upper_wall_height_offset"])
+def test_borders_and_walls_are_numbers(name: str) -> None:
+    wrong: Any
+    for wrong in ("abc", None, [1]):
+        with pytest.raises(TypeError, match=rf"^{name}: got .*; allowed: finite numb"):
+            newton_qd.create("pointmaze", **{name: wrong})
 
 
 def test_another_maze() -> None:

@@ -75,6 +75,11 @@ def test_faulty_individuals_have_the_worst_objective() -> None:
     np.testing.assert_array_equal(measures, 0.0)
     with pytest.raises(ValueError, match="worst: got -inf; allowed: finite number"):
         make_ribs_evaluation(score, key, limits=LIMITS, worst=-np.inf)
+    wrong: Any = 0
+    with pytest.raises(TypeError, match=r"^key: got 0; allowed: one key"):
+        make_ribs_evaluation(score, wrong, limits=LIMITS, worst=-1.0)
+    with pytest.raises(ValueError, match=r"^solutions: got .*; allowed: numbers"):
+        evaluate(np.full((2, 3), "a"))
 
 
 def test_what_pyribs_would_refuse_counts_as_faulty() -> None:

@@ -264,7 +264,7 @@ class PhysicsEnv(Env):
         inputs.require_key("rng", rng)
         root_key, angle_key, velocity_key = jax.random.split(rng, 3)
         rest = split_as([rng], self._rest())
-        q = self.reset_pose(root_key, rest.q)
+        q = self._number(self.reset_pose(root_key, rest.q))
         q = physics.unit_quaternions(self.system, q)
         q = q.at[self._joint_q].add(self._noise(angle_key, self._angle_noise))
         if self._grounding is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -52,7 +53,7 @@ def require_key(name: str, key: Any, *, several: bool = False) -> None:
 
     Raises:
         TypeError: It is not a key.
-        ValueError: It is an array of keys.
+        ValueError: It is an array of keys, or has the wrong shape.
     """
     allowed = "one key, such as jax.random.key(0)"
     if several:
@@ -63,6 +64,8 @@ def require_key(name: str, key: Any, *, several: bool = False) -> None:
         raise TypeError(message(name, key, allowed))
     if not several and len(key.shape) != (0 if typed else 1):
         allowed += " (for a batch, use jax.vmap or create(..., batch_size=...))"
+        raise ValueError(message(name, key, allowed))
+    if not typed and key.shape[-1:] not in ((2,), (4,)):
         raise ValueError(message(name, key, allowed))
 
 
@@ -79,7 +82,7 @@ def require_state(state: State, *keys: str) -> None:
     """
     checks.instance("state", state, State, "a State that reset or step returned")
     for key in keys:
-        if key not in state.info:
+        if not isinstance(state.info, Mapping) or key not in state.info:
             given = Fact(f"info without {key!r}")
             raise ValueError(message("state", given, OWN_STATE))
 

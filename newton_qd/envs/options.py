@@ -16,7 +16,8 @@ Constructor = TypeVar("Constructor", bound=Callable[..., None])
 def checked_options(init: Constructor) -> Constructor:
     """Decorates a constructor: checks its options by their type annotations.
 
-    A ``float`` must be a finite number, and not below 0 if it scales noise. A
+    A ``float`` must be a finite number, and not below 0 if it scales noise; a
+    ``float | None`` may be ``None``, too. A
     ``tuple[float, float]`` must be a range, the lowest value first. A ``bool`` must be
     ``True`` or ``False``. The constructor checks other parameters itself.
 
@@ -24,7 +25,7 @@ def checked_options(init: Constructor) -> Constructor:
         init: An ``__init__`` whose options are keyword-only.
     """
     parameters = inspect.signature(init).parameters
-    kinds = {name: str(parameter.annotation) for name, parameter in parameters.items()}
+    kinds = {name: _text(each.annotation) for name, each in parameters.items()}
 
     @functools.wraps(init)
     def checked(self: Any, *args: Any, **options: Any) -> None:
@@ -36,6 +37,13 @@ def checked_options(init: Constructor) -> Constructor:
     return checked  # pyright: ignore[reportReturnType]
 
 
+def _text(annotation: object) -> str:
+    """Returns an annotation as it is written, also where Python has evaluated it."""
+    if isinstance(annotation, str):
+        return annotation
+    return inspect.formatannotation(annotation)
+
+
 def _anything(name: str, value: object) -> None:
     del name, value
 
@@ -44,8 +52,14 @@ def _number(name: str, value: object) -> None:
     checks.number(name, value, least=0 if "noise_scale" in name else None)
 
 
+def _number_or_none(name: str, value: object) -> None:
+    if value is not None:
+        _number(name, value)
+
+
 _CHECKS: dict[str, Callable[[str, Any], None]] = {
     "float": _number,
+    "float | None": _number_or_none,
     "tuple[float, float]": checks.interval,
     "bool": checks.flag,
 }

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -73,15 +71,23 @@ class PointMaze(QDEnv):
             dtype: ``"float32"``, or ``"float64"`` with JAX x64 on.
 
         Raises:
+            TypeError: An argument is not a number.
             ValueError: A number is not finite, borders or walls are in the wrong order,
-                or ``dtype`` is float64 and JAX x64 is off.
+                walls are wider than the box, or ``dtype`` is float64 and JAX x64 is
+                off.
         """
         for name, value in (
+            ("x_min", x_min),
+            ("x_max", x_max),
+            ("y_min", y_min),
+            ("y_max", y_max),
+            ("lower_wall_height_offset", lower_wall_height_offset),
+            ("upper_wall_height_offset", upper_wall_height_offset),
             ("zone_width_offset_from_x_min", zone_width_offset_from_x_min),
             ("zone_height_offset_from_y_max", zone_height_offset_from_y_max),
-            ("wall_width_ratio", wall_width_ratio),
         ):
             checks.number(name, value)
+        checks.number("wall_width_ratio", wall_width_ratio, least=0, most=1)
         checks.number("scale_action_space", scale_action_space, above=0)
         checks.number("zone_width", zone_width, above=0)
         walls = lower_wall_height_offset, upper_wall_height_offset
@@ -325,13 +331,13 @@ def _require_box(
     """Checks borders and walls.
 
     Raises:
-        ValueError: They are not finite, or not in the right order.
+        ValueError: They are not in the right order.
     """
-    if not -math.inf < x[0] < x[1] < math.inf:
-        allowed = "finite, x_min below x_max"
+    if not x[0] < x[1]:
+        allowed = "x_min below x_max"
         raise ValueError(message("x_min, x_max", x, allowed))
-    if not -math.inf < y[0] < _HIGHEST_START < y[1] < math.inf:
-        allowed = f"finite, y_min below {_HIGHEST_START}, y_max above it"
+    if not y[0] < _HIGHEST_START < y[1]:
+        allowed = f"y_min below {_HIGHEST_START}, y_max above it"
         raise ValueError(message("y_min, y_max", y, allowed))
     if not y[0] < walls[0] < walls[1] < y[1]:
         name = "lower_wall_height_offset, upper_wall_height_offset"

@@ -116,13 +116,15 @@ def _bounds(name: str, limits: Range, default: jax.Array) -> tuple[np.ndarray, .
     allowed = "(low, high), numbers"
     if default.shape:
         allowed += f" or arrays of shape {default.shape}"
+    refusal = message(name, limits, allowed)
     try:
         low, high = (
             np.broadcast_to(np.asarray(end, default.dtype), default.shape)
             for end in limits
+            if checks.real_numbers(end) is not None and not isinstance(limits, dict)
         )
     except (TypeError, ValueError) as error:
-        raise ValueError(message(name, limits, allowed)) from error
+        raise ValueError(refusal) from error
     check_bounds(name, np.stack([low, high]))
     if np.any(low > high):
         why = "where low is above high"

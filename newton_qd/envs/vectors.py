@@ -42,6 +42,9 @@ def length(vector: jax.Array) -> jax.Array:
 
 def wrapped(angle: jax.Array) -> jax.Array:
     """Returns angles (...) shifted by multiples of 2 pi to between -pi and pi [rad]."""
+    angle = jnp.asarray(angle)
+    if not jnp.issubdtype(angle.dtype, jnp.floating):
+        angle = angle.astype(jnp.result_type(float))
     turn = np.asarray(2 * np.pi, angle.dtype)
     return angle - turn * jnp.round(angle / turn)
 

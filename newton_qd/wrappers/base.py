@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from newton_qd import checks
 from newton_qd.checks import Fact, message
 from newton_qd.envs.base import Env
 from newton_qd.envs.env import raise_own_error
@@ -44,7 +45,11 @@ class Wrapper(Env):
 
         Args:
             env: The environment.
+
+        Raises:
+            TypeError: It is not an environment.
         """
+        checks.environment(env)
         self.env = env
 
     def reset(self, rng: RNGKey) -> State:

@@ -10,9 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from newton_qd import checks
 from newton_qd.checks import Fact, message
 from newton_qd.envs.base import Env, QDEnv
-from newton_qd.envs.inputs import OWN_STATE, require_state
+from newton_qd.envs.inputs import OWN_STATE, require_real, require_state
 from newton_qd.envs.rollouts import RolloutOrder
 from newton_qd.envs.state import State
 from newton_qd.extractors import get_mean_state_descriptor
@@ -24,7 +25,10 @@ class DescriptorWrapper(Wrapper, QDEnv):
     """Writes ``info["state_descriptor"]``; the base class for your own descriptors.
 
     A subclass overrides ``describe`` and ``limits``. It may also override
-    ``descriptor_extractor``.
+    ``descriptor_extractor``. ``rollout`` calls ``describe`` for one step after the
+    other. If ``describe`` does not read what earlier steps have written into ``info``,
+    the subclass may set ``rollout_order = RolloutOrder.AT_ONCE`` (of
+    ``newton_qd.envs.rollouts``), which is faster.
     """
 
     rollout_order = RolloutOrder.AT_ONCE
@@ -67,6 +71,7 @@ class DescriptorWrapper(Wrapper, QDEnv):
         """Begins an episode.
 
         Raises:
+            TypeError: ``describe`` does not return real numbers.
             ValueError: ``describe`` returns another shape than the limits have, or the
                 environment is float64 and JAX x64 is off.
         """
@@ -100,9 +105,13 @@ class DescriptorWrapper(Wrapper, QDEnv):
         """Returns the state descriptor of one world.
 
         Raises:
+            TypeError: It does not have real numbers.
             ValueError: It is of another shape than the limits have.
         """
-        described = jnp.asarray(self.describe(state), self.dtype)
+        found = self.describe(state)
+        if not isinstance(found, list | tuple):
+            require_real(f"{type(self).__name__}.describe", found)
+        described = jnp.asarray(found, self.dtype)
         if described.shape != (self.state_descriptor_length,):
             allowed = f"shape {(self.state_descriptor_length,)}, as its limits"
             raise ValueError(
@@ -134,10 +143,12 @@ def _check_limits(kind: type[DescriptorWrapper]) -> None:
         ValueError: They are missing, or not two rows of numbers, lowest first.
     """
     limits = getattr(kind, "limits", None)
-    try:
-        pair = np.asarray(limits, np.float64)
-    except (TypeError, ValueError):
-        pair = np.zeros(())
-    if pair.ndim != 2 or len(pair) != 2 or not np.all(pair[0] < pair[1]):
+    pair = checks.real_numbers(limits)
+    if (
+        pair is None
+        or pair.ndim != 2
+        or len(pair) != 2
+        or not np.all(pair[0] < pair[1])
+    ):
         allowed = "lowest and highest values, such as ((0.0, 0.0), (1.0, 1.0))"
         raise ValueError(message(f"{kind.__name__}.limits", limits, allowed))

@@ -11,7 +11,7 @@ import numpy as np
 from newton_qd import checks, memory
 from newton_qd.checks import Fact, message
 from newton_qd.envs.base import Env
-from newton_qd.envs.inputs import require_key
+from newton_qd.envs.inputs import require_key, require_state
 from newton_qd.envs.state import State
 from newton_qd.types import Action, Params, RNGKey
 from newton_qd.wrappers.base import Wrapper
@@ -75,22 +75,13 @@ class VectorWrapper(Wrapper):
             ValueError: State, action or parameters do not have the same batch axis in
                 front.
         """
-        batch = jnp.shape(state.done)
-        if len(batch) != 1:
-            allowed = "(batch,), as after a reset of this environment"
-            raise ValueError(message("state: shape of done", batch, allowed))
+        batch = _batch(state)
         shape = (*batch, self.action_size)
         allowed = f"an array of shape {shape}"
         checks.instance("action", action, (jax.Array, np.ndarray), allowed)
         if action.shape != shape:
             raise ValueError(message("action", action, allowed))
-        for leaf in jax.tree.leaves(params):
-            if jnp.shape(leaf)[:1] != batch:
-                allowed = (
-                    f"the batch axis {batch} in front of every array, as in "
-                    "default_params"
-                )
-                raise ValueError(message("params", leaf, allowed))
+        _require_batch(params, batch)
         return jax.vmap(self.env.step)(state, action, params)
 
     def rollout(self, state: State, actions: Action, params: Params = None) -> State:
@@ -106,12 +97,15 @@ class VectorWrapper(Wrapper):
 
         Raises:
             TypeError: The state or the actions have the wrong type.
-            ValueError: The state or the actions have the wrong shape.
+            ValueError: State, actions or parameters have the wrong shape.
         """
-        shape = (*jnp.shape(state.done), self.action_size)
-        if jnp.shape(actions)[1:] != shape or jnp.ndim(state.done) != 1:
-            allowed = f"an array of shape (steps, {', '.join(map(str, shape))})"
+        batch = _batch(state)
+        shape = (*batch, self.action_size)
+        allowed = f"an array of shape (steps, {', '.join(map(str, shape))})"
+        checks.instance("actions", actions, (jax.Array, np.ndarray), allowed)
+        if jnp.shape(actions)[1:] != shape:
             raise ValueError(message("actions", actions, allowed))
+        _require_batch(params, batch)
         run = jax.vmap(self.env.rollout, in_axes=(0, 1, 0), out_axes=1)
         return run(state, actions, params)
 
@@ -123,6 +117,35 @@ class VectorWrapper(Wrapper):
             lambda leaf: jnp.broadcast_to(leaf, size + jnp.shape(leaf)),
             self.env.default_params,
         )
+
+
+def _batch(state: State) -> tuple[int]:
+    """Returns the batch axis of a state.
+
+    Raises:
+        TypeError: It is not a state.
+        ValueError: It has no batch axis, or several.
+    """
+    require_state(state)
+    batch = jnp.shape(state.done)
+    if len(batch) != 1:
+        allowed = "(batch,), as after a reset of this environment"
+        raise ValueError(message("state: shape of done", batch, allowed))
+    return batch
+
+
+def _require_batch(params: Params, batch: tuple[int]) -> None:
+    """Checks that parameters have the batch axis in front.
+
+    Raises:
+        ValueError: One has not.
+    """
+    for leaf in jax.tree.leaves(params):
+        if jnp.shape(leaf)[:1] != batch:
+            allowed = (
+                f"the batch axis {batch} in front of every array, as in default_params"
+            )
+            raise ValueError(message("params", leaf, allowed))
 
 
 def state_bytes(env: Env) -> int:

@@ -13,6 +13,7 @@ from jax.flatten_util import ravel_pytree
 
 from newton_qd import checks
 from newton_qd.checks import Fact, message
+from newton_qd.envs.inputs import require_key
 from newton_qd.qd.extras import require_extra
 from newton_qd.types import Repertoire, ScoringFunction
 
@@ -54,12 +55,14 @@ def make_ribs_evaluation(
         and, with ``jacobian``, gradients (N, 1 + D, size).
 
     Raises:
-        TypeError: ``limits`` are not two vectors.
-        ValueError: ``worst`` is not finite, or a highest descriptor is not above the
-            lowest one. The returned function raises ``GradientsError`` if gradients are
-            missing or have the wrong shape, and ``ValueError`` if the solutions are no
-            matrix or the limits do not have the shape of a descriptor.
+        TypeError: ``key`` is not a key, or ``limits`` are not two vectors.
+        ValueError: ``key`` is several keys, ``worst`` is not finite, or a highest
+            descriptor is not above the lowest one. The returned function raises
+            ``GradientsError`` if gradients are missing or have the wrong shape, and
+            ``ValueError`` if the solutions are no matrix or the limits do not have the
+            shape of a descriptor.
     """
+    require_key("key", key)
     checks.number("worst", worst)
     low = jnp.asarray(_limits(limits)[0], jnp.float32)
 
@@ -81,10 +84,11 @@ def make_ribs_evaluation(
         return objectives, jnp.where(good[:, None], descriptors, low), *rows
 
     def evaluate(solutions: np.ndarray) -> tuple[np.ndarray, ...]:
-        if np.ndim(solutions) != 2:
-            allowed = "an array of shape (N, size)"
+        found = checks.real_numbers(solutions)
+        if found is None or found.ndim != 2:
+            allowed = "numbers, an array of shape (N, size)"
             raise ValueError(message("solutions", solutions, allowed))
-        results = run(jnp.asarray(solutions, jnp.float32))
+        results = run(jnp.asarray(found, jnp.float32))
         # copies, because pyribs normalizes the gradients in place
         return tuple(np.array(result) for result in results)
 

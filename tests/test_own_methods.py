@@ -1,0 +1,110 @@
+"""What the methods and options of a user's own class may be, and what is refused."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import newton_qd
+from newton_qd import authoring as nq
+from newton_qd.envs.hopper import Hopper
+from newton_qd.robots import HOPPER
+
+KEY = jax.random.key(0)
+
+
+class Plain(nq.PhysicsEnv):
+    """A robot without a reward."""
+
+    def outcome(self, before: Any, after: Any, action: Any) -> Any:
+        return 0.0, False, {}
+
+
+@pytest.mark.parametrize("kind", [np.int32, np.float16, np.float64])
+def test_a_pose_of_other_numbers_has_noise_too(kind: Any) -> None:
+    pose = np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0], kind)
+
+    class Posed(Plain):
+        def reset_pose(self, rng: Any, q: Any) -> Any:
+            return pose
+
+    class Numbers(Plain):
+        def reset_pose(self, rng: Any, q: Any) -> Any:
+            return jnp.asarray(pose, q.dtype)
+
+    states = [env(HOPPER).reset(KEY).pipeline_state.q for env in (Posed, Numbers)]
+    np.testing.assert_array_equal(*states)
+    assert np.all(np.asarray(states[0])[3:] != 0)
+
+
+def test_options_are_checked_also_where_python_evaluates_annotations() -> None:
+    def init(self: Any, robot: Any, *, cost: Any = 0.1, alive: Any = True) -> None:
+        Plain.__init__(self, robot)
+
+    # as in a module without ``from __future__ import annotations``
+    init.__annotations__.update(cost=float, alive=bool)
+    kind: Any = type("Own", (Plain,), {"__init__": nq.checked_options(init)})
+    with pytest.raises(ValueError, match=r"^cost: got nan; allowed: finite numbers"):
+        kind(HOPPER, cost=float("nan"))
+    with pytest.raises(TypeError, match=r"^alive: got 'no'; allowed: True, False"):
+        kind(HOPPER, alive="no")
+    kind(HOPPER, cost=1.0, alive=False)
+
+
+@pytest.mark.parametrize(
+    ("value", "error"), [(-1.0, ValueError), (np.nan, ValueError), ("a", TypeError)]
+)
+def test_noise_of_velocities_is_checked(value: Any, error: type[Exception]) -> None:
+    with pytest.raises(error, match=r"^reset_velocity_noise_scale: got .* from 0$"):
+        Plain(HOPPER, reset_velocity_noise_scale=value)
+
+
+@pytest.mark.parametrize(
+    ("found", "words"), [(None, "None"), (1j, "a complex"), ("0", "a str")]
+)
+def test_descriptors_are_real_numbers(found: Any, words: str) -> None:
+    class Odd(nq.DescriptorWrapper):
+        limits: ClassVar = ((0.0,), (1.0,))
+
+        def describe(self, state: Any) -> Any:
+            return found
+
+    with pytest.raises(TypeError, match=rf"^Odd\.describe: got {words}; allowed: real"):
+        jax.eval_shape(Odd(Plain(HOPPER), "own").reset, KEY)
+
+
+def test_a_descriptor_is_a_wrapper() -> None:
+    with pytest.raises(TypeError, match=r"wrapper: got .*Hopper.*a subclass of Wrapp"):
+        nq.register("own_hopper", Hopper, descriptor=Hopper)
+    with pytest.raises(TypeError, match=r"^env: got None; allowed: an environment"):
+        nq.Wrapper(None)  # pyright: ignore[reportArgumentType]
+
+
+def test_angles_may_be_integers() -> None:
+    angles = np.arange(8)
+    np.testing.assert_allclose(
+        nq.wrapped(jnp.asarray(angles)), nq.wrapped(jnp.asarray(angles, jnp.float32))
+    )
+
+
+def test_plans_are_arrays_and_begin_with_a_state() -> None:
+    one = newton_qd.create("hopper", auto_reset=False)
+    batch = newton_qd.create("hopper", auto_reset=False, batch_size=2)
+    wrong: Any = None
+    for env in (one, batch):
+        state = jax.eval_shape(env.reset, KEY)
+        plan = jnp.zeros((4, *state.done.shape, 3))
+        with pytest.raises(TypeError, match=r"^state: got None; allowed: a State"):
+            env.rollout(wrong, plan)
+        with pytest.raises(TypeError, match=r"^state: got None; allowed: a State"):
+            env.step(wrong, plan[0])
+        wrong_plan: Any = plan.tolist()
+        with pytest.raises(TypeError, match=r"^actions: got .*an array of shape"):
+            env.rollout(state, wrong_plan)
+    state = jax.eval_shape(batch.reset, KEY)
+    with pytest.raises(ValueError, match=r"^params: got .* the batch axis \(2,\)"):
+        batch.rollout(state, jnp.zeros((4, 2, 3)), one.default_params)
