@@ -8,6 +8,8 @@
 - ``DescriptorWrapper``: the base class for descriptors; ``FeetContactWrapper`` and
   ``XYPositionWrapper``: descriptors of the suite; ``Wrapper``: any other change
 - ``WrapperSpec``: a wrapper with its options
+- ``checked_options``, ``RolloutOrder``: checks of the options of a class, and how
+  ``rollout`` may run its steps
 - ``get_feet_contact_proportion``, ``get_final_xy_position``,
   ``get_mean_state_descriptor``: descriptors of episodes
 - ``register``, ``create``: add an environment by name, and build it
@@ -21,6 +23,7 @@
 from newton_qd.envs.base import Env, PhysicsEnv, QDEnv
 from newton_qd.envs.locomotion import Locomotion
 from newton_qd.envs.options import checked_options
+from newton_qd.envs.rollouts import RolloutOrder
 from newton_qd.envs.state import State, check
 from newton_qd.envs.vectors import length, ordered_sum, wrapped
 from newton_qd.extractors import (
@@ -60,6 +63,7 @@ __all__ = [
     "QDEnv",
     "RNGKey",
     "RobotSpec",
+    "RolloutOrder",
     "Scene",
     "State",
     "Wrapper",

@@ -12,7 +12,7 @@ import jax
 from newton_qd import brax_views as brax
 from newton_qd import checks, tasks
 from newton_qd.checks import Fact, listed, message, shown
-from newton_qd.envs.base import Env
+from newton_qd.envs.base import Env, PhysicsEnv
 from newton_qd.envs.methods import check_methods, random_key
 from newton_qd.envs.shown import REGISTERED
 from newton_qd.errors import UnknownEnvironment
@@ -28,7 +28,6 @@ from newton_qd.wrappers import (
     EvalWrapper,
     FixedInitialStateWrapper,
     VectorWrapper,
-    Wrapper,
 )
 
 _MOVED = {
@@ -185,9 +184,20 @@ def _descriptor_specs(
     if not isinstance(descriptor, WrapperSpec):
         allowed = "None, a class such as FeetContactWrapper, or a WrapperSpec of one"
         checks.function("descriptor", descriptor, allowed)
+        _refuse_robot("descriptor", descriptor)
         descriptor = WrapperSpec(descriptor)
     _check_wrappers((descriptor,))
     return (descriptor,)
+
+
+def _refuse_robot(name: str, wrapper: object) -> None:
+    """Checks that a wrapper is no class of robots.
+
+    Raises:
+        TypeError: It is one.
+    """
+    if isinstance(wrapper, type) and issubclass(wrapper, PhysicsEnv):
+        raise TypeError(message(name, wrapper, "wrappers, such as FeetContactWrapper"))
 
 
 def _takes_robot(base: Callable[..., Env]) -> bool:
@@ -200,8 +210,8 @@ def _check_wrappers(wrappers: object) -> None:
     """Checks the ``wrappers`` of ``register``.
 
     Raises:
-        TypeError: They are not a sequence of ``WrapperSpec``, or a wrapper does not
-            take one of its options.
+        TypeError: They are not a sequence of ``WrapperSpec``, one is a class of robots,
+            or a wrapper does not take one of its options.
     """
     if not isinstance(wrappers, Sequence) or isinstance(wrappers, str):
         allowed = "a tuple or list of WrapperSpec, such as "
@@ -212,11 +222,7 @@ def _check_wrappers(wrappers: object) -> None:
         allowed = "a WrapperSpec, such as WrapperSpec(FeetContactWrapper)"
         checks.instance(name, spec, WrapperSpec, allowed)
         checks.function(f"{name}.wrapper", spec.wrapper, "a class or a function")
-        kind = spec.wrapper
-        if isinstance(kind, type) and issubclass(kind, Env):
-            if not issubclass(kind, Wrapper):
-                allowed = "a subclass of Wrapper, such as FeetContactWrapper"
-                raise TypeError(message(f"{name}.wrapper", kind, allowed))
+        _refuse_robot(f"{name}.wrapper", spec.wrapper)
         allowed = "a mapping of keyword arguments"
         checks.instance(f"{name}.options", spec.options, Mapping, allowed)
         spec.check_options(f"{name}.options", spec.options)

@@ -360,7 +360,9 @@ def test_descriptors_have_the_length_of_their_limits(page: dict[str, Any]) -> No
         env.reset(jax.random.key(0))
 
 
-@pytest.mark.parametrize("limits", [None, 3, (0.0, 1.0), ((0, 0), (1,)), ((1,), (0,))])
+@pytest.mark.parametrize(
+    "limits", [None, 3, (0.0, 1.0), ((0, 0), (1,)), (("0",), ("1",))]
+)
 def test_limits_of_descriptors(limits: Any, page: dict[str, Any]) -> None:
     kind = type("Bad", (page["ArmAngles"],), {"limits": limits})
     with pytest.raises(ValueError, match=r"^Bad\.limits: got .*; allowed: lowest"):

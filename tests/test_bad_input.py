@@ -165,6 +165,8 @@ def test_bad_states_are_named(name: str) -> None:
         with pytest.raises(TypeError, match=r"state: got an array .*allowed: a State"):
             wrappers.step(action, state)  # pyright: ignore[reportArgumentType]
         wrappers = wrappers.env  # pyright: ignore[reportAttributeAccessIssue]
+    with pytest.raises(ValueError, match=r"state: got info without 'fault'; allowed"):
+        env.unwrapped.step(state.replace(info=None), action)  # pyright: ignore
     with pytest.raises(TypeError, match=r"state: got None; allowed: a State"):
         env.unwrapped.step(None, action)  # pyright: ignore[reportArgumentType]
     inside = env.unwrapped.reset(jax.random.key(0))

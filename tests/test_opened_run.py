@@ -82,7 +82,8 @@ def test_wrong_cells_are_named(found: Run) -> None:
     if len(empty):
         with pytest.raises(LookupError, match="which is empty; allowed: one of the"):
             found.elite(int(empty[0]))
-    for descriptor in ([0.1], [0.1, np.nan], [0.1] * 3):
+    wrong: Any = ["0.1", "0.2"]
+    for descriptor in ([0.1], [0.1, np.nan], [0.1] * 3, wrong):
         with pytest.raises(ValueError, match="2 finite numbers: left, right"):
             found.nearest(descriptor)
     with pytest.raises(ValueError, match="count: got 0"):
@@ -182,9 +183,11 @@ def test_files_of_another_run_are_refused(reference: Path, tmp_path: Path) -> No
     with pytest.raises(ConfigError, match="numbers with the columns iteration, eval"):
         opened(out)
     (out / "metrics.csv").write_bytes((reference / "metrics.csv").read_bytes())
-    (out / "corrected.json").write_text("[1]")
-    with pytest.warns(UserWarning, match="an object of reevaluations, qd_score"):
-        assert opened(out).reevaluated is None
+    whole = '{"reevaluations": 1, "qd_score": "a", "coverage": 1, "max_fitness": 1}'
+    for text in ("[1]", "{", whole):
+        (out / "corrected.json").write_text(text)
+        with pytest.warns(UserWarning, match="an object of reevaluations, qd_score"):
+            assert opened(out).reevaluated is None
 
 
 def test_eval_says_that_the_bits_are_the_same(

@@ -109,6 +109,7 @@ def test_ranges_of_arrays_and_of_one_value() -> None:
         ({"damping_scale": (-1.0, 1.0)}, r"damping_scale: got -1.0; .*from 0"),
         ({"friction": (0.0, np.inf)}, r"friction: got inf; .*finite"),
         ({"friction": ("0", "1")}, r"friction: got \('0', '1'\); .*numbers$"),
+        ({"friction": (0.5, "0.7", 0.9)}, r"friction: got .*numbers$"),
         ({"friction": {0: 1, 1: 2}}, r"friction: got \{0: 1, 1: 2\}; .*numbers$"),
         ({"worlds": 0}, "worlds: got 0; allowed: .*integers from 1"),
         ({"worlds": True}, r"worlds: got True; allowed"),

@@ -148,7 +148,8 @@ def test_state_descriptors_are_written_in_order() -> None:
     env = newton_qd.create("hopper", auto_reset=False, episode_length=None)
     assert _order(Highest(env, "hopper")) == RolloutOrder.IN_ORDER
     check(Highest(env, "hopper"))
-    assert _order(Said(env, "hopper")) == RolloutOrder.AT_ONCE
+    for kind in (Said, type("Later", (Height,), {"rollout_order": Said.rollout_order})):
+        assert _order(kind(env, "hopper")) == RolloutOrder.AT_ONCE
     for name in ("hopper_uni", "ant_omni"):
         own = newton_qd.create(name, auto_reset=False, episode_length=None)
         assert _order(own) == RolloutOrder.AT_ONCE

@@ -19,7 +19,10 @@ from newton_qd.assets import AssetNotFoundError, find_urdf
 from newton_qd.physics import reference
 from newton_qd.physics.model import build_system, load_system, newton_builder
 from newton_qd.physics.model.scene import read_scene
-from newton_qd.physics.model.xml_reader import RobotDescriptionError
+from newton_qd.physics.model.xml_reader import (
+    RobotDescriptionError,
+    RobotDescriptionWarning,
+)
 from newton_qd.physics.system import ObstacleKind, System
 from newton_qd.robots import ANT, Contact
 from newton_qd.scenes import HUMANOID_TRAP, MAZE, SCENES, TRAP, Scene
@@ -238,6 +241,15 @@ def test_refused_files(tmp_path: Path, inside: str, message: str) -> None:
     path = write(tmp_path, f"<robot name='scene'>{inside}</robot>")
     with pytest.raises(RobotDescriptionError, match=re.escape(message)):
         load_system(ANT, scene=Scene("scene", path))
+
+
+def test_misspelt_names_are_noticed(tmp_path: Path) -> None:
+    wall = '<orgin xyz="5 0 0"/><geometry><sphere radius="1"/></geometry>'
+    file = tmp_path / "walls.urdf"
+    link = f'<link name="wall"><collision>{wall}</collision></link>'
+    file.write_text(f'<robot name="walls">{link}</robot>')
+    with pytest.warns(RobotDescriptionWarning, match=r"<orgin>: element: got <orgin>"):
+        read_scene(Scene("walls", str(file)))
 
 
 def test_refused_rows(tmp_path: Path) -> None:

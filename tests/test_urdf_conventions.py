@@ -215,8 +215,9 @@ def test_misspelt_names_are_noticed(slip: str, tmp_path: Path) -> None:
 
 
 def test_names_of_simulators_are_not(tmp_path: Path) -> None:
-    inside = '<gazebo/><transmission/><dynamics spring_stiffness="1" damping="0"/>'
-    other = '<contact><lateral_friction value="1"/></contact><self_collide/>'
+    inside = '<gazebo/><dynamics viscous_damping="1" spring_stiffness="1"/>'
+    inside += '<limit command_effort="1" gear_velocity="2" max_velocity="3"/>'
+    other = "<collision_checking/><contact><lateral_friction/></contact>"
     hinge = joint("hinge", "continuous", "a", "b", inside)
     text = robot_text(link("a", other), link("b"), hinge)
     with warnings.catch_warnings():

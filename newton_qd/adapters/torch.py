@@ -22,7 +22,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from newton_qd import checks
 from newton_qd.checks import Fact, message
@@ -254,7 +253,9 @@ class _Door:
         """
         if isinstance(params, PhysicsParams):
             for name in FIELDS:
-                check_bounds(name, np.asarray(getattr(params, name)))
+                values = checks.real_numbers(getattr(params, name))
+                if values is not None:  # the step refuses what is no number
+                    check_bounds(name, values)
 
 
 def _parts(state: State) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TypeAlias
 
 import jax
@@ -118,13 +119,16 @@ def _bounds(name: str, limits: Range, default: jax.Array) -> tuple[np.ndarray, .
         allowed += f" or arrays of shape {default.shape}"
     refusal = message(name, limits, allowed)
     try:
+        ends = [checks.real_numbers(end) for end in limits]
         low, high = (
-            np.broadcast_to(np.asarray(end, default.dtype), default.shape)
-            for end in limits
-            if checks.real_numbers(end) is not None and not isinstance(limits, dict)
+            np.broadcast_to(end.astype(default.dtype), default.shape)
+            for end in ends
+            if end is not None
         )
     except (TypeError, ValueError) as error:
         raise ValueError(refusal) from error
+    if len(ends) != 2 or isinstance(limits, Mapping):  # whose keys would be the ends
+        raise ValueError(refusal)
     check_bounds(name, np.stack([low, high]))
     if np.any(low > high):
         why = "where low is above high"

@@ -53,7 +53,8 @@ def rollout(env: Any, state: State, actions: Action, params: Params) -> State:
         TypeError: The state or an action has the wrong type.
         ValueError: The state, the actions or ``params`` do not fit the environment.
     """
-    inputs.require_state(state)
+    if not hasattr(state, "done"):  # a class of a user may have states of its own
+        inputs.require_state(state)
     # a wrapper around a batch: ``VectorWrapper`` itself has a ``rollout`` of its own
     batched = getattr(env, "batch_size", None) is not None
     shape = (*(jnp.shape(state.done) if batched else ()), env.action_size)
@@ -92,11 +93,15 @@ def _own_order(env: Any) -> RolloutOrder:
 
     A class that overrides a method may need another order than its base class has.
     """
+    kinds = type(env).__mro__
     orders = [getattr(env, "rollout_order", RolloutOrder.ONE_BY_ONE)]
     for name, order in _UNLESS_SAID.items():
-        owner = next((kind for kind in type(env).__mro__ if name in vars(kind)), None)
-        if owner is not None and "rollout_order" not in vars(owner):
-            orders.append(order)
+        for kind in kinds:
+            if "rollout_order" in vars(kind):  # said of this method, or of a newer one
+                break
+            if name in vars(kind):
+                orders.append(order)
+                break
     return max(orders)
 
 

@@ -27,8 +27,7 @@ class DescriptorWrapper(Wrapper, QDEnv):
     A subclass overrides ``describe`` and ``limits``. It may also override
     ``descriptor_extractor``. ``rollout`` calls ``describe`` for one step after the
     other. If ``describe`` does not read what earlier steps have written into ``info``,
-    the subclass may set ``rollout_order = RolloutOrder.AT_ONCE`` (of
-    ``newton_qd.envs.rollouts``), which is faster.
+    the subclass may set ``rollout_order = RolloutOrder.AT_ONCE``, which is faster.
     """
 
     rollout_order = RolloutOrder.AT_ONCE
@@ -109,8 +108,8 @@ class DescriptorWrapper(Wrapper, QDEnv):
             ValueError: It is of another shape than the limits have.
         """
         found = self.describe(state)
-        if not isinstance(found, list | tuple):
-            require_real(f"{type(self).__name__}.describe", found)
+        for part in found if isinstance(found, list | tuple) else [found]:
+            require_real(f"{type(self).__name__}.describe", part)
         described = jnp.asarray(found, self.dtype)
         if described.shape != (self.state_descriptor_length,):
             allowed = f"shape {(self.state_descriptor_length,)}, as its limits"

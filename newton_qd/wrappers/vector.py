@@ -126,7 +126,8 @@ def _batch(state: State) -> tuple[int]:
         TypeError: It is not a state.
         ValueError: It has no batch axis, or several.
     """
-    require_state(state)
+    if not hasattr(state, "done"):  # a class of a user may have states of its own
+        require_state(state)
     batch = jnp.shape(state.done)
     if len(batch) != 1:
         allowed = "(batch,), as after a reset of this environment"

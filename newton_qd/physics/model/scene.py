@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import warnings
 from collections.abc import Iterator
 
 import numpy as np
@@ -14,9 +15,11 @@ from newton_qd.checks import Fact, listed, message
 from newton_qd.physics import reference
 from newton_qd.physics.model.description import WORLD, find_root, read_joints
 from newton_qd.physics.model.elements import Link, Shape, by_name, read_link
+from newton_qd.physics.model.spelling import misspelt
 from newton_qd.physics.model.xml_reader import (
     IDENTITY,
     RobotDescriptionError,
+    RobotDescriptionWarning,
     XmlReader,
 )
 from newton_qd.physics.system import ObstacleKind
@@ -85,6 +88,8 @@ def read_scene(scene: Scene) -> tuple[SceneLink, ...]:
     elements = by_name(reader, "link")
     if not elements:
         raise reader.error(reader.root, "element <link> is missing")
+    for text in misspelt(reader):
+        warnings.warn(text, RobotDescriptionWarning, stacklevel=2)
     links = {name: read_link(reader, element) for name, element in elements.items()}
     for name, link in links.items():
         if (name == WORLD and link.shapes) or link.mass > 0:

@@ -6,14 +6,13 @@ does not know is no error. But one that is almost a known name is a slip.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterator
 from xml.etree import ElementTree
 
 from newton_qd.checks import Fact, message
 from newton_qd.physics.model.xml_reader import XmlReader
 
-_CLOSE = 0.6  # similarity of two names, from 0 to 1
+_SHORT = 5  # letters; shorter names are misspelt by one slip, longer ones by up to two
 
 _CHILDREN = {
     "link": ("inertial", "visual", "collision"),
@@ -87,9 +86,27 @@ def _inside(reader: XmlReader, element: ElementTree.Element) -> Iterator[str]:
 
 def _almost(name: str, known: tuple[str, ...]) -> bool:
     """Returns whether a name is not known, but almost."""
-    return name not in known and bool(
-        difflib.get_close_matches(name, known, n=1, cutoff=_CLOSE)
+    return name not in known and any(
+        _slips(name, other) <= (1 if len(other) < _SHORT else 2) for other in known
     )
+
+
+def _slips(name: str, other: str) -> int:
+    """Returns how many letters are wrong, missing, too many or swapped.
+
+    It is the optimal string alignment distance (Damerau 1964, "A technique for computer
+    detection and correction of spelling errors").
+    """
+    rows = [list(range(len(other) + 1))]
+    for i, a in enumerate(name, start=1):
+        row = [i]
+        for j, b in enumerate(other, start=1):
+            cost = min(rows[-1][j] + 1, row[-1] + 1, rows[-1][j - 1] + (a != b))
+            if i > 1 and j > 1 and (a, name[i - 2]) == (other[j - 2], b):
+                cost = min(cost, rows[-2][j - 2] + 1)
+            row.append(cost)
+        rows.append(row)
+    return rows[-1][-1]
 
 
 def _ignored(
@@ -99,5 +116,5 @@ def _ignored(
     name: str,
     known: tuple[str, ...],
 ) -> Exception:
-    why = "which is not known and ignored"
+    why = "which is unknown, so it is ignored"
     return reader.error(element, message(kind, Fact(name), ", ".join(known), why=why))

@@ -24,7 +24,7 @@ class RobotDescriptionError(ValueError):
 
 
 class RobotDescriptionWarning(UserWarning):
-    """A robot's URDF file says less than it could, and this package chose a meaning."""
+    """A URDF file may not mean what its author wanted; the text says what it means."""
 
 
 def asset_file(urdf: Path, name: str) -> Path | None:

@@ -254,6 +254,7 @@ class Run:
         """Returns rows (N,) of the archive, and whether ``cell`` was a single one.
 
         Raises:
+            IndexError: A cell of the grid does not exist.
             LookupError: There are none, or a cell of the grid is empty.
             ValueError: ``cell`` has more axes than one.
         """

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from newton_qd import checks
 from newton_qd.checks import Fact, message
 from newton_qd.qd.config import ConfigError
 from newton_qd.qd.run.archive import ARCHIVE, Archive, load_archive
@@ -78,10 +79,26 @@ def read_reevaluated(path: Path) -> Reevaluated | None:
     if not path.is_file():
         return None
     try:
-        return Reevaluated(**json.loads(path.read_text(encoding="utf-8")))
+        return _reevaluated(path.read_text(encoding="utf-8"))
     except (TypeError, ValueError) as error:
         names = ", ".join(f.name for f in dataclasses.fields(Reevaluated))
         text = message(str(path), Fact("other content"), f"an object of {names}")
         text += f" ({error}); the run is opened without these metrics"
         warnings.warn(text, stacklevel=3)
         return None
+
+
+def _reevaluated(text: str) -> Reevaluated:
+    """Returns the metrics of a file.
+
+    Raises:
+        TypeError: It has other names, or a value is not a number.
+        ValueError: It is not JSON.
+    """
+    found = Reevaluated(**json.loads(text))
+    for field in dataclasses.fields(found):
+        value = getattr(found, field.name)
+        absent = value is None and field.default is None
+        if not absent and not checks.is_number(value):  # infinite if none is left
+            raise TypeError(message(field.name, value, "numbers"))
+    return found
