@@ -57,7 +57,11 @@ def get_final_xy_position(data: StateDescriptors, mask: Mask) -> Descriptor:
 
     Returns:
         (n, nd) last valid state descriptors.
+
+    Raises:
+        ValueError: ``mask`` has another shape than the steps of ``data``.
     """
+    _require_steps(data, mask)
     last = jnp.sum(mask == 0, axis=1, dtype=jnp.int32) - 1
     return jax.vmap(lambda rows, index: rows[index])(data.state_desc, last)
 
@@ -72,7 +76,11 @@ def get_feet_contact_proportion(data: StateDescriptors, mask: Mask) -> Descripto
 
     Returns:
         (n, nd) proportions [-].
+
+    Raises:
+        ValueError: ``mask`` has another shape than the steps of ``data``.
     """
+    _require_steps(data, mask)
     valid = (1.0 - mask)[..., None].astype(data.state_desc.dtype)
     # If all components had one number of steps, XLA would multiply by its reciprocal in
     # some batches, and 41 * (1 / 41) is not 1.
@@ -92,8 +100,23 @@ def get_mean_state_descriptor(data: StateDescriptors, mask: Mask) -> Descriptor:
 
     Returns:
         (n, nd) means.
+
+    Raises:
+        ValueError: ``mask`` has another shape than the steps of ``data``.
     """
     return get_feet_contact_proportion(data, mask)
+
+
+def _require_steps(data: StateDescriptors, mask: Mask) -> None:
+    """Checks that a mask has a number for each step; JAX would read another one.
+
+    Raises:
+        ValueError: It has not.
+    """
+    steps = jnp.shape(data.state_desc)[:-1]
+    if jnp.shape(mask) != steps:
+        given = Fact(f"shape {jnp.shape(mask)}")
+        raise ValueError(message("mask", given, f"{steps}, as the state descriptors"))
 
 
 _READS = {

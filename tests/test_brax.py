@@ -200,6 +200,18 @@ def test_brax_trains_on_it(
             "state: got None; allowed: a state, as reset",
         ),
         (
+            lambda env: env("pointmaze", eval_metrics=True),
+            ValueError,
+            "eval_metrics: got True, which needs an episode length.*allowed: False",
+        ),
+        (
+            lambda env: env("ant_omni").step(
+                jax.eval_shape(env("pointmaze").reset, jax.random.key(0)), jnp.zeros(8)
+            ),
+            ValueError,
+            "state: got info without 'xy_position'; allowed: a state of this environm",
+        ),
+        (
             lambda env: env("pointmaze", episode_length=5),
             ValueError,
             "env: got an environment with an episode length; allowed: one world",

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import json
+import sys
 
 import pytest
 
@@ -72,3 +74,27 @@ def test_the_table_for_scripts(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["envs", "--json"]) == cli.OK
     rows = json.loads(capsys.readouterr().out)
     assert [row["name"] for row in rows] == [*newton_qd.registered_envs()]
+
+
+@pytest.mark.parametrize("closed", ["stdout", "stderr"])
+def test_a_closed_output_is_no_failure(
+    closed: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, closed, None)
+    assert cli.main(["envs", "hopper"]) == cli.OK
+    assert cli.main(["plot", "no such folder"]) == cli.BAD_ARGUMENTS
+
+
+def test_a_character_that_a_terminal_lacks(monkeypatch: pytest.MonkeyPatch) -> None:
+    written = io.BytesIO()
+    stream = io.TextIOWrapper(written, encoding="ascii")
+    monkeypatch.setattr(sys, "stderr", stream)
+    assert cli.main(["plot", "pm\u00e9"]) == cli.BAD_ARGUMENTS
+    assert b"pm\\xe9" in written.getvalue()
+
+
+def test_the_doctor_prints_json_without_what(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert cli.main(["doctor", "--json", "gradients", "hopper"]) == cli.BAD_ARGUMENTS
+    assert "--json: got it with gradients" in capsys.readouterr().err

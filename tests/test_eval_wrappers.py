@@ -112,3 +112,28 @@ def test_eval_leaves_the_old_state_alone() -> None:
     first = env.step(state, jnp.ones(1))
     assert (set(state.info), set(state.metrics)) == keys
     assert env.step(state, jnp.ones(1)).obs == first.obs
+
+
+def test_without_auto_reset_an_episode_ends_once() -> None:
+    env = CompletedEvalWrapper(EpisodeWrapper(Line(), 3, 1))
+    sums = [state.info["completed_eval_metrics"] for state in play(env, 5)]
+    assert [float(s.completed_episodes) for s in sums] == [0, 0, 0, 1, 1, 1]
+    assert [float(s.completed_episodes_steps) for s in sums] == [0, 0, 0, 3, 3, 3]
+    assert float(sums[-1].completed_episodes_metrics["moved"]) == 3.0
+    assert float(sums[-1].current_episode_metrics["moved"]) == 0.0
+
+
+def test_worlds_may_be_reset_outside_of_the_sums() -> None:
+    env = AutoResetWrapper(CompletedEvalWrapper(EpisodeWrapper(Line(), 3, 1)))
+    sums = [state.info["completed_eval_metrics"] for state in play(env, 8)]
+    episodes = [0, 0, 0, 1, 1, 1, 2, 2, 2]
+    assert [float(s.completed_episodes) for s in sums] == episodes
+
+
+@pytest.mark.parametrize("wrapper", [EvalWrapper, CompletedEvalWrapper])
+def test_a_state_without_sums_is_named(
+    wrapper: type[EvalWrapper] | type[CompletedEvalWrapper],
+) -> None:
+    inside = EpisodeWrapper(Line(), 3, 1)
+    with pytest.raises(ValueError, match=r"state: got info without '.*eval_metrics'"):
+        wrapper(inside).step(inside.reset(KEY), jnp.ones(1))

@@ -290,3 +290,20 @@ def test_descriptors_keep_float32_under_x64(x64: None) -> None:
     data, mask = episodes()
     assert get_final_xy_position(data, mask).dtype == np.float32
     assert get_feet_contact_proportion(data, mask > 0).dtype == np.float32
+
+
+@pytest.mark.parametrize("reduce", [get_final_xy_position, get_feet_contact_proportion])
+def test_a_mask_has_a_number_for_each_step(reduce: Any) -> None:
+    for shape in ((2, 3), (1, 4), (2,)):
+        with pytest.raises(ValueError, match=r"^mask: got shape .*; allowed: \(2, 4\)"):
+            reduce(Transitions(jnp.ones((2, 4, 2))), jnp.zeros(shape))
+
+
+def test_kernels_take_what_jax_makes_of_numpy() -> None:
+    rows: Any = np.arange(8.0).reshape(4, 2)  # JAX has no float64 here
+    ones: Any = np.ones((4, 2))
+    mask: Any = np.zeros(4)
+    assert physics.episode_final(rows, mask).tolist() == [6.0, 7.0]
+    assert physics.episode_proportion(ones, mask).tolist() == [1.0, 1.0]
+    with pytest.raises(ValueError, match="state_desc, mask: got shapes"):
+        physics.episode_proportion(ones[:, :0], mask)

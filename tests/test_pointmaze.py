@@ -211,6 +211,13 @@ def test_borders_and_walls_are_numbers(name: str) -> None:
             newton_qd.create("pointmaze", **{name: wrong})
 
 
+def test_a_state_of_another_precision_is_refused(x64: None) -> None:
+    state = newton_qd.create("pointmaze").reset(KEY)
+    wide = newton_qd.create("pointmaze", dtype="float64")
+    with pytest.raises(TypeError, match=r"^state\.obs: got .*float32; allowed: .*64"):
+        wide.step(state, jnp.zeros(2))
+
+
 def test_another_maze() -> None:
     maze = PointMaze(y_max=3.0, zone_height_offset_from_y_max=-1.0, zone_width=0.5)
     np.testing.assert_allclose(maze.goal, (-0.5, 2.0))

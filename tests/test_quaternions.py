@@ -41,7 +41,7 @@ def stepped(q: jax.Array) -> tuple[jax.Array, jax.Array]:
     return state.q, fault
 
 
-@pytest.mark.parametrize("length", [0.2, 1.1, 30.0])
+@pytest.mark.parametrize("length", [2e-30, 0.2, 1.1, 30.0, 1e25])
 def test_the_length_of_a_quaternion_changes_nothing(length: float) -> None:
     expected, _ = stepped(TURNED)
     found, fault = stepped(TURNED.at[3:7].multiply(length))
@@ -51,6 +51,15 @@ def test_the_length_of_a_quaternion_changes_nothing(length: float) -> None:
 
 def test_a_unit_quaternion_stays_the_same() -> None:
     np.testing.assert_array_equal(physics.unit_quaternions(SYSTEM, TURNED), TURNED)
+
+
+def test_coordinates_are_checked() -> None:
+    wrong: Any
+    for wrong in (jnp.arange(15), TURNED.tolist()):
+        with pytest.raises(TypeError, match=r"^q: got .*; allowed: an array of shape"):
+            physics.unit_quaternions(SYSTEM, wrong)
+    with pytest.raises(ValueError, match=r"^q: got an array of shape \(2,\)"):
+        physics.unit_quaternions(SYSTEM, jnp.zeros(2))
 
 
 def test_a_quaternion_of_length_zero_is_a_fault() -> None:

@@ -257,6 +257,10 @@ def test_worlds_with_random_parameters() -> None:
         RandomParamsWrapper(env, colour=(1, 2))
     with pytest.raises(ValueError, match="friction: got"):
         RandomParamsWrapper(env, friction=(2, 1))
+    with pytest.raises(ValueError, match=r"env: got .*, and the ranges of the outer"):
+        RandomParamsWrapper(wrapped, friction=(0.5, 1.5))
+    pair: Any = jnp.array([0.5, 1.5])
+    RandomParamsWrapper(env, friction=pair)
 
 
 @pytest.mark.slow

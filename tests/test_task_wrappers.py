@@ -172,6 +172,8 @@ def test_forward_metric_is_named_by_the_class() -> None:
 def test_forward_reward_and_repeated_actions() -> None:
     with pytest.raises(ValueError, match=r"repeats actions 2 times.*EpisodeWrapper"):
         NoForwardRewardWrapper(newton_qd.create("ant", action_repeat=2), "ant")
+    with pytest.raises(ValueError, match=r"forward part would be subtracted twice"):
+        NoForwardRewardWrapper(newton_qd.create("ant_omni"), "ant")
     env = newton_qd.create("ant_omni", action_repeat=2)
     single = newton_qd.create("ant_omni")
     state, action = jax.jit(env.reset)(KEY), jnp.full(8, 0.5, np.float32)

@@ -25,6 +25,7 @@ from newton_qd.qd import load_run
 from newton_qd.robots import ROBOTS
 from newton_qd.scenes import SCENES
 from newton_qd.viewing import (
+    Recorder,
     drawing_of,
     html,
     joined,
@@ -33,6 +34,7 @@ from newton_qd.viewing import (
     render,
     replay_html,
     write_explorer,
+    write_replay,
 )
 from newton_qd.viewing.drawing import body_frames, drawing_of_system
 from newton_qd.viewing.trajectory import Trajectory
@@ -109,6 +111,10 @@ def test_wrong_arguments_are_named(ant: Any, walk: Trajectory) -> None:
         record(ant, jnp.zeros((3, 8)), key, steps=4)
     with pytest.raises(ValueError, match=r"steps, worlds: got .*, which needs at leas"):
         record(ant, lambda obs: obs[:8], key, steps=2**31 - 1)
+    with pytest.raises(TypeError, match="policy: got 3; allowed: a function of para"):
+        Recorder(ant, 3, 5)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"steps: got 1.5; allowed: integers from 1"):
+        Recorder(ant, lambda _, obs: obs[:8], 1.5)  # type: ignore[arg-type]
     with pytest.raises(TypeError, match="trajectory: got 3; allowed: a Trajectory"):
         render(3, "a.png")  # type: ignore[arg-type]
     for runs in ("a", ["a"], walk):
@@ -333,3 +339,7 @@ def test_pictures(walk: Trajectory, tmp_path: Path) -> None:
     assert np.abs(seen_above - picture[:, :64]).mean() > 1
     with pytest.raises(ValueError, match=r"elevation: got 90; allowed: "):
         render(one, tmp_path / "one.png", elevation=90)
+    with pytest.raises(ValueError, match="width: got 1; allowed: integers from 2"):
+        render(one, tmp_path / "one.mp4", width=1)
+    name = "run\udcff"  # a folder whose name is no text
+    assert "run?" in write_replay(one, tmp_path / "one.html", name).read_text()

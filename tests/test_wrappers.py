@@ -279,3 +279,16 @@ def test_check_counts_what_it_does_not_name() -> None:
     )
     with pytest.raises(newton_qd.FaultError, match="world 7 at step 7 and 12 more"):
         newton_qd.check(state)  # pyright: ignore[reportArgumentType]
+
+
+def test_a_second_episode_wrapper_is_refused() -> None:
+    for inside in (EpisodeWrapper(Line(), 3, 1), newton_qd.create("pointmaze")):
+        with pytest.raises(ValueError, match=r"^env: got .*EpisodeWrapper, and both"):
+            EpisodeWrapper(inside, 3, 1)
+
+
+def test_a_first_state_of_another_task_is_named() -> None:
+    ours, other = (newton_qd.create(name) for name in ("anttrap", "antnotrap"))
+    state = jax.eval_shape(other.reset, jax.random.key(0))
+    with pytest.raises(ValueError, match=r"^state: got first_obs and obs of shape"):
+        jax.eval_shape(ours.step, state, jnp.zeros(8))

@@ -17,7 +17,7 @@ import numpy as np
 
 from newton_qd import checks, registry
 from newton_qd.adapters.worlds import one_world
-from newton_qd.checks import message
+from newton_qd.checks import Fact, message
 from newton_qd.envs.base import Env, PhysicsEnv
 from newton_qd.envs.methods import random_key
 from newton_qd.envs.state import State
@@ -126,7 +126,9 @@ class BraxEnv(envs.Env):
             why = "a physics of brax"
             raise ValueError(message("backend", backend, f"None, {BACKEND}", why=why))
         if isinstance(env, str):
-            # brax's wrapper counts the steps of an episode
+            if options.get("eval_metrics"):
+                why = "which needs an episode length, and brax's wrappers count steps"
+                raise ValueError(message("eval_metrics", True, "False", why=why))
             options = {"episode_length": None, **options}
         self.env = one_world(env, options, endless=True)
         self.sys = self._own = BraxSystem(self.env.default_params, self.env)
@@ -149,10 +151,15 @@ class BraxEnv(envs.Env):
 
         Raises:
             TypeError: ``state`` is not a state, or the action has the wrong type.
-            ValueError: The action has the wrong shape.
+            ValueError: The state is of another environment, or the action has the
+                wrong shape.
         """
         allowed = "a state, as reset() returns it"
         checks.instance("state", state, (envs.State, State), allowed)
+        for key in self._keys:
+            if key not in state.info:
+                given = Fact(f"info without {key!r}")
+                raise ValueError(message("state", given, "a state of this environment"))
         info: dict[str, Any] = {key: state.info[key] for key in self._keys}
         if "fault" in info:
             info["fault"] = jnp.zeros(jnp.shape(state.done), jnp.int32)
@@ -213,7 +220,11 @@ def register_with_brax(prefix: str = "newton_qd/") -> tuple[str, ...]:
 
     Returns:
         The names, such as ``newton_qd/ant_uni``.
+
+    Raises:
+        TypeError: ``prefix`` is not text.
     """
+    checks.instance("prefix", prefix, str, "text, which may be empty")
     names = []
     for name in registry.registered_envs():
         kind: Any = functools.partial(BraxEnv, name)

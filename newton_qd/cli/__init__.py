@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import io
+import os
 import sys
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
@@ -57,6 +59,7 @@ def main(
         command.add_parser(commands)
     runs.add_parsers(commands)
     viewing.add_parsers(commands)
+    _repair_streams()
     arguments = parser.parse_args(argv)
     code = OK
     with contextlib.suppress(BrokenPipeError):  # as in: newton-qd envs | head
@@ -67,6 +70,20 @@ def main(
         except BrokenPipeError:
             abandon(stream)
     return code
+
+
+def _repair_streams() -> None:
+    """Makes output possible that is closed or has few characters.
+
+    Python has no stream in the place of one that is closed (``newton-qd envs >&-``).
+    A name of a file may have a character that a terminal does not.
+    """
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))
+        elif isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def _run(

@@ -17,7 +17,7 @@ def add_parser(commands: Commands) -> None:
         description="Without WHAT, checks the installation: versions, devices, missing "
         "packages, and a few steps of an ant.",
     )
-    doctor.add_argument("--json", action="store_true", help="print JSON, for scripts")
+    doctor.add_argument("--json", action="store_true", help="print JSON (without WHAT)")
     doctor.set_defaults(run=health.run, modules=[])
     ailments = doctor.add_subparsers(dest="ailment", metavar="WHAT")
     parser = ailments.add_parser(
@@ -72,6 +72,9 @@ def run(arguments: argparse.Namespace) -> int:
     from newton_qd.physics.precision import quiet
 
     quiet()
+    if arguments.json:
+        refused = "--json: got it with gradients; allowed: without WHAT"
+        return complain(arguments, refused, BAD_ARGUMENTS)
     out = arguments.out
     if out is not None and out.exists() and not out.is_dir():  # not after minutes
         refused = f"--out: got {out}, a file; allowed: a folder, or a new name"

@@ -117,20 +117,22 @@ def require_robot_state(state: State, system: System, metrics: tuple[str, ...]) 
         raise ValueError(message("state", given, allowed))
 
 
-def require_point_state(state: State) -> None:
+def require_point_state(state: State, dtype: np.dtype) -> None:
     """Checks that a state is one of a point, whose observation is its position.
 
     Args:
         state: Argument of a step.
+        dtype: Allowed dtype. Weakly typed numbers are converted to it.
 
     Raises:
-        TypeError: It is not a ``State``.
+        TypeError: It is not a ``State``, or has another precision.
         ValueError: It is a state of another environment.
     """
     require_state(state, "fault")
     if jnp.shape(state.obs) != (2,):
         given = Fact(f"obs of shape {jnp.shape(state.obs)}")
         raise ValueError(message("state", given, f"{OWN_STATE}, so obs of shape (2,)"))
+    checks.array("state.obs", state.obs, (2,), dtype)
 
 
 def checked_action(action: Action, size: int, dtype: np.dtype) -> Action:

@@ -141,7 +141,7 @@ class PointMaze(QDEnv):
                 JAX x64 is off.
         """
         checks.x64(self._dtype)
-        require_point_state(state)
+        require_point_state(state, self._dtype)
         refuse_params(params)
         action = checked_action(action, self.action_size, self._dtype)
         old = state.obs

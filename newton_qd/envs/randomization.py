@@ -8,6 +8,7 @@ from typing import TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.typing import ArrayLike
 
 from newton_qd import checks
@@ -118,8 +119,11 @@ def _bounds(name: str, limits: Range, default: jax.Array) -> tuple[np.ndarray, .
     if default.shape:
         allowed += f" or arrays of shape {default.shape}"
     refusal = message(name, limits, allowed)
+    known = isinstance(limits, jax.Array) and not isinstance(limits, Tracer)
     try:
-        ends = [checks.real_numbers(end) for end in limits]
+        # under ``jit``, the entries of an array of JAX would be traced
+        pair = np.asarray(limits) if known else limits
+        ends = [checks.real_numbers(end) for end in pair]
         low, high = (
             np.broadcast_to(end.astype(default.dtype), default.shape)
             for end in ends

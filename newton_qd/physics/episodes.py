@@ -61,14 +61,26 @@ def _episode_reduction(
     return differentiable(call, name, steps * (nd + 1), size)
 
 
-def _episode_row(state_desc: jax.Array, mask: jax.Array) -> jax.Array:
-    if state_desc.ndim != 2 or mask.shape != state_desc.shape[:1] or not mask.size:
-        given = Fact(f"shapes {state_desc.shape}, {mask.shape}")
-        allowed = "(t, nd) and (t,), t of 1 or more"
+def _reduced(name: str, state_desc: jax.Array, mask: jax.Array) -> jax.Array:
+    """Returns the row that a kernel writes for an episode.
+
+    Raises:
+        TypeError: The kernels do not support the type of ``state_desc``.
+        ValueError: ``state_desc`` or ``mask`` has the wrong shape, or has no steps.
+    """
+    # numbers of NumPy may get another type here, and the kernel must be one of that
+    state_desc, mask = jnp.asarray(state_desc), jnp.asarray(mask)
+    shapes = state_desc.shape, mask.shape
+    if state_desc.ndim != 2 or shapes[1] != shapes[0][:1] or not state_desc.size:
+        given = Fact(f"shapes {shapes[0]}, {shapes[1]}")
+        allowed = "(t, nd) and (t,), t and nd of 1 or more"
         raise ValueError(message("state_desc, mask", given, allowed))
-    if state_desc.dtype.name not in SCALARS:
+    dtype, (steps, nd) = state_desc.dtype, state_desc.shape
+    if dtype.name not in SCALARS:
         raise TypeError(message("state_desc", state_desc, listed(SCALARS)))
-    return jnp.concatenate([state_desc.ravel(), mask.astype(state_desc.dtype)])
+    size = nd if name == "final" else steps * nd
+    run = _episode_reduction(name, dtype.name, steps, nd, size)
+    return run(jnp.concatenate([state_desc.ravel(), mask.astype(dtype)]))
 
 
 def episode_proportion(state_desc: jax.Array, mask: jax.Array) -> jax.Array:
@@ -90,11 +102,8 @@ def episode_proportion(state_desc: jax.Array, mask: jax.Array) -> jax.Array:
         TypeError: The kernels do not support the type of ``state_desc``.
         ValueError: ``state_desc`` or ``mask`` has the wrong shape, or has no steps.
     """
-    row = _episode_row(state_desc, mask)
-    steps, nd = state_desc.shape
-    dtype, size = state_desc.dtype.name, steps * nd
-    run = _episode_reduction("proportion", dtype, steps, nd, size)
-    return run(row).reshape(nd, steps)[:, 0]
+    row = _reduced("proportion", state_desc, mask)
+    return row.reshape(jnp.shape(state_desc)[::-1])[:, 0]
 
 
 def episode_final(state_desc: jax.Array, mask: jax.Array) -> jax.Array:
@@ -116,6 +125,4 @@ def episode_final(state_desc: jax.Array, mask: jax.Array) -> jax.Array:
         TypeError: The kernels do not support the type of ``state_desc``.
         ValueError: ``state_desc`` or ``mask`` has the wrong shape, or has no steps.
     """
-    row = _episode_row(state_desc, mask)
-    steps, nd = state_desc.shape
-    return _episode_reduction("final", state_desc.dtype.name, steps, nd, nd)(row)
+    return _reduced("final", state_desc, mask)

@@ -14,6 +14,7 @@ import jax
 import numpy as np
 import warp as wp
 
+from newton_qd.checks import message
 from newton_qd.physics import interrupts
 from newton_qd.physics.ending import stop_at_exit
 from newton_qd.physics.explicit_mesh import over_devices, row_like
@@ -172,6 +173,10 @@ def native_row_call(plan: Plan, target: str = "newton_qd_rows") -> RowCall:
     plan.register()
 
     def call(*rows: jax.Array, output_dims: int) -> tuple[jax.Array, ...]:
+        for given in rows:
+            if given.dtype.itemsize != plan.number_bytes:  # it would read other memory
+                allowed = f"numbers of {plan.number_bytes} bytes"
+                raise TypeError(message("row of a kernel", given, allowed))
         row = row_like(rows, output_dims)
         run = jax.ffi.ffi_call(target, row, vmap_method="broadcast_all")
         return (run(*rows, plan=np.int64(plan.key)),)

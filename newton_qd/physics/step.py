@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from newton_qd import checks
 from newton_qd.physics import bridge
 from newton_qd.physics.inspection import checked_vector, forward_kinematics
 from newton_qd.physics.kinds import JointKind
@@ -63,13 +64,22 @@ def unit_quaternions(system: System, q: jax.Array) -> jax.Array:
     Args:
         system: The system.
         q: (nq,) coordinates [m or rad].
+
+    Raises:
+        TypeError: ``q`` is not an array, or has the wrong dtype.
+        ValueError: ``q`` has the wrong shape.
     """
+    q = checks.array("q", q, (system.nq,), system.dtype)
     for start in system.q_start[system.joint_kind == JointKind.FREE] + 3:
         quaternion = q[start : start + 4]
-        square = jnp.sum(quaternion**2)
-        length = jnp.sqrt(jnp.where(square > 0, square, 1))
-        scaled = jnp.where(square > 0, quaternion / length, jnp.nan)
-        unit = jnp.where(jnp.abs(square - 1) <= _ROUNDED, quaternion, scaled)
+        # the square of a long one would overflow, and that of a short one vanish
+        largest = jax.lax.stop_gradient(jnp.max(jnp.abs(quaternion)))
+        some = largest > 0
+        shrunk = quaternion / jnp.where(some, largest, 1)
+        length = jnp.sqrt(jnp.where(some, jnp.sum(shrunk**2), 1))
+        scaled = jnp.where(some, shrunk / length, jnp.nan)
+        near = jnp.abs(jnp.sum(quaternion**2) - 1) <= _ROUNDED
+        unit = jnp.where(near, quaternion, scaled)
         q = q.at[start : start + 4].set(unit)
     return q
 

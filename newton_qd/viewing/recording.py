@@ -129,10 +129,13 @@ class Recorder:
             contacts: Whether to record the impulse of every contact.
 
         Raises:
-            TypeError: The environment cannot be drawn.
+            TypeError: The environment cannot be drawn, or ``policy`` is no function.
+            ValueError: ``steps`` is not an integer above 0.
             RobotDescriptionError: A URDF file is malformed.
             OSError: A URDF file cannot be read.
         """
+        checks.function("policy", policy, "a function of parameters and an observation")
+        checks.integer("steps", steps)
         self.env = env
         self.drawing = drawing_of(env)
         run = functools.partial(_run, env, policy, None, contacts, steps)

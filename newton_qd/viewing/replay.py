@@ -32,6 +32,8 @@ def replay_html(trajectory: Trajectory, title: str | None = None) -> str:
     checks.instance("trajectory", trajectory, Trajectory, "a Trajectory")
     checks.text("title", title, optional=True)
     title = trajectory.drawing.name if title is None else title
+    # the name of a folder may have bytes that are no text
+    title = title.encode("utf-8", "replace").decode()
     data = {"title": title, "trajectory": trajectory_data(trajectory)}
     return page(f"{title} - newton_qd", _BODY, ("replay.js",), data)
 

@@ -83,6 +83,9 @@ def render(
         # it has hundredths of a second, and browsers slow down below two of them
         checks.number("rate of a GIF", rate, least=_SLOWEST, most=_FASTEST)
     checks.number("rate", rate, above=0)
+    if ending == ".mp4":  # a video has even sizes
+        checks.integer("width", width, least=2)
+        checks.integer("height", height, least=2)
     last = int(trajectory.lengths.max())
     _check_time(time, ending, last * trajectory.dt)
     require(ending)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from newton_qd.envs.inputs import require_state
+from newton_qd.checks import Fact, message
+from newton_qd.envs.inputs import OWN_STATE, require_state
 from newton_qd.envs.state import State, select
 from newton_qd.types import READINGS, Action, Params, RNGKey
 from newton_qd.wrappers.base import Wrapper
@@ -47,6 +48,12 @@ class AutoResetWrapper(Wrapper):
                 wrong shape.
         """
         require_state(state, "first_obs")
+        first, found = (jnp.shape(x) for x in (state.info["first_obs"], state.obs))
+        size = self.observation_size
+        if first != found or found[-1:] != (size,):
+            given = Fact(f"first_obs and obs of shape {first} and {found}")
+            allowed = f"{OWN_STATE}, so both of length {size}"
+            raise ValueError(message("state", given, allowed))
         begins = state.done > 0
         counters = {key: state.info[key] for key in _COUNTERS if key in state.info}
         zeros = {key: jnp.zeros_like(value) for key, value in counters.items()}

@@ -31,6 +31,31 @@ def unsupported(env: Env, env_name: str, allowed: str) -> str:
     return f"This wrapper does not support {env_name} yet. {refusal}"
 
 
+def outermost(env: Env, kind: type[Wrapper]) -> Wrapper | None:
+    """Returns the outermost wrapper of a kind, ``env`` included; ``None`` without."""
+    while isinstance(env, Wrapper):
+        if isinstance(env, kind):
+            return env
+        env = env.env
+    return None
+
+
+def refuse_second(env: Env, kind: type[Wrapper], why: str) -> None:
+    """Checks that an environment has no wrapper of a kind yet.
+
+    Args:
+        env: The environment.
+        kind: The class.
+        why: What two of them would do, for the error.
+
+    Raises:
+        ValueError: It has one.
+    """
+    if outermost(env, kind) is not None:
+        given = Fact(f"an environment with {kind.__name__}")
+        raise ValueError(message("env", given, "one without it", why=why))
+
+
 class Wrapper(Env):
     """An environment around another one; forwards everything that it does not change.
 

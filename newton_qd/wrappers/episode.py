@@ -11,7 +11,7 @@ from newton_qd.envs.inputs import require_state
 from newton_qd.envs.rollouts import RolloutOrder
 from newton_qd.envs.state import State
 from newton_qd.types import Action, Params, RNGKey
-from newton_qd.wrappers.base import Wrapper
+from newton_qd.wrappers.base import Wrapper, refuse_second
 
 
 class EpisodeWrapper(Wrapper):
@@ -37,8 +37,11 @@ class EpisodeWrapper(Wrapper):
             action_repeat: Control steps for each action.
 
         Raises:
-            ValueError: A number is not an integer above 0.
+            ValueError: A number is not an integer above 0, or ``env`` has an
+                ``EpisodeWrapper`` already.
         """
+        why = "and both would count in info['steps']; see create(episode_length=None)"
+        refuse_second(env, EpisodeWrapper, why)
         checks.integer("episode_length", episode_length)
         checks.integer("action_repeat", action_repeat)
         super().__init__(env)

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from newton_qd.checks import Fact, message
+from newton_qd.envs.inputs import require_state
 from newton_qd.envs.rollouts import RolloutOrder
 from newton_qd.envs.state import State, at_fault
 from newton_qd.types import Action, Metrics, Params, RNGKey
@@ -65,6 +66,7 @@ class EvalWrapper(Wrapper):
             ValueError: The state has no sums of this wrapper, or the action has another
                 shape.
         """
+        require_state(state, self.STATE_INFO_KEY)
         sums = state.info[self.STATE_INFO_KEY]
         if not isinstance(sums, EvalMetrics):
             raise ValueError(f"Incorrect type for state_metrics: {type(sums)}")

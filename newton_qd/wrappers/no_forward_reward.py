@@ -7,7 +7,7 @@ from newton_qd.envs.base import Env, PhysicsEnv
 from newton_qd.envs.rollouts import RolloutOrder
 from newton_qd.envs.state import State
 from newton_qd.types import Action, Params
-from newton_qd.wrappers.base import Wrapper, unsupported
+from newton_qd.wrappers.base import Wrapper, refuse_second, unsupported
 
 
 class NoForwardRewardWrapper(Wrapper):
@@ -25,8 +25,10 @@ class NoForwardRewardWrapper(Wrapper):
 
         Raises:
             NotImplementedError: The reward has no forward part.
-            ValueError: The environment repeats actions.
+            ValueError: The environment repeats actions, or has this wrapper already.
         """
+        why = "and the forward part would be subtracted twice"
+        refuse_second(env, NoForwardRewardWrapper, why)
         base = env.unwrapped
         name = base.forward_reward_name if isinstance(base, PhysicsEnv) else None
         if name is None:

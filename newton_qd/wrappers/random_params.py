@@ -13,7 +13,7 @@ from newton_qd.envs.randomization import Range, randomize_params
 from newton_qd.envs.state import State
 from newton_qd.physics.parameters import FIELDS
 from newton_qd.types import Action, Params, RNGKey
-from newton_qd.wrappers.base import Wrapper
+from newton_qd.wrappers.base import Wrapper, refuse_second
 
 _OWN_KEY = 0x7061  # any number, so that parameters do not follow from the start state
 
@@ -42,9 +42,12 @@ class RandomParamsWrapper(Wrapper):
 
         Raises:
             TypeError: ``env`` is not an environment, or a parameter does not exist.
-            ValueError: The environment has no physical parameters, or a range is wrong.
+            ValueError: The environment has no physical parameters, or draws them
+                already, or a range is wrong.
         """
         del env_name
+        why = "and the ranges of the outer one alone would count"
+        refuse_second(env, RandomParamsWrapper, why)
         for name in ranges:
             if name not in FIELDS:
                 why = "which is no physical parameter"

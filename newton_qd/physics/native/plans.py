@@ -78,6 +78,7 @@ class Plan:
         key: Number by which a compiled program finds the plan. It depends on what the
             plan computes only, so programs that JAX has stored find it in a later
             process.
+        number_bytes: Size of a number.
     """
 
     def __init__(
@@ -104,6 +105,7 @@ class Plan:
             packs_per_thread: Launches for which another thread pays.
             rollouts: What a rollout of the kernel reads; ``None``: there are none.
         """
+        self.number_bytes = number_bytes
         self.key = _key(content)
         self._entry = entry
         self._struct = struct = _Plan(key=self.key, kernel=entry.function)
