@@ -339,6 +339,8 @@ def test_pictures(walk: Trajectory, tmp_path: Path) -> None:
     assert np.abs(seen_above - picture[:, :64]).mean() > 1
     with pytest.raises(ValueError, match=r"elevation: got 90; allowed: "):
         render(one, tmp_path / "one.png", elevation=90)
+    with pytest.raises(ValueError, match=r"rate: got 1000000000\.0; .* up to 1000"):
+        render(one, tmp_path / "one.mp4", rate=1e9)
     with pytest.raises(ValueError, match="width: got 1; allowed: integers from 2"):
         render(one, tmp_path / "one.mp4", width=1)
     name = "run\udcff"  # a folder whose name is no text

@@ -128,7 +128,8 @@ def checked_starts(arguments: argparse.Namespace) -> int:
     Raises:
         ConfigError: An argument is not allowed, or has no effect.
     """
-    checks.integer("--starts", arguments.starts, least=0, error=ConfigError)
+    most = 100_000  # all are evaluated at once
+    checks.integer("--starts", arguments.starts, least=0, most=most, error=ConfigError)
     if arguments.seed is None:
         return 0
     checks.integer("--seed", arguments.seed, least=0, error=ConfigError)

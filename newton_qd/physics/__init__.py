@@ -1,4 +1,7 @@
-"""Differentiable physics: systems, the control step, and functions that inspect it."""
+"""Differentiable physics: systems, the control step, and functions that inspect it.
+
+A function of a ``System`` raises ``TypeError`` if its first argument is something else.
+"""
 
 from newton_qd.physics.bridge import from_jax, to_jax
 from newton_qd.physics.episodes import episode_final, episode_proportion

@@ -4,10 +4,18 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from newton_qd import checks
 from newton_qd.checks import message
 from newton_qd.physics import bridge
-from newton_qd.physics.system import Kinematics, PhysicsState, System
+from newton_qd.physics.system import (
+    Kinematics,
+    PhysicsState,
+    System,
+    require_physics_state,
+    takes_system,
+)
 
 
 def _rotate(quaternion: jax.Array, vector: jax.Array) -> jax.Array:
@@ -21,14 +29,20 @@ def checked_vector(system: System, name: str, value: jax.Array, size: int) -> ja
     """Returns a vector (size,) in the dtype of a system.
 
     Raises:
+        TypeError: It does not have real numbers.
         ValueError: It has the wrong shape.
     """
+    allowed = f"an array of shape ({size},)"
+    checks.instance(name, value, (jax.Array, np.ndarray, list, tuple), allowed)
+    if jnp.issubdtype(jnp.asarray(value).dtype, jnp.complexfloating):
+        raise TypeError(message(name, value, "real numbers"))
     value = jnp.asarray(value, jnp.dtype(system.dtype))
     if value.shape != (size,):
-        raise ValueError(message(name, value, f"an array of shape ({size},)"))
+        raise ValueError(message(name, value, allowed))
     return value
 
 
+@takes_system
 def forward_kinematics(system: System, q: jax.Array, v: jax.Array) -> Kinematics:
     """Computes the pose and the velocity of every body.
 
@@ -48,6 +62,7 @@ def forward_kinematics(system: System, q: jax.Array, v: jax.Array) -> Kinematics
     return bridge.kinematics(system)(q, v)
 
 
+@takes_system
 def seen_bodies(system: System, state: PhysicsState) -> Kinematics:
     """Returns the pose and the velocity of every body.
 
@@ -61,13 +76,16 @@ def seen_bodies(system: System, state: PhysicsState) -> Kinematics:
         The kinematics. Differentiable in reverse mode.
 
     Raises:
+        TypeError: ``state`` is not a ``PhysicsState``.
         ValueError: ``q`` or ``v`` of the state has the wrong shape.
     """
+    require_physics_state(state)
     if state.bodies is not None:
         return state.bodies
     return forward_kinematics(system, state.q, state.v)
 
 
+@takes_system
 def mass_matrix(system: System, q: jax.Array) -> jax.Array:
     """Computes the joint-space inertia, including the armature.
 
@@ -85,6 +103,7 @@ def mass_matrix(system: System, q: jax.Array) -> jax.Array:
     return bridge.dynamics(system, q, jnp.zeros((system.nv,), q.dtype))[0]
 
 
+@takes_system
 def bias_forces(system: System, q: jax.Array, v: jax.Array) -> jax.Array:
     """Computes the bias forces: velocity-product forces and gravity.
 
@@ -106,6 +125,7 @@ def bias_forces(system: System, q: jax.Array, v: jax.Array) -> jax.Array:
     return bridge.dynamics(system, q, v)[1]
 
 
+@takes_system
 def contact_gaps(system: System, q: jax.Array) -> jax.Array:
     """Computes the gaps of all contacts, with the distances that the step uses.
 
@@ -128,6 +148,7 @@ def contact_gaps(system: System, q: jax.Array) -> jax.Array:
     return bridge.contact_gaps(system, q)
 
 
+@takes_system
 def contact_impulses(
     system: System, state: PhysicsState, control: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
@@ -146,8 +167,10 @@ def contact_impulses(
         [N s], never negative.
 
     Raises:
+        TypeError: ``state`` is not a ``PhysicsState``.
         ValueError: The state or the control has the wrong shape.
     """
+    require_physics_state(state)
     q = checked_vector(system, "q", state.q, system.nq)
     v = checked_vector(system, "v", state.v, system.nv)
     control = checked_vector(system, "control", control, system.nu)
@@ -158,6 +181,7 @@ def contact_impulses(
     return found[..., :3], found[..., 3]
 
 
+@takes_system
 def lowest_contact(system: System, q: jax.Array) -> jax.Array:
     """Computes the height of the lowest point of all ground-contact spheres [m].
 

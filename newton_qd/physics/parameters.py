@@ -13,7 +13,7 @@ from jax.typing import ArrayLike
 from newton_qd import checks
 from newton_qd.checks import message
 from newton_qd.physics import layout
-from newton_qd.physics.system import System
+from newton_qd.physics.system import System, takes_system
 
 
 @jax.tree_util.register_dataclass
@@ -73,6 +73,7 @@ def parameter_count(system: System) -> int:
     return layout.parameters(system).size
 
 
+@takes_system
 def default_params(system: System) -> PhysicsParams:
     """Returns the parameters of one world with the values of the robot's files."""
     robot = system.robot

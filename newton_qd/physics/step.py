@@ -13,12 +13,19 @@ from newton_qd.physics import bridge
 from newton_qd.physics.inspection import checked_vector, forward_kinematics
 from newton_qd.physics.kinds import JointKind
 from newton_qd.physics.parameters import PhysicsParams, parameter_row
-from newton_qd.physics.system import CONTACT_FRACTION, PhysicsState, System
+from newton_qd.physics.system import (
+    CONTACT_FRACTION,
+    PhysicsState,
+    System,
+    require_physics_state,
+    takes_system,
+)
 
 _ROUNDED = 1e-3
 """Largest difference from 1 of the squared length of a quaternion that is kept."""
 
 
+@takes_system
 def initial_state(system: System, q: jax.Array, v: jax.Array) -> PhysicsState:
     """Returns the state before the first step, with zero contact impulses.
 
@@ -55,6 +62,7 @@ def initial_state(system: System, q: jax.Array, v: jax.Array) -> PhysicsState:
     )
 
 
+@takes_system
 def unit_quaternions(system: System, q: jax.Array) -> jax.Array:
     """Returns coordinates whose quaternions have the length 1.
 
@@ -110,6 +118,7 @@ class Foreseen:
     fault: jax.Array
 
 
+@takes_system
 def step(
     system: System,
     state: PhysicsState,
@@ -140,6 +149,7 @@ def step(
             concrete parameter is out of bounds; or the value of an environment
             variable is not allowed.
     """
+    require_physics_state(state)
     if isinstance(params, Foreseen):
         return params.after, params.fault
     own = None if params is None else parameter_row(system, params)
@@ -148,6 +158,7 @@ def step(
     return after, fault.astype(jnp.int32)
 
 
+@takes_system
 def rollout(
     system: System,
     state: PhysicsState,
@@ -178,6 +189,7 @@ def rollout(
             concrete parameter is out of bounds; or the value of an environment
             variable is not allowed.
     """
+    require_physics_state(state)
     own = None if params is None else parameter_row(system, params)
     after, fault = bridge.rollout(system, state.q, state.v, controls, own)
     return Foreseen(after, fault.astype(jnp.int32))

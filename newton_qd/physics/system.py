@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Concatenate, ParamSpec, TypeVar
 
 import jax
 import numpy as np
 
+from newton_qd import checks
 from newton_qd.checks import Fact, message
 from newton_qd.physics.kinds import TAILS as TAILS
 from newton_qd.physics.kinds import JointKind as JointKind
@@ -262,3 +266,31 @@ class PhysicsState:
     smooth_feet_contact: jax.Array
     torso_xy: jax.Array
     bodies: Kinematics | None = None
+
+
+def require_physics_state(state: object) -> None:
+    """Checks that a value is the state of a world.
+
+    Raises:
+        TypeError: It is not.
+    """
+    allowed = "a PhysicsState, such as state.pipeline_state"
+    checks.instance("state", state, PhysicsState, allowed)
+
+
+Rest = ParamSpec("Rest")
+Result = TypeVar("Result")
+
+
+def takes_system(
+    function: Callable[Concatenate[System, Rest], Result],
+) -> Callable[Concatenate[System, Rest], Result]:
+    """Decorates a function of a system: another first argument is a ``TypeError``."""
+
+    @functools.wraps(function)
+    def checked(system: System, *args: Rest.args, **options: Rest.kwargs) -> Result:
+        allowed = "a System, such as env.unwrapped.system"
+        checks.instance("system", system, System, allowed)
+        return function(system, *args, **options)
+
+    return checked

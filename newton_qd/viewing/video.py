@@ -21,6 +21,7 @@ FORMATS = (".png", ".gif", ".mp4")
 _RATE = 20.0  # pictures per second of a GIF or video
 _COLORS = 48  # of a GIF
 _SLOWEST, _FASTEST = 0.01, 50.0  # pictures per second of a GIF
+_MOST_VIDEO = 1000.0  # pictures per second
 
 
 def require(ending: str) -> None:
@@ -59,7 +60,8 @@ def render(
         height: Height of the picture of one world [px].
         time: Moment of a picture [s], up to the end of the longest episode; ``None``:
             the middle. Only for ``.png``.
-        rate: Pictures per second of a GIF or a video [1/s]; of a GIF 0.01 to 50.
+        rate: Pictures per second of a GIF or a video [1/s]; of a GIF 0.01 to 50, of a
+            video up to 1,000.
         zoom: Size of the robot in the picture; 1: as in the pages.
         elevation: Angle of the view above the ground [deg]; ``None``: as in the pages.
         progress: Called after each picture with its number from 1 and their count.
@@ -82,7 +84,7 @@ def render(
     if ending == ".gif":
         # it has hundredths of a second, and browsers slow down below two of them
         checks.number("rate of a GIF", rate, least=_SLOWEST, most=_FASTEST)
-    checks.number("rate", rate, above=0)
+    checks.number("rate", rate, above=0, most=_MOST_VIDEO if ending == ".mp4" else None)
     if ending == ".mp4":  # a video has even sizes
         checks.integer("width", width, least=2)
         checks.integer("height", height, least=2)

@@ -9,9 +9,10 @@ import numpy as np
 from newton_qd.checks import Fact
 from newton_qd.physics import reference
 from newton_qd.physics.model.robot_checks import index_of, refusal
-from newton_qd.physics.system import JointKind, System
+from newton_qd.physics.system import JointKind, System, takes_system
 
 
+@takes_system
 def raising_coordinate(system: System) -> tuple[int, float] | None:
     """Finds the coordinate that moves the torso up without rotating it.
 
@@ -37,6 +38,7 @@ def raising_coordinate(system: System) -> tuple[int, float] | None:
     return None
 
 
+@takes_system
 def grounding_coordinate(system: System) -> tuple[int, float] | None:
     """Finds the coordinate that places the robot on the ground in any pose.
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from newton_qd.checks import Fact, message
 from newton_qd.physics import reference
-from newton_qd.physics.system import JointKind, System
+from newton_qd.physics.system import JointKind, System, takes_system
 
 FAST_TURN = 0.25
 """Turn of a joint in a substep from which velocity products change within it [rad]."""
@@ -149,6 +149,7 @@ def needed_substeps(system: System) -> tuple[float, float]:
     return dt * fastest / LARGEST_TURN, dt * frequency / LARGEST_PHASE
 
 
+@takes_system
 def recommended_substeps(system: System) -> int:
     """Computes how many substeps a control step of a robot needs to keep its energy.
 

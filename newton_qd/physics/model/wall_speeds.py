@@ -10,7 +10,7 @@ import numpy as np
 from newton_qd.checks import Fact, message
 from newton_qd.physics import reference
 from newton_qd.physics.model.substeps import contact_masses, iterates
-from newton_qd.physics.system import ObstacleKind, System
+from newton_qd.physics.system import ObstacleKind, System, takes_system
 from newton_qd.robots import RobotSpec
 
 # Speeds that are tried [m/s]. Beyond them, sliding along a wall is no longer tested.
@@ -60,6 +60,7 @@ def soft_walls(system: System) -> tuple[str, ...]:
     return tuple(texts)
 
 
+@takes_system
 def wall_speeds(system: System) -> np.ndarray:
     """Computes the speed up to which each contact with a wall holds the robot.
 
