@@ -139,23 +139,6 @@ def number(
     )
 
 
-def real_numbers(value: object) -> np.ndarray | None:
-    """Returns numbers as an array, float64; ``None`` if they are no real numbers.
-
-    Text such as ``"1"`` is no number, though NumPy would convert it. Neither are
-    ``True`` and ``False``.
-    """
-    import jax.numpy as jnp
-
-    try:
-        found = np.asarray(value)
-    except (TypeError, ValueError):  # rows of several lengths, a value under ``jit``
-        return None
-    kinds = (jnp.integer, jnp.floating)  # of NumPy, and such as bfloat16
-    real = any(jnp.issubdtype(found.dtype, kind) for kind in kinds)
-    return found.astype(np.float64) if real else None
-
-
 def integer(
     name: str,
     value: object,

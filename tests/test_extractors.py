@@ -24,6 +24,8 @@ from newton_qd.extractors import (
     get_final_xy_position,
     get_mean_state_descriptor,
 )
+from newton_qd.physics import row_calls
+from newton_qd.physics.episodes import _episode_reduction
 
 
 @jax.tree_util.register_dataclass
@@ -307,3 +309,11 @@ def test_kernels_take_what_jax_makes_of_numpy() -> None:
     assert physics.episode_proportion(ones, mask).tolist() == [1.0, 1.0]
     with pytest.raises(ValueError, match="state_desc, mask: got shapes"):
         physics.episode_proportion(ones[:, :0], mask)
+
+
+def test_a_kernel_refuses_rows_of_another_precision() -> None:
+    if not row_calls.native(row_calls.default_device()):
+        pytest.skip("on a GPU, Warp itself checks the type")
+    run = _episode_reduction("final", "float64", 4, 2, 2)
+    with pytest.raises(TypeError, match=r"^row of a kernel: got .*float32; .* 8 bytes"):
+        run(jnp.zeros(12, np.float32))

@@ -22,6 +22,7 @@ TESTED = Path(newton_qd.__file__).parent.parent
 # A module may import those of its own name and those before it.
 LAYERS = (
     "checks",
+    "real_numbers",
     "errors",
     "files",
     "memory",

@@ -54,7 +54,7 @@ def test_a_state_of_an_environment_is_no_state_of_the_physics(name: str) -> None
 def test_coordinates_are_real_numbers() -> None:
     wrong: Any = "abc"
     for function in (physics.forward_kinematics, physics.initial_state):
-        with pytest.raises(TypeError, match=r"^q: got .*complex64; allowed: real numb"):
+        with pytest.raises(TypeError, match=r"^q: got complex numbers; allowed: real"):
             function(SYSTEM, Q + 1j, V)
         with pytest.raises(
             TypeError, match=r"^q: got 'abc'; allowed: an array of shap"

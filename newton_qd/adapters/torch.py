@@ -29,6 +29,7 @@ from newton_qd.envs.base import Env
 from newton_qd.envs.state import State
 from newton_qd.errors import MissingExtra
 from newton_qd.physics.parameters import FIELDS, PhysicsParams, check_bounds
+from newton_qd.real_numbers import real_numbers
 from newton_qd.types import Params, PyTree
 
 try:
@@ -253,7 +254,7 @@ class _Door:
         """
         if isinstance(params, PhysicsParams):
             for name in FIELDS:
-                values = checks.real_numbers(getattr(params, name))
+                values = real_numbers(getattr(params, name))
                 if values is not None:  # the step refuses what is no number
                     check_bounds(name, values)
 

@@ -11,8 +11,8 @@ from newton_qd.wrappers import (
     AutoResetWrapper,
     EpisodeWrapper,
     VectorWrapper,
-    Wrapper,
 )
+from newton_qd.wrappers.base import outermost
 
 
 def one_world(env: str | Env, options: dict[str, Any], *, endless: bool = False) -> Env:
@@ -41,17 +41,14 @@ def one_world(env: str | Env, options: dict[str, Any], *, endless: bool = False)
     elif options:
         given = Fact(f"an environment with options {', '.join(sorted(options))}")
         raise ValueError(message("env", given, "a name with options"))
-    refused = {VectorWrapper: "a batch", AutoResetWrapper: "auto-reset"}
+    refused = {AutoResetWrapper: "auto-reset", VectorWrapper: "a batch"}
     allowed = "one world: create(..., auto_reset=False), no batch_size"
     if endless:
         refused[EpisodeWrapper] = "an episode length"
         allowed += ", episode_length=None"
-    inside = env
-    while isinstance(inside, Wrapper):
-        for kind, what in refused.items():
-            if isinstance(inside, kind):
-                raise ValueError(
-                    message("env", Fact(f"an environment with {what}"), allowed)
-                )
-        inside = inside.env
+    for kind, what in refused.items():
+        if outermost(env, kind) is not None:
+            raise ValueError(
+                message("env", Fact(f"an environment with {what}"), allowed)
+            )
     return env

@@ -13,6 +13,7 @@ from newton_qd import checks
 from newton_qd.checks import Fact, message
 from newton_qd.envs.state import State
 from newton_qd.physics.system import PhysicsState, System
+from newton_qd.real_numbers import require_real
 from newton_qd.types import Action, Params
 
 
@@ -206,21 +207,6 @@ def checked_outcome(env: str, found: object) -> tuple[str, ...]:
             given = Fact(f"shape {jnp.shape(value)}")
             raise ValueError(message(f"{env}.outcome: {name!r}", given, "shape ()"))
     return tuple(metrics)
-
-
-def require_real(name: str, value: object) -> None:
-    """Checks that what a method returns has real numbers.
-
-    Raises:
-        TypeError: It is no array and no number, or has complex numbers.
-    """
-    allowed = "real numbers"
-    scalars = (bool, int, float, np.bool_, np.number)
-    if not checks.is_array(value) and not isinstance(value, scalars):
-        given = Fact("None" if value is None else f"a {type(value).__name__}")
-        raise TypeError(message(name, given, allowed))
-    if jnp.issubdtype(jnp.result_type(value), jnp.complexfloating):
-        raise TypeError(message(name, Fact("complex numbers"), allowed))
 
 
 def checked_vector(name: str, found: object, size: int, *, meaning: str) -> None:

@@ -16,6 +16,7 @@ from newton_qd.checks import Fact, message
 from newton_qd.envs.base import Env
 from newton_qd.envs.inputs import require_key
 from newton_qd.physics.parameters import FIELDS, PhysicsParams, check_bounds
+from newton_qd.real_numbers import real_numbers
 from newton_qd.types import RNGKey
 
 Range: TypeAlias = tuple[ArrayLike, ArrayLike]
@@ -123,7 +124,7 @@ def _bounds(name: str, limits: Range, default: jax.Array) -> tuple[np.ndarray, .
     try:
         # under ``jit``, the entries of an array of JAX would be traced
         pair = np.asarray(limits) if known else limits
-        ends = [checks.real_numbers(end) for end in pair]
+        ends = [real_numbers(end) for end in pair]
         low, high = (
             np.broadcast_to(end.astype(default.dtype), default.shape)
             for end in ends

@@ -16,6 +16,7 @@ from newton_qd.physics.system import (
     require_physics_state,
     takes_system,
 )
+from newton_qd.real_numbers import require_real
 
 
 def _rotate(quaternion: jax.Array, vector: jax.Array) -> jax.Array:
@@ -34,8 +35,7 @@ def checked_vector(system: System, name: str, value: jax.Array, size: int) -> ja
     """
     allowed = f"an array of shape ({size},)"
     checks.instance(name, value, (jax.Array, np.ndarray, list, tuple), allowed)
-    if jnp.issubdtype(jnp.asarray(value).dtype, jnp.complexfloating):
-        raise TypeError(message(name, value, "real numbers"))
+    require_real(name, jnp.asarray(value))
     value = jnp.asarray(value, jnp.dtype(system.dtype))
     if value.shape != (size,):
         raise ValueError(message(name, value, allowed))

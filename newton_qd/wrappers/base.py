@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -17,6 +17,8 @@ from newton_qd.envs.state import State
 from newton_qd.robots import Material
 from newton_qd.scenes import Scene
 from newton_qd.types import Action, Params, RNGKey
+
+Kind = TypeVar("Kind", bound="Wrapper")
 
 
 def unsupported(env: Env, env_name: str, allowed: str) -> str:
@@ -31,7 +33,7 @@ def unsupported(env: Env, env_name: str, allowed: str) -> str:
     return f"This wrapper does not support {env_name} yet. {refusal}"
 
 
-def outermost(env: Env, kind: type[Wrapper]) -> Wrapper | None:
+def outermost(env: Env, kind: type[Kind]) -> Kind | None:
     """Returns the outermost wrapper of a kind, ``env`` included; ``None`` without."""
     while isinstance(env, Wrapper):
         if isinstance(env, kind):

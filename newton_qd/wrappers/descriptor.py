@@ -10,13 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from newton_qd import checks
 from newton_qd.checks import Fact, message
 from newton_qd.envs.base import Env, QDEnv
-from newton_qd.envs.inputs import OWN_STATE, require_real, require_state
+from newton_qd.envs.inputs import OWN_STATE, require_state
 from newton_qd.envs.rollouts import RolloutOrder
 from newton_qd.envs.state import State
 from newton_qd.extractors import get_mean_state_descriptor
+from newton_qd.real_numbers import real_numbers, require_real
 from newton_qd.types import Action, Descriptor, DescriptorExtractor, Params, RNGKey
 from newton_qd.wrappers.base import Wrapper
 
@@ -142,7 +142,7 @@ def _check_limits(kind: type[DescriptorWrapper]) -> None:
         ValueError: They are missing, or not two rows of numbers, lowest first.
     """
     limits = getattr(kind, "limits", None)
-    pair = checks.real_numbers(limits)
+    pair = real_numbers(limits)
     if (
         pair is None
         or pair.ndim != 2

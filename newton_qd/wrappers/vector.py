@@ -14,7 +14,7 @@ from newton_qd.envs.base import Env
 from newton_qd.envs.inputs import require_key, require_state
 from newton_qd.envs.state import State
 from newton_qd.types import Action, Params, RNGKey
-from newton_qd.wrappers.base import Wrapper
+from newton_qd.wrappers.base import Wrapper, outermost
 
 _MANY = 100_000  # worlds; for fewer, the check is not worth the time to trace a reset
 
@@ -38,13 +38,11 @@ class VectorWrapper(Wrapper):
                 worlds do not fit in memory, or ``env`` has a batch already.
         """
         checks.integer("batch_size", batch_size)
-        inside = env
-        while isinstance(inside, Wrapper):
-            if isinstance(inside, VectorWrapper):
-                given = Fact(f"{inside.batch_size} worlds")
-                allowed = "environments of one world (jax.vmap nests batches)"
-                raise ValueError(message("env", given, allowed))
-            inside = inside.env
+        inside = outermost(env, VectorWrapper)
+        if inside is not None:
+            given = Fact(f"{inside.batch_size} worlds")
+            allowed = "environments of one world (jax.vmap nests batches)"
+            raise ValueError(message("env", given, allowed))
         if batch_size > _MANY:
             needed, most = batch_size * state_bytes(env), memory.limit(jax.devices()[0])
             memory.check("batch_size", batch_size, needed, most)

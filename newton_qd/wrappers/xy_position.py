@@ -15,6 +15,7 @@ from newton_qd.envs.points import point
 from newton_qd.envs.rollouts import RolloutOrder
 from newton_qd.envs.state import State
 from newton_qd.extractors import get_final_xy_position
+from newton_qd.real_numbers import real_numbers
 from newton_qd.types import Descriptor
 from newton_qd.wrappers.base import unsupported
 from newton_qd.wrappers.descriptor import DescriptorWrapper
@@ -120,7 +121,7 @@ def _limit(name: str, given: Limits | None, unlimited: float) -> np.ndarray:
     if given is None:
         return np.full(2, unlimited)
     refusal = message(name, given, "None, or two finite numbers")
-    limit = checks.real_numbers(given)
+    limit = real_numbers(given)
     if limit is None or limit.shape != (2,) or not np.all(np.isfinite(limit)):
         raise ValueError(refusal)
     return limit

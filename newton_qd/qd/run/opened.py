@@ -20,21 +20,16 @@ from newton_qd.qd.algorithms import ALGORITHMS, algorithm_named
 from newton_qd.qd.config import ConfigError, EvolveConfig, read_config
 from newton_qd.qd.extras import require_extra
 from newton_qd.qd.run.archive import Archive
-from newton_qd.qd.run.folder import (
-    CONFIG,
-    REEVALUATED,
-)
+from newton_qd.qd.run.folder import CONFIG, REEVALUATED
 from newton_qd.qd.run.plot import grid_indices
 from newton_qd.qd.run.reevaluation import Reevaluated
 from newton_qd.qd.run.results import read_reevaluated, read_results
 from newton_qd.qd.run.search import start_key
 from newton_qd.qd.scoring.networks import policy_for
 from newton_qd.qd.scoring.robust import robust, run_scoring
-from newton_qd.qd.scoring.rollout import (
-    Policy,
-    episode_of,
-)
+from newton_qd.qd.scoring.rollout import Policy, episode_of
 from newton_qd.qd.scoring.task import Task, make_task, randomized
+from newton_qd.real_numbers import real_numbers
 from newton_qd.types import Repertoire, RNGKey, ScoringFunction
 
 if TYPE_CHECKING:
@@ -177,12 +172,8 @@ class Run:
         """
         checks.integer("count", count)
         length = self.task.descriptor_length
-        wanted = checks.real_numbers(descriptor)
-        if (
-            wanted is None
-            or wanted.shape != (length,)
-            or not np.all(np.isfinite(wanted))
-        ):
+        wanted = real_numbers(descriptor)
+        if wanted is None or wanted.shape != (length,) or not np.isfinite(wanted).all():
             numbers = "1 finite number" if length == 1 else f"{length} finite numbers"
             allowed = f"{numbers}: {', '.join(self.task.labels)}"
             raise ValueError(message("descriptor", descriptor, allowed))

@@ -15,6 +15,7 @@ from newton_qd import checks
 from newton_qd.checks import Fact, message
 from newton_qd.envs.inputs import require_key
 from newton_qd.qd.extras import require_extra
+from newton_qd.real_numbers import real_numbers
 from newton_qd.types import Repertoire, ScoringFunction
 
 if TYPE_CHECKING:
@@ -84,7 +85,7 @@ def make_ribs_evaluation(
         return objectives, jnp.where(good[:, None], descriptors, low), *rows
 
     def evaluate(solutions: np.ndarray) -> tuple[np.ndarray, ...]:
-        found = checks.real_numbers(solutions)
+        found = real_numbers(solutions)
         if found is None or found.ndim != 2:
             allowed = "numbers, an array of shape (N, size)"
             raise ValueError(message("solutions", solutions, allowed))
