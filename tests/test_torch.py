@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import importlib
 import re
@@ -65,7 +66,9 @@ def same(state: Any, wanted: Any) -> bool:
     return all(np.array_equal(a.detach().cpu().numpy(), b) for a, b in pairs)
 
 
-def test_memory_is_shared(torch: Any, door: Any) -> None:
+@pytest.mark.usefixtures("door")
+def test_memory_is_shared(torch: Any) -> None:
+    door = importlib.import_module("newton_qd.adapters.torch_state")
     tensor = torch.arange(6.0).reshape(2, 3)
     array = door.to_jax(tensor)
     assert array.unsafe_buffer_pointer() == tensor.data_ptr()
@@ -190,20 +193,86 @@ def test_errors(torch: Any, door: Any, maze: Any) -> None:
         step(state, torch.zeros(WORLDS, 2, dtype=torch.float16))
 
 
+def test_a_tensor_of_a_state_may_begin_to_need_a_gradient(
+    torch: Any, door: Any, maze: Any
+) -> None:
+    reset, step = door.make_torch_step(maze)
+    state, actions = reset(0), torch.full((WORLDS, 2), 0.3)
+    state.obs.requires_grad_()
+    step(state, actions).obs.sum().backward()
+    assert state.obs.grad.any()
+
+
+def test_a_state_is_frozen_but_for_its_dictionaries(
+    torch: Any, door: Any, maze: Any
+) -> None:
+    """A step goes on from what a reader sees."""
+    reset, step = door.make_torch_step(maze)
+    state, actions = reset(0), torch.zeros(WORLDS, 2)
+    with pytest.raises(dataclasses.FrozenInstanceError, match=r"state\.replace\(obs="):
+        state.obs = state.obs + 1
+    state.info["steps"] = torch.ones_like(state.info["steps"])
+    for copied in (state, copy.copy(state), copy.deepcopy(state)):
+        assert (step(copied, actions).info["steps"] == 2).all()
+    with pytest.raises(TypeError, match=r"^state\.obs: got .*; allowed: tensors of"):
+        step(state.replace(obs=state.obs.cpu().numpy()), actions)
+
+
 def test_what_pytorch_cannot_do_here_is_an_error(
     torch: Any, door: Any, maze: Any
 ) -> None:
     reset, step = door.make_torch_step(maze)
     actions = torch.full((WORLDS, 2), 0.3, requires_grad=True)
-    loss = step(reset(0), actions).reward.sum()
-    (slope,) = torch.autograd.grad(loss, actions, create_graph=True)
-    with pytest.raises(RuntimeError, match=r"once_differentiable|not require grad"):
-        slope.sum().backward()
     state = step(reset(0), actions)
     with torch.no_grad():
         actions.mul_(2.0)
     with pytest.raises(RuntimeError, match="modified by an inplace operation"):
         state.reward.sum().backward()
+    given = torch.func.grad, torch.func.vmap
+    for transform in given:
+        with pytest.raises(TypeError, match=r"^action: got .*outside of torch\.func$"):
+            transform(lambda action: step(reset(0), action).reward.sum())(actions)
+    for wrong in (actions.bfloat16(), actions.detach().to_sparse()):
+        with pytest.raises(TypeError, match=r"^action: got .*; allowed: an? "):
+            step(reset(0), wrong)
+
+
+def test_second_derivatives_are_an_error(torch: Any, door: Any, maze: Any) -> None:
+    """Also of a loss that is linear in the results, and as part of a longer graph."""
+    reset, step = door.make_torch_step(maze)
+    first, autograd = reset(0), torch.autograd
+
+    def linear(actions: Any) -> Any:
+        return step(step(first, actions), actions).obs.sum()
+
+    actions = torch.full((WORLDS, 2), 0.3, requires_grad=True)
+    (slope,) = autograd.grad(linear(actions), actions, create_graph=True)
+    assert slope.requires_grad
+    for again in (
+        lambda: (linear(actions) + (slope**2).sum()).backward(),
+        lambda: autograd.grad(slope.sum(), actions),
+        lambda: autograd.functional.hessian(linear, actions.detach()),
+        lambda: autograd.functional.hvp(linear, actions.detach(), actions.detach()),
+    ):
+        with pytest.raises(RuntimeError, match="has no second derivatives"):
+            again()
+
+
+def test_forward_mode_and_batches_are_errors(torch: Any, door: Any, maze: Any) -> None:
+    reset, step = door.make_torch_step(maze)
+    first, actions = reset(0), torch.full((WORLDS, 2), 0.3)
+
+    def loss(actions: Any) -> Any:
+        return step(first, actions).reward.sum()
+
+    forward = torch.autograd.forward_ad
+    with forward.dual_level(), pytest.raises(RuntimeError, match="no forward-mode"):
+        loss(forward.make_dual(actions, torch.ones_like(actions)))
+    jacobian = torch.autograd.functional.jacobian
+    with pytest.raises(RuntimeError, match="no forward-mode"):
+        jacobian(loss, actions, strategy="forward-mode", vectorize=True)
+    with pytest.raises(RuntimeError, match="no batches of slopes"):
+        jacobian(loss, actions, vectorize=True)
 
 
 @pytest.mark.slow

@@ -63,6 +63,7 @@ def expected(env: Any) -> np.ndarray:
 
 def test_memory_is_shared(torch: Any, door: Any) -> None:
     tensor = torch.arange(6.0, device="cuda").reshape(2, 3)
+    door = importlib.import_module("newton_qd.adapters.torch_state")
     array = door.to_jax(tensor)
     assert array.unsafe_buffer_pointer() == tensor.data_ptr()
     assert door.to_torch(array).data_ptr() == tensor.data_ptr()

@@ -15,13 +15,11 @@ steps, which wait for that stream.
 # pyright: reportAttributeAccessIssue=false, reportMissingImports=false
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 
 from newton_qd import checks
 from newton_qd.checks import Fact, message
@@ -34,78 +32,12 @@ from newton_qd.types import Params, PyTree
 
 try:
     import torch
-    from torch.autograd.function import once_differentiable
+    from torch.autograd import forward_ad
+
+    from newton_qd.adapters.torch_graph import Step, linearized, parts_of, pulled
+    from newton_qd.adapters.torch_state import TorchState, is_tracked, to_jax
 except ModuleNotFoundError as error:
     raise MissingExtra("torch", "torch") from error
-
-
-_FIELDS = tuple(field.name for field in dataclasses.fields(State))
-
-
-class TorchState:
-    """A :class:`newton_qd.State` whose leaves are tensors.
-
-    It has the same attributes. Each becomes tensors when it is first read, so a step
-    costs little. It is a pytree of tensors.
-
-    Attributes:
-        arrays: The same state with the arrays of JAX; ``None`` after ``replace``.
-        tracked: Whether one of its tensors requires a gradient.
-    """
-
-    pipeline_state: Any
-    obs: Any
-    reward: Any
-    done: Any
-    metrics: Any
-    info: Any
-
-    def __init__(self, arrays: State | None, parts: dict[str, Any]) -> None:
-        """Makes a state.
-
-        Args:
-            arrays: State of JAX, if there is one.
-            parts: Attributes that are tensors already; all of them without ``arrays``.
-        """
-        self.arrays = arrays
-        self.tracked = bool(parts) and _tracked(parts)
-        vars(self).update(parts)
-
-    def __getattr__(self, name: str) -> Any:
-        if name not in _FIELDS or self.arrays is None:
-            kind = type(self).__name__
-            raise AttributeError(f"{kind!r} object has no attribute {name!r}")
-        value = jax.tree.map(to_torch, getattr(self.arrays, name))
-        setattr(self, name, value)
-        return value
-
-    def __repr__(self) -> str:
-        return f"<TorchState: observation {tuple(self.obs.shape)}>"
-
-    @property
-    def parts(self) -> dict[str, Any]:
-        """All attributes by name, as tensors."""
-        return {name: getattr(self, name) for name in _FIELDS}
-
-    def replace(self, **changes: Any) -> TorchState:
-        """Returns a copy with some attributes replaced.
-
-        Raises:
-            TypeError: A state has no such attribute.
-        """
-        for name, value in changes.items():
-            if name not in _FIELDS:
-                raise TypeError(
-                    message(name, value, f"one of {checks.listed(_FIELDS)}")
-                )
-        return TorchState(None, {**self.parts, **changes})
-
-
-jax.tree_util.register_pytree_node(
-    TorchState,
-    lambda state: ((state.parts,), None),
-    lambda _, children: TorchState(None, *children),
-)
 
 
 class TorchEnv(NamedTuple):
@@ -133,8 +65,10 @@ def make_torch_step(env: Env) -> TorchEnv:
 
     Returns:
         ``(reset, step)``. Both compile at their first call. ``step`` raises
-        ``ValueError`` if the actions are on another device than the state, and all
-        errors of ``env.step``.
+        ``ValueError`` if the actions are on another device than the state,
+        ``TypeError`` under ``torch.func`` (and another error under
+        ``torch.compile``), and all errors of ``env.step``. Forward-mode and second
+        derivatives raise ``RuntimeError``.
 
     Raises:
         TypeError: ``env`` is not an environment.
@@ -157,29 +91,6 @@ def detached(state: TorchState) -> TorchState:
     )
 
 
-def to_torch(leaf: Any) -> Any:
-    """Returns an array of JAX as a tensor that shares its memory.
-
-    Args:
-        leaf: An array. Random keys stay what they are: PyTorch has no such type.
-    """
-    if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
-        return leaf
-    return torch.from_dlpack(leaf)
-
-
-def to_jax(leaf: Any) -> Any:
-    """Returns a tensor as an array of JAX that shares its memory.
-
-    Args:
-        leaf: A tensor; other leaves stay what they are. A tensor with gaps in its
-            memory is copied.
-    """
-    if not isinstance(leaf, torch.Tensor):
-        return leaf
-    return jax.dlpack.from_dlpack(leaf.detach().contiguous())
-
-
 class _Door:
     """The compiled functions of an environment."""
 
@@ -189,8 +100,8 @@ class _Door:
 
         self._reset = jax.jit(env.reset)
         self._run = jax.jit(run)
-        self.linearize = jax.jit(functools.partial(_linearized, run))
-        self.pull = jax.jit(_pulled, static_argnums=(2, 3))
+        self.linearize = jax.jit(functools.partial(linearized, run))
+        self.pull = jax.jit(pulled, static_argnums=(2, 3))
 
     def reset(self, seed: int) -> TorchState:
         """Begins an episode in every world.
@@ -215,35 +126,33 @@ class _Door:
             params: Physical parameters; ``None``: the default ones.
 
         Raises:
-            TypeError: The state is not one of PyTorch, or the action is not a tensor.
+            RuntimeError: A tensor has a tangent of forward mode.
+            TypeError: The state is not one of PyTorch, or the action is not a tensor
+                with memory of its own.
             ValueError: The action is on another device than the state, or a physical
                 parameter is out of bounds.
         """
         checks.instance("state", state, TorchState, "a state of reset or step")
         checks.instance("action", action, torch.Tensor, "a tensor of PyTorch")
+        parts = state.as_arrays()
         if action.device != state.obs.device:
             wrong = Fact(f"a tensor on {action.device}")
             raise ValueError(message("action", wrong, f"one on {state.obs.device}"))
-        if state.arrays is None:
-            parts = jax.tree.map(to_jax, state.parts)
-        else:
-            parts = {name: getattr(state.arrays, name) for name in _FIELDS}
         given = jax.tree.map(to_jax, params)
         self._check(given)
+        _check_forward((state.parts, action, params))
         tracked = action.requires_grad or state.tracked
-        tracked = tracked or (params is not None and _tracked(params))
+        tracked = tracked or (params is not None and is_tracked(params))
         if not tracked or not torch.is_grad_enabled():
-            # the exchange of a NumPy array takes less time; it shares its memory too
-            on_cpu = action.device.type == "cpu"
-            array = action.detach().numpy() if on_cpu else to_jax(action)
+            array = _action(action, numpy=action.device.type == "cpu")
             after = TorchState(self._run(parts, array, given), {})
             after.obs  # noqa: B018 - waits for the step: the inputs may change now
             return after
         found: list[State] = []
-        inputs = parts, to_jax(action), given
+        inputs = parts, _action(action), given
         leaves = jax.tree.leaves((state.parts, action, params))
-        results = _Step.apply(self, inputs, found, *leaves)
-        structure = jax.tree.structure(_parts(found[0]))
+        results = Step.apply(self, inputs, found, *leaves)
+        structure = jax.tree.structure(parts_of(found[0]))
         return TorchState(found[0], jax.tree.unflatten(structure, results))
 
     def _check(self, params: Params) -> None:
@@ -259,104 +168,42 @@ class _Door:
                     check_bounds(name, values)
 
 
-def _parts(state: State) -> dict[str, Any]:
-    """Returns the attributes of a state by name."""
-    return {name: getattr(state, name) for name in _FIELDS}
-
-
-def _tracked(tree: PyTree) -> bool:
-    """Returns whether a tensor in a pytree requires a gradient."""
-    return any(
-        leaf.requires_grad
-        for leaf in jax.tree.leaves(tree)
-        if isinstance(leaf, torch.Tensor)
-    )
-
-
-def _moves(leaf: Any) -> bool:
-    """Returns whether an array or tensor has a gradient."""
-    if isinstance(leaf, torch.Tensor):
-        return leaf.is_floating_point()
-    return jnp.issubdtype(leaf.dtype, jnp.floating)
-
-
-def _linearized(
-    run: Callable[..., State], inputs: PyTree
-) -> tuple[State, Callable[..., Any]]:
-    """Returns the next state, and its gradient as a function that is a pytree."""
-    leaves, structure = jax.tree.flatten(inputs)
-
-    def step(moving: list[jax.Array]) -> tuple[list[jax.Array], State]:
-        rest = iter(moving)
-        merged = [next(rest) if _moves(leaf) else leaf for leaf in leaves]
-        state = run(*jax.tree.unflatten(structure, merged))
-        moved = [leaf for leaf in jax.tree.leaves(_parts(state)) if _moves(leaf)]
-        return moved, state
-
-    moving = [leaf for leaf in leaves if _moves(leaf)]
-    _, pull, state = jax.vjp(step, moving, has_aux=True)
-    return state, pull
-
-
-def _pulled(
-    pull: Callable[..., Any],
-    slopes: list[jax.Array | None],
-    shapes: tuple[jax.ShapeDtypeStruct, ...],
-    wanted: tuple[bool, ...],
-) -> list[jax.Array]:
-    """Returns the gradients of the inputs that are wanted.
+def _action(action: torch.Tensor, *, numpy: bool = False) -> Any:
+    """Returns an action as an array that shares its memory.
 
     Args:
-        pull: What ``_linearized`` returned.
-        slopes: Gradient of the loss with respect to each result; ``None``: zero.
-        shapes: Shapes and types of the results.
-        wanted: Which inputs are wanted.
+        action: The action.
+        numpy: Whether it is an array of NumPy, whose exchange takes less time.
+
+    Raises:
+        TypeError: The tensor is not dense, has no memory, or has a type that NumPy
+            lacks.
     """
-    pairs = zip(slopes, shapes, strict=True)
-    given = [jnp.zeros(x.shape, x.dtype) if s is None else s for s, x in pairs]
-    (found,) = pull(given)
-    return [slope for slope, want in zip(found, wanted, strict=True) if want]
+    try:
+        return action.detach().numpy() if numpy else to_jax(action)
+    except (BufferError, RuntimeError, TypeError) as error:
+        wrong = Fact(f"a {action.layout} tensor of {action.dtype}: {error}")
+        raise TypeError(
+            message(
+                "action",
+                wrong,
+                "a dense tensor of float32 or float64, outside of torch.func",
+            )
+        ) from error
 
 
-class _Step(torch.autograd.Function):
-    """A step as an operation of PyTorch's graph."""
+def _check_forward(tree: PyTree) -> None:
+    """Checks that no tensor has a tangent, which a step would drop.
 
-    @staticmethod
-    def forward(
-        ctx: Any, door: _Door, inputs: PyTree, found: list[State], *leaves: Any
-    ) -> tuple[Any, ...]:
-        """Runs the step; appends its result to ``found``."""
-        state, ctx.pull = door.linearize(inputs)
-        found.append(state)
-        arrays = jax.tree.leaves(_parts(state))
-        results = tuple(to_torch(array) for array in arrays)
-        ctx.door, ctx.moving = door, tuple(map(_moves, leaves))
-        ctx.shapes = tuple(
-            jax.ShapeDtypeStruct(x.shape, x.dtype) if _moves(x) else None
-            for x in arrays
-        )
-        ctx.set_materialize_grads(False)
-        tensors = [x for x in results if isinstance(x, torch.Tensor)]
-        ctx.mark_non_differentiable(*(x for x in tensors if not _moves(x)))
-        # PyTorch then finds tensors that somebody changed before the way back
-        given = [x for x in leaves if isinstance(x, torch.Tensor)]
-        ctx.save_for_backward(*given, *tensors)
-        return results
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, *slopes: Any) -> tuple[Any, ...]:
-        """Returns the gradient of every leaf of the inputs that needs one.
-
-        Raises:
-            RuntimeError: A tensor was changed in place after the step.
-        """
-        _ = ctx.saved_tensors  # raises the error
-        pairs = zip(slopes, ctx.shapes, strict=True)
-        given = [to_jax(slope) for slope, shape in pairs if shape is not None]
-        shapes = tuple(shape for shape in ctx.shapes if shape is not None)
-        needed = ctx.needs_input_grad[3:]
-        moving = zip(needed, ctx.moving, strict=True)
-        wanted = tuple(need for need, moves in moving if moves)
-        found = iter(ctx.door.pull(ctx.pull, given, shapes, wanted))
-        return None, None, None, *(to_torch(next(found)) if x else None for x in needed)
+    Raises:
+        RuntimeError: A tensor has a tangent.
+    """
+    if forward_ad._current_level < 0:
+        return
+    for leaf in jax.tree.leaves(tree):
+        if isinstance(leaf, torch.Tensor):
+            if forward_ad.unpack_dual(leaf).tangent is not None:
+                raise RuntimeError(
+                    "newton_qd.adapters.torch has no forward-mode derivatives; "
+                    "allowed: torch.autograd.grad and backward"
+                )
