@@ -60,7 +60,7 @@ MERGED_ROW = {
 
 def test_fixed_links_bring_their_mass(tmp_path: Path) -> None:
     """MuJoCo merges links in the same way."""
-    system = built(tmp_path, MERGED, "head", **MERGED_ROW)
+    system = built(tmp_path, MERGED, "trunk", **MERGED_ROW)
     assert system.body_names == ("trunk", "arm")
     assert (system.torso, system.feet.tolist()) == (0, [0])
     # MuJoCo fixes the root of a file to the world, so here it hangs on a hinge.
@@ -330,6 +330,28 @@ def test_meshes_of_a_package(tmp_path: Path) -> None:
         assert built(folder, text, "a").nb == 1
     with pytest.raises(RobotDescriptionError, match="no file on this machine"):
         built(folder, text.replace("../a", "package://b_description/a"), "a")
+
+
+TWICE = {
+    "axis": joint("hinge", "continuous", "a", "b", '<axis xyz="0 1 0"/>' * 2),
+    "limit": joint("hinge", "continuous", "a", "b", '<limit effort="1"/>' * 2),
+    "child": joint("hinge", "continuous", "a", "b", '<child link="b"/>'),
+}
+
+
+@pytest.mark.parametrize("tag", TWICE)
+def test_an_element_is_given_once(tag: str, tmp_path: Path) -> None:
+    text = robot_text(link("a"), link("b"), TWICE[tag])
+    assert f"second <{tag}> of this joint" in refusal(tmp_path, text, "a")
+
+
+def test_a_template_is_refused(tmp_path: Path) -> None:
+    """Its legs would be missing."""
+    leg = "<xacro:leg prefix='left'/>"
+    for text in (robot_text(link("a"), leg), robot_text(link("a", leg))):
+        assert "got <xacro:leg>; allowed: URDF; run xacro" in refusal(
+            tmp_path, text, "a"
+        )
 
 
 def test_prefixed_elements_are_left_out(tmp_path: Path) -> None:

@@ -73,15 +73,17 @@ class RobotSpec:
     Attributes:
         name: Name of the robot.
         urdf: File name inside ``urdf/``, or a path.
-        torso: Link whose position is the robot's position.
-        feet: Links of the feet-contact descriptor, in order.
+        torso: Link whose position is the robot's position. If it is fixed to another
+            link, both must have the same frame.
+        feet: Links of the feet-contact descriptor, in order. All contacts of a foot and
+            of the links that are fixed to it count.
         actuators: ``(joint, gear)`` in the order of the action. The gear is the torque
             [N m] of an action of 1, or the force [N] for a slide.
         contacts: Spheres that may touch the ground.
         pairs: Pairs of colliders of two links that may touch each other, each with
             ``end`` 0.
         rest_pose: ``(joint, angle)`` of the default pose [rad]; 0 for all other joints.
-        rest_height: Height of the root in the default pose [m]; ``None`` puts
+        rest_height: Height of the torso in the default pose [m]; ``None`` puts
             the lowest contact on the ground.
         rest_rotation: Roll, pitch and yaw of a free root in the default pose [rad].
         servos: Joints of ``actuators`` that hold an angle. Their action is the target

@@ -20,7 +20,7 @@ from newton_qd import checks
 from newton_qd.assets import find_urdf
 from newton_qd.checks import Fact, listed, message
 from newton_qd.physics.model.arrays import body_arrays, dof_arrays
-from newton_qd.physics.model.contacts import body_of, contact_tables
+from newton_qd.physics.model.contacts import contact_tables
 from newton_qd.physics.model.description import (
     Description,
     read_description,
@@ -29,6 +29,7 @@ from newton_qd.physics.model.description import (
 from newton_qd.physics.model.elements import UNLIMITED, Shape
 from newton_qd.physics.model.inertia import check_inertia
 from newton_qd.physics.model.kept_models import kept_or_built
+from newton_qd.physics.model.named_links import feet_bodies, torso_body
 from newton_qd.physics.model.newton_input import NewtonInput, merge_fixed_bodies
 from newton_qd.physics.model.rest import rest_coordinates
 from newton_qd.physics.model.robot_checks import check_robot, index_of, refusal
@@ -290,11 +291,8 @@ def _system(
         v_start=built.v_start,
         contact_stiffness=weight / (material.support * material.static_penetration),
         **contact_tables(robot, scene, bodies, len(obstacles["obstacle_kind"])),
-        feet=np.array(
-            [body_of(robot, "feet", foot, bodies) for foot in robot.feet],
-            dtype=np.int32,
-        ),
-        torso=body_of(robot, "torso", robot.torso, bodies),
+        feet=feet_bodies(robot, bodies),
+        torso=torso_body(robot, bodies),
         rest_q=np.zeros(int(np.where(built.joint_kind == JointKind.FREE, 7, 1).sum())),
         feet_width=0.02,
         feet_tail="exponential",

@@ -11,7 +11,8 @@ from newton_qd.checks import Fact, listed
 from newton_qd.physics import reference
 from newton_qd.physics.model.description import Body
 from newton_qd.physics.model.elements import Shape
-from newton_qd.physics.model.robot_checks import check_feet, index_of, refusal
+from newton_qd.physics.model.named_links import body_of
+from newton_qd.physics.model.robot_checks import check_feet, refusal
 from newton_qd.physics.model.scene import (
     TOUCHING,
     ContactRow,
@@ -22,23 +23,6 @@ from newton_qd.robots import Contact, RobotSpec
 from newton_qd.scenes import Scene
 
 _CORNERS = np.array([*itertools.product((-1.0, 1.0), repeat=3)])
-
-
-def body_of(robot: RobotSpec, field: str, link: str, bodies: list[Body]) -> int:
-    """Returns the index of the body that contains a link.
-
-    Args:
-        robot: The robot.
-        field: Field of the robot that names the link, for the error message.
-        link: Name of the link.
-        bodies: Bodies of the robot.
-
-    Raises:
-        RobotDescriptionError: No body contains the link.
-    """
-    links = {name: i for i, body in enumerate(bodies) for name in body.links}
-    index_of(robot, field, link, tuple(links), "a moving link ")
-    return links[link]
 
 
 def _contact_spheres(shape: Shape, end: int) -> tuple[np.ndarray, float]:

@@ -25,6 +25,7 @@ from newton_qd.physics.model.elements import (
     read_link,
 )
 from newton_qd.physics.model.spelling import misspelt
+from newton_qd.physics.model.unread import refuse_unread
 from newton_qd.physics.model.xml_reader import (
     IDENTITY,
     RobotDescriptionError,
@@ -47,14 +48,14 @@ class Body:
         joint: The joint that moves it. The joint's frame is in the parent body.
             ``None`` for a body that floats.
         parent: Name of the parent body. ``None`` for the world.
-        links: Names of all links of the body.
+        links: Frames (7,) of all links of the body in that of the body, by name.
         shapes: Colliders of all links of the body, in the body frame.
     """
 
     link: Link
     joint: Joint | None
     parent: str | None
-    links: tuple[str, ...]
+    links: dict[str, np.ndarray]
     shapes: tuple[Shape, ...]
 
 
@@ -271,6 +272,7 @@ def read_description(path: Path, fixed_base: bool | None = None) -> Description:
     if reader.root.tag != "robot":
         given = Fact(f"<{reader.root.tag}>")
         raise reader.refused(reader.root, "outermost element", given, "<robot>")
+    refuse_unread(reader)
     elements = by_name(reader, "link")
     if not elements:
         raise reader.error(reader.root, "element <link> is missing")
@@ -296,7 +298,7 @@ def read_description(path: Path, fixed_base: bool | None = None) -> Description:
         if fixed:
             still.update((name, at) for name, at in frames.items() if name != WORLD)
         else:
-            bodies[link.name] = Body(merged, joint, parent, tuple(frames), shapes)
+            bodies[link.name] = Body(merged, joint, parent, frames, shapes)
         for next_joint in moving:
             if next_joint.kind == "floating":
                 _check_floating(path, next_joint, fixed)

@@ -89,10 +89,10 @@ def _refusal(
     else:
         name = f"link {link!r} and all that hangs on it, which joint {joint!r} moves"
         cure = f"an <inertial> on {link!r}, or fewer joints without mass between them"
-    given = Fact(f"{max(pivot.share, 0.0):.1g} of its parts{where}")
+    given = Fact(f"{max(pivot.share, 0.0):.2g} of its parts{where}")
     if system.dtype == "float32" and pivot.share >= _KEPT * np.finfo(float).eps:
         cure += ", or dtype='float64'"
-    return name, given, f"at least {least:.1g}, so: {cure}"
+    return name, given, f"at least {least:.2g}, so: {cure}"
 
 
 def _pose(system: System, rng: np.random.Generator) -> np.ndarray:

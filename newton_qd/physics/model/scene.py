@@ -16,6 +16,7 @@ from newton_qd.physics import reference
 from newton_qd.physics.model.description import WORLD, find_root, read_joints
 from newton_qd.physics.model.elements import Link, Shape, by_name, read_link
 from newton_qd.physics.model.spelling import misspelt
+from newton_qd.physics.model.unread import refuse_unread
 from newton_qd.physics.model.xml_reader import (
     IDENTITY,
     RobotDescriptionError,
@@ -85,6 +86,7 @@ def read_scene(scene: Scene) -> tuple[SceneLink, ...]:
     if reader.root.tag != "robot":
         given = Fact(f"<{reader.root.tag}>")
         raise reader.refused(reader.root, "outermost element", given, "<robot>")
+    refuse_unread(reader)
     elements = by_name(reader, "link")
     if not elements:
         raise reader.error(reader.root, "element <link> is missing")
