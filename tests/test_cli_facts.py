@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import json
+import os
 import sys
 
 import pytest
@@ -98,3 +100,28 @@ def test_the_doctor_prints_json_without_what(
 ) -> None:
     assert cli.main(["doctor", "--json", "gradients", "hopper"]) == cli.BAD_ARGUMENTS
     assert "--json: got it with gradients" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("arguments", [["--version"], ["envs"]])
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EPIPE])
+def test_an_output_that_takes_nothing(
+    arguments: list[str], number: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A full disk is a failure, and a reader who has left is none."""
+
+    class Full(io.StringIO):
+        def flush(self) -> None:
+            raise OSError(number, "no")
+
+        def fileno(self) -> int:
+            return nowhere
+
+    errors, nowhere = io.StringIO(), os.open(os.devnull, os.O_WRONLY)
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "stdout", Full())
+        patch.setattr(sys, "stderr", errors)
+        code = cli.main(arguments)
+    os.close(nowhere)
+    full = number == errno.ENOSPC
+    assert code == (cli.FAILED if full else cli.OK)
+    assert ("output: [Errno 28] no" in errors.getvalue()) is full

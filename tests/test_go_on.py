@@ -260,6 +260,7 @@ def test_a_damaged_start_is_refused(reference: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     config = start_with(reference, out=out).config
     (out / "checkpoint.bin").unlink()
+    (out / "archive.npz").unlink()
     content = (out / "start.npz").read_bytes()
     for damaged in (b"", content[:-100], b"PK\3\4 something else"):
         (out / "start.npz").write_bytes(damaged)

@@ -7,6 +7,7 @@ import dataclasses
 import hashlib
 import json
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -345,3 +346,28 @@ def test_pictures(walk: Trajectory, tmp_path: Path) -> None:
         render(one, tmp_path / "one.mp4", width=1)
     name = "run\udcff"  # a folder whose name is no text
     assert "run?" in write_replay(one, tmp_path / "one.html", name).read_text()
+
+
+def test_a_video_that_is_not_complete_leaves_the_old_one(
+    walk: Trajectory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As on a full disk, where ffmpeg says nothing to its caller."""
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+
+    def half(path: Path, *_: Any, **__: Any) -> Iterator[None]:
+        assert path.is_absolute(), "before a colon, ffmpeg sees a protocol"
+        path.write_bytes(b"half a video")
+        while True:
+            yield
+
+    def broken(*_: Any, **__: Any) -> Iterator[None]:
+        yield
+        raise OSError("Broken pipe\n\nFFMPEG COMMAND:\nffmpeg -y")
+
+    target = tmp_path / "one.mp4"
+    target.write_bytes(b"old")
+    for writer, why in ((half, "no complete video"), (broken, "stopped: Broken pipe$")):
+        monkeypatch.setattr(ffmpeg, "write_frames", writer)
+        with pytest.raises(OSError, match=rf"one\.mp4 is not written: ffmpeg .*{why}"):
+            render(walk.world(0), target, width=32, height=32, rate=5)
+        assert target.read_bytes() == b"old" and len(list(tmp_path.iterdir())) == 1

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import io
 import os
 import sys
@@ -60,15 +59,22 @@ def main(
     runs.add_parsers(commands)
     viewing.add_parsers(commands)
     _repair_streams()
-    arguments = parser.parse_args(argv)
     code = OK
-    with contextlib.suppress(BrokenPipeError):  # as in: newton-qd envs | head
+    try:
+        arguments = parser.parse_args(argv)
         code = _run(arguments, task_factory)
-    for stream in (sys.stdout, sys.stderr):
-        try:
-            stream.flush()
-        except BrokenPipeError:
-            abandon(stream)
+        sys.stdout.flush()
+    except BrokenPipeError:  # as in: newton-qd envs | head
+        pass
+    except OSError as error:  # as in: newton-qd envs > /dev/full
+        print(f"newton-qd: error: output: {error}", file=sys.stderr)
+        code = FAILED
+    finally:
+        for stream in (sys.stdout, sys.stderr):
+            try:
+                stream.flush()
+            except OSError:
+                abandon(stream)
     return code
 
 

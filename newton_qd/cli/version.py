@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import platform
+import sys
 from typing import Any
 
 from newton_qd.qd.facts import package_versions
@@ -27,4 +28,5 @@ class ShowVersion(argparse.Action):
         for name, version in package_versions().items():
             if name != "newton_qd":
                 print(f"{name} {version or 'is not installed'}")
+        sys.stdout.flush()  # an error of the output is not an error at the exit
         parser.exit()

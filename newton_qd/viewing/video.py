@@ -108,7 +108,10 @@ def render(
     temporary = temporary_name(target)
     try:
         if ending == ".mp4":
-            _write_video(found, temporary, rate)
+            try:
+                _write_video(found, temporary, rate)
+            except OSError as error:
+                raise OSError(f"{target} is not written: {error}") from error
         else:
             _write_images(found, temporary, rate, ending)
         os.replace(temporary, target)
@@ -172,9 +175,14 @@ def _durations(count: int, rate: float) -> list[int]:
 
 
 def _write_video(found: Iterable[np.ndarray], path: Path, rate: float) -> None:
-    """Writes a video in H.264."""
+    """Writes a video in H.264.
+
+    Raises:
+        OSError: The video is not complete, for example because the disk is full.
+    """
     import imageio_ffmpeg
 
+    path = path.absolute()  # ffmpeg takes what is before a colon for a protocol
     write: Any = imageio_ffmpeg.write_frames  # takes fractions, too
     writer = None
     try:
@@ -195,6 +203,13 @@ def _write_video(found: Iterable[np.ndarray], path: Path, rate: float) -> None:
                     warnings.filterwarnings("ignore", r"os.fork\(\) was called")
                     writer.send(None)
             writer.send(np.ascontiguousarray(image[:height, :width]).tobytes())
+    except OSError as error:  # its text has the command and all output of ffmpeg
+        raise OSError(f"ffmpeg stopped: {str(error).splitlines()[0]}") from error
     finally:
         if writer is not None:
             writer.close()
+    try:  # ffmpeg does not say whether it could write the end of the file
+        imageio_ffmpeg.count_frames_and_secs(path)
+    except RuntimeError as error:
+        why = "ffmpeg wrote no complete video; the disk may be full"
+        raise OSError(why) from error

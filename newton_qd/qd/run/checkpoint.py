@@ -106,19 +106,14 @@ def load_checkpoint(path: Path) -> Checkpoint:
     if not separator or not head.startswith(_MAGIC):
         raise CheckpointError(
             f"{path} is not a checkpoint of this version of newton_qd, or its "
-            "beginning is damaged; delete it to start the run again"
+            "beginning is damaged"
         )
     if hashlib.sha256(payload).hexdigest().encode() != head[len(_MAGIC) :]:
-        raise CheckpointError(
-            f"{path} is damaged (checksum differs); delete it to start the run again"
-        )
+        raise CheckpointError(f"{path} is damaged (checksum differs)")
     try:
         return _from_arrays(read_npz(payload))
     except DAMAGE as error:
-        raise CheckpointError(
-            f"{path} does not hold a checkpoint ({error}); delete it to start the run "
-            "again"
-        ) from error
+        raise CheckpointError(f"{path} does not hold a checkpoint ({error})") from error
 
 
 def read_npz(content: bytes) -> dict[str, np.ndarray]:

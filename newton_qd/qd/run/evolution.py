@@ -287,7 +287,8 @@ def _first(
         if start is not None:
             display.note(f"starting from {len(start)} elites of another archive")
     if folder is not None and resumed:
-        folder.go_on(config)  # not before its state is known to fit
+        # not before its state is known to fit
+        folder.go_on(config, anew=checkpoint is None)
     if state.iteration < config.iterations:
         display.note("compiling the physics and the rollout (longer on a first start)")
     return state

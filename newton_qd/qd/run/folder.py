@@ -248,7 +248,8 @@ class RunFolder:
 
         Raises:
             ConfigError: A setting differs from the run's.
-            CheckpointError: The checkpoint is damaged or belongs to another run.
+            CheckpointError: The checkpoint is damaged, belongs to another run, or
+                was deleted after the archive was written.
         """
         _, old_facts = self.compare(config)
         warnings = []
@@ -261,25 +262,45 @@ class RunFolder:
                 "the result may differ from an uninterrupted run"
             )
         path = self.path / CHECKPOINT
-        checkpoint = load_checkpoint(path) if path.exists() else None
-        if checkpoint and not same_run(checkpoint.settings, settings_text(config)):
+        if path.exists():
+            checkpoint = self._checkpoint(path)
+            require_same_run(path, checkpoint, config)
+            return checkpoint, warnings
+        if (self.path / ARCHIVE).exists():
             raise CheckpointError(
-                f"{path} belongs to a run with other settings than {CONFIG}"
+                f"{path} is missing, so the run cannot go on; delete {ARCHIVE}, the "
+                "result so far, to start it again"
             )
-        return checkpoint, warnings
+        return None, warnings
 
-    def go_on(self, config: EvolveConfig) -> None:
+    def _checkpoint(self, path: Path) -> Checkpoint:
+        """Reads the checkpoint of a run that goes on.
+
+        Raises:
+            CheckpointError: It is damaged.
+        """
+        try:
+            return load_checkpoint(path)
+        except CheckpointError as error:
+            cure = f"to start the run again, delete it and {ARCHIVE}"
+            raise CheckpointError(f"{error}; {cure}") from error
+
+    def go_on(self, config: EvolveConfig, *, anew: bool = False) -> None:
         """Writes the settings of a run that goes on beyond its end.
 
         Args:
             config: Settings with which the checkpoint was restored.
+            anew: Whether there was no checkpoint, so the run starts again.
 
         Raises:
             ConfigError: A setting other than the number of generations differs.
         """
         stored, facts = self.compare(config)
-        if stored != config:
+        if anew or stored != config:
             (self.path / REEVALUATED).unlink(missing_ok=True)  # of the earlier end
+        if anew:
+            (self.path / METRICS).unlink(missing_ok=True)
+        if stored != config:
             self.start(config, facts)
 
     def save(self, checkpoint: Checkpoint) -> None:
@@ -297,6 +318,23 @@ class RunFolder:
         """Writes the metrics of re-evaluated elites."""
         text = json.dumps(metrics, indent=2) + "\n"
         write_atomically(self.path / REEVALUATED, text.encode())
+
+
+def require_same_run(path: Path, state: Checkpoint, config: EvolveConfig) -> None:
+    """Checks that a checkpoint is of a run with some settings.
+
+    Args:
+        path: The checkpoint, for the error.
+        state: Its content.
+        config: The settings.
+
+    Raises:
+        CheckpointError: It belongs to another run.
+    """
+    if not same_run(state.settings, settings_text(config)):
+        raise CheckpointError(
+            f"{path} belongs to a run with other settings than {CONFIG}"
+        )
 
 
 def complete_metrics(metrics: np.ndarray) -> np.ndarray:

@@ -364,7 +364,8 @@ def load_run(
     Raises:
         ConfigError: The folder holds no run, or its settings do not fit the task.
         ArchiveError: ``archive.npz`` is damaged, and there is no checkpoint.
-        CheckpointError: The checkpoint is damaged, and there is no ``archive.npz``.
+        CheckpointError: The checkpoint belongs to a run with other settings, or is
+            damaged, and there is no ``archive.npz``.
         FileNotFoundError: The run was stopped before its first checkpoint.
         MissingExtra: QDax is not installed.
         TypeError: ``folder`` is no path.
@@ -375,7 +376,7 @@ def load_run(
     path = Path(folder)
     config, facts = read_config(path / CONFIG)
     algorithm_named(config.algorithm)
-    archive, metrics = read_results(path)
+    archive, metrics = read_results(path, config)
     task = randomized(config, task_factory(config))
     config = config.resolve(task.descriptor_length)
     policy = policy_for(task, config.hidden)

@@ -13,7 +13,7 @@ import numpy as np
 
 from newton_qd import checks
 from newton_qd.checks import Fact, message
-from newton_qd.qd.config import ConfigError
+from newton_qd.qd.config import ConfigError, EvolveConfig
 from newton_qd.qd.run.archive import ARCHIVE, Archive, load_archive
 from newton_qd.qd.run.checkpoint import CheckpointError, load_checkpoint
 from newton_qd.qd.run.folder import (
@@ -21,18 +21,24 @@ from newton_qd.qd.run.folder import (
     COLUMNS,
     METRICS,
     complete_metrics,
+    require_same_run,
 )
 from newton_qd.qd.run.reevaluation import Reevaluated
 
 
 def read_results(
-    folder: str | os.PathLike[str],
+    folder: str | os.PathLike[str], config: EvolveConfig | None = None
 ) -> tuple[Archive, dict[str, np.ndarray]]:
     """Returns archive and metrics of a results folder, from the newest files.
 
+    Args:
+        folder: The folder.
+        config: Settings of the run, if they matter.
+
     Raises:
         ArchiveError: ``archive.npz`` is damaged, and there is no checkpoint.
-        CheckpointError: The checkpoint is damaged, and there is no ``archive.npz``.
+        CheckpointError: The checkpoint belongs to a run with other settings, or is
+            damaged, and there is no ``archive.npz``.
         FileNotFoundError: The run was stopped before its first checkpoint.
     """
     path = Path(folder)
@@ -46,6 +52,8 @@ def read_results(
             text = f"{error}; its archive and metrics are read from {ARCHIVE} instead"
             warnings.warn(text, stacklevel=3)
         else:
+            if config is not None:
+                require_same_run(checkpoint, state, config)
             arrays = [getattr(state, f.name) for f in dataclasses.fields(Archive)]
             columns = complete_metrics(np.asarray(state.metrics)).T
             return Archive(*arrays), dict(zip(COLUMNS, columns, strict=True))
@@ -58,11 +66,12 @@ def _metrics(path: Path) -> dict[str, np.ndarray]:
     Raises:
         ConfigError: It has other columns, or values that are not numbers.
     """
-    with path.open(encoding="utf-8", newline="") as file:
-        head, *rows = list(csv.reader(file)) or [[]]
+    text = path.read_text(encoding="utf-8")
+    head, *rows = list(csv.reader(text.splitlines())) or [[]]
     try:
         table = np.asarray([[float(x) for x in row] for row in rows])
-        if tuple(head) == COLUMNS[: len(head)] and table.shape[1:] == (len(head),):
+        fits = tuple(head) == COLUMNS[: len(head)] and table.shape[1:] == (len(head),)
+        if fits and text.endswith("\n"):  # else the last number may lack digits
             return dict(zip(COLUMNS, complete_metrics(table).T, strict=True))
     except ValueError:
         pass
