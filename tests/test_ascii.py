@@ -254,10 +254,11 @@ def rollout(weights: jax.Array, key: jax.Array) -> dict[str, jax.Array]:
 
 @dataclasses.dataclass
 class Found:
-    """Gradients of episodes (N, 1, T, nu), and whether they overflowed (N, 1)."""
+    """Gradients of episodes (N, 1, T, nu), and whether they were lost (N, 1), (N,)."""
 
     gradients: jax.Array
     overflowed: jax.Array
+    faulty: jax.Array
 
 
 @pytest.mark.parametrize("samples", [None, 20])
@@ -272,7 +273,8 @@ def test_exact_offspring_raise_the_return(samples: int | None) -> None:
     def gradient(actions: jax.Array, key: jax.Array) -> Any:
         del key
         slopes = jnp.zeros_like(actions).at[..., 0].set(1)
-        return Found(slopes[:, None], jnp.zeros((len(actions), 1), bool))
+        kept = jnp.zeros((len(actions), 1), bool)
+        return Found(slopes[:, None], kept, kept[:, 0])
 
     made = ExactAsciiEmitter(
         policy,
@@ -299,14 +301,19 @@ def test_exact_offspring_raise_the_return(samples: int | None) -> None:
     np.testing.assert_array_equal(gain[:, 1], 0)
 
 
-def test_parents_whose_derivative_overflowed_stay() -> None:
+@pytest.mark.parametrize("why", ["overflowed", "faulty", "zero"])
+def test_parents_without_a_derivative_stay(why: str) -> None:
     """Every second parent has no slopes; Adam would make steps of rounding errors."""
     lost = jnp.array([[True], [False]] * 3)
 
     def gradient(actions: jax.Array, key: jax.Array) -> Any:
         del key
         slopes = jnp.where(lost[..., None], 0, jnp.ones_like(actions))
-        return Found(slopes[:, None], lost)
+        return Found(
+            slopes[:, None],
+            lost & (why == "overflowed"),
+            lost[:, 0] & (why == "faulty"),
+        )
 
     made = ExactAsciiEmitter(
         policy,
@@ -321,7 +328,8 @@ def test_parents_whose_derivative_overflowed_stay() -> None:
     cells = compute_euclidean_centroids((2, 2), [0.0, 0.0], [1.0, 1.0])
     held = MapElitesRepertoire.init(genotypes, fitnesses, places, cells, {})
     offspring, extra = compiled(made.emit)(held, None, jax.random.key(0))
-    np.testing.assert_array_equal(extra["overflowed"], lost[:, 0])
+    counted = lost[:, 0] & (why != "zero")
+    np.testing.assert_array_equal(extra["overflowed"], counted)
     same = (offspring[:, None] == genotypes).all(axis=2).any(axis=1).reshape(6, 2)
     np.testing.assert_array_equal(same, np.tile(lost, 2))
 

@@ -16,6 +16,7 @@ from newton_qd import cli
 from newton_qd.envs.state import State
 from newton_qd.errors import FaultError
 from newton_qd.gradients import GradientReport, diagnose_gradients
+from newton_qd.gradients.doctor_input import checked_genotypes
 
 
 class Growing:
@@ -157,6 +158,13 @@ class Failing(Growing):
         fault = (x[0] > 2.0).astype(jnp.int32)
         sound = super()._state(jnp.where(fault == 0, x, 0.0), steps)
         return sound.replace(info={"fault": fault})
+
+
+def test_small_types_are_diagnosed_in_double_precision() -> None:
+    plans = 0.1 * jax.random.normal(jax.random.key(0), (2, 20, 1), jnp.bfloat16)
+    with jax.enable_x64(True):
+        found = checked_genotypes(plans, Growing(0.5), lambda w, _: w, 16)  # pyright: ignore[reportArgumentType]
+    assert isinstance(found, jax.Array) and found.dtype == np.float64
 
 
 def test_faults_are_no_agreement() -> None:

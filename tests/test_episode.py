@@ -93,7 +93,7 @@ def test_weights_of_a_wrong_shape(shape: Any, text: str, hopper: Any) -> None:
 def test_weights_are_an_array(line: Any) -> None:
     episode, plans = line
     nested: Any = [[[1.0, 0.0]]] * len(plans)
-    with pytest.raises(TypeError, match=r"weights: got \[\[.*; allowed: an array of"):
+    with pytest.raises(TypeError, match="weights: got a list; allowed: an array of"):
         episode.directional(plans, nested, KEY)
 
 

@@ -351,6 +351,17 @@ def test_what_no_episode_can_be_made_of() -> None:
     run = make_episode(bare, None, get_final_xy_position, episode_length=4)
     with pytest.raises(ValueError, match="no state descriptor; allowed: QD tasks"):
         run(jnp.zeros((4, 3)), key)
+    with pytest.raises(ValueError, match=r"^start: got .*; allowed: one key"):
+        run(jnp.zeros((4, 3)), jax.random.split(key, 3))
+    reset = jax.eval_shape(bare.reset, key)
+    with jax.enable_x64(True):
+        wide = jax.tree.map(lambda x: jnp.zeros(x.shape, float), reset)
+        with pytest.raises(
+            ValueError, match="start: got a state of float64; allowed: f"
+        ):
+            run(jnp.zeros((4, 3)), wide)
+    with pytest.raises(ValueError, match=r"genotype: got shape \(4, 3\), \(4, 3\)"):
+        make_episode(bare, None, None, episode_length=4)((jnp.zeros((4, 3)),) * 2, key)
     for arguments in ((None,), ("hopper_uni",), (bare, "wide"), (bare, 0.1, "no")):
         with pytest.raises(TypeError, match="allowed"):
             with_smooth_descriptor(*arguments)  # pyright: ignore[reportArgumentType]

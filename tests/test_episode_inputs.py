@@ -13,10 +13,12 @@ from contract import same
 from physics_helpers import report
 from test_episode_gradients import Line, make
 
+import newton_qd
 from newton_qd import physics
 from newton_qd.envs.state import State
 from newton_qd.extractors import get_feet_contact_proportion
 from newton_qd.gradients import (
+    Episode,
     GradientOptions,
     make_episode,
     make_episode_gradient,
@@ -128,3 +130,21 @@ def test_no_descriptor() -> None:
     result = jax.jit(gradient)(jnp.zeros((2, 4, 1), jnp.float32), KEY)
     assert result.descriptors.shape == (2, 0)
     np.testing.assert_array_equal(result.gradients[:, 0, :, 0], [[4, 3, 2, 1]] * 2)
+
+
+def test_parameters_are_checked_before_anything_is_compiled() -> None:
+    """In a batch and in an episode, their values are not known any more."""
+    env = newton_qd.create("hopper", auto_reset=False)
+    wrong = env.default_params.replace(friction=-jnp.ones(()))
+    episode, plan = Episode(env, episode_length=3), jnp.zeros((3, 3))
+    batch = newton_qd.create("hopper", batch_size=2, auto_reset=False)
+    shapes = jax.eval_shape(batch.reset, KEY)
+    state = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    many = jax.tree.map(lambda x: jnp.stack([x, x]), wrong)
+    for run in (
+        lambda: episode(plan, KEY, wrong),
+        lambda: episode.gradient(plan[None], KEY, wrong),
+        lambda: batch.step(state, jnp.zeros((2, 3)), many),
+    ):
+        with pytest.raises(ValueError, match=r"^params\.friction: got -1\.0; allowed"):
+            run()

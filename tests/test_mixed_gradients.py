@@ -14,7 +14,7 @@ import pytest
 
 from newton_qd.envs.state import State
 from newton_qd.extractors import get_final_xy_position
-from newton_qd.gradients import MixedGradients, make_mixed_gradient
+from newton_qd.gradients import Episode, MixedGradients, make_mixed_gradient
 
 
 class Landscape:
@@ -78,6 +78,23 @@ def test_zeroth_order_where_the_first_is_noise() -> None:
     np.testing.assert_allclose(result.gradients[0, 0, 0], [1, 0, 0], atol=0.15)
     ratio = result.zeroth_variance / (result.first_variance + result.zeroth_variance)
     np.testing.assert_allclose(result.order[0, 0], ratio[0, 0], 1e-5)
+
+
+def test_gradients_have_the_form_of_genotypes() -> None:
+    """Also of a leaf without numbers, in a small type, and with strict promotion."""
+    env: Any = Landscape(lambda action: action.sum().astype(jnp.float32))
+    episode = Episode(env, lambda w, seen: w["w"] + seen, episode_length=1)
+    genotypes = {"w": jnp.zeros((2, 3), jnp.bfloat16), "none": jnp.zeros((2, 0))}
+    key = jax.random.key(0)
+    found = episode.mixed(genotypes, key, samples=2).gradients
+    for name, leaf in genotypes.items():
+        assert found[name].dtype == leaf.dtype
+        assert found[name].shape == (2, 1, *leaf.shape[1:])
+    with jax.numpy_dtype_promotion("strict"):
+        strict = Episode(env, None, episode_length=1)
+        assert strict.mixed(jnp.zeros((2, 1, 3)), key, samples=2).gradients.all()
+    with pytest.raises(TypeError, match="genotypes: got an array of int32; allowed"):
+        episode.mixed({"w": jnp.zeros((2, 3), int)}, key)
 
 
 def test_tolerance_finds_a_jump() -> None:

@@ -16,9 +16,11 @@ from point_runs import PointEnv
 import newton_qd
 from newton_qd.envs.base import Env, PhysicsEnv
 from newton_qd.envs.limits import within
+from newton_qd.envs.state import State
 from newton_qd.gradients import (
     Episode,
     GradientOptions,
+    diagnose_gradients,
     with_smooth_termination,
 )
 from newton_qd.qd.emitters.actor_critic_learner import ActorCritic
@@ -274,6 +276,56 @@ def test_a_plan_sees_that_its_end_is_near() -> None:
     scale = np.abs(once.gradients).max()
     np.testing.assert_allclose(once.gradients, steps.gradients, atol=1e-4 * scale)
     assert np.abs(once.gradients - blind.gradients).max() > 0.1 * scale
+
+
+class Ending:
+    """A point that pays 1 a step; ``done`` is 0, with a slope of 0.1 in its place."""
+
+    observation_size = action_size = 1
+    dtype, dt, name = np.dtype("float64"), 0.1, "ending"
+
+    def reset(self, rng: jax.Array) -> State:
+        del rng
+        return self._state(jnp.zeros((1,)))
+
+    def step(self, state: State, action: jax.Array) -> State:
+        return self._state(state.pipeline_state + action)
+
+    def _state(self, x: jax.Array) -> State:
+        slope = 0.1 * x[0]
+        done = slope - jax.lax.stop_gradient(slope)
+        return State(x, x, jnp.ones_like(done), done, {}, {})
+
+
+PAID = np.array([-0.6, -0.3, -0.1, 0.0])  # each step costs 0.1 of all rewards after it
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (GradientOptions(), PAID),
+        (GradientOptions(window=1), np.zeros(4)),
+        (GradientOptions(window=2), np.array([-0.1, 0.0, -0.1, 0.0])),
+        (GradientOptions(discount=0.0), np.zeros(4)),
+    ],
+)
+def test_a_window_cuts_the_slope_of_an_end(
+    options: GradientOptions, expected: np.ndarray
+) -> None:
+    """A reward after a window has no slope in it, also by way of ``done``."""
+    with jax.enable_x64(True):
+        episode = Episode(Ending(), episode_length=4, options=options)
+        plan, key = jnp.zeros((1, 4, 1)), jax.random.key(0)
+        found = episode.gradient(plan, key).gradients[0, 0, :, 0]
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+def test_the_doctor_sees_the_slope_of_an_end() -> None:
+    """The gradient that it diagnoses is that of an episode."""
+    with jax.enable_x64(True):
+        plans = np.zeros((2, 4, 1))
+        report = diagnose_gradients(Ending(), genotypes=plans, horizons=(4,))  # pyright: ignore[reportArgumentType]
+    assert report.horizons[0].largest_norm == pytest.approx(np.linalg.norm(PAID))
 
 
 def test_another_environment_stays_as_it_is() -> None:

@@ -26,8 +26,7 @@ from newton_qd.checks import Fact, message
 from newton_qd.envs.base import Env
 from newton_qd.envs.state import State
 from newton_qd.errors import MissingExtra
-from newton_qd.physics.parameters import FIELDS, PhysicsParams, check_bounds
-from newton_qd.real_numbers import real_numbers
+from newton_qd.physics.parameters import check_values
 from newton_qd.types import Params, PyTree
 
 try:
@@ -139,7 +138,7 @@ class _Door:
             wrong = Fact(f"a tensor on {action.device}")
             raise ValueError(message("action", wrong, f"one on {state.obs.device}"))
         given = jax.tree.map(to_jax, params)
-        self._check(given)
+        check_values(given)
         _check_forward((state.parts, action, params))
         tracked = action.requires_grad or state.tracked
         tracked = tracked or (params is not None and is_tracked(params))
@@ -154,18 +153,6 @@ class _Door:
         results = Step.apply(self, inputs, found, *leaves)
         structure = jax.tree.structure(parts_of(found[0]))
         return TorchState(found[0], jax.tree.unflatten(structure, results))
-
-    def _check(self, params: Params) -> None:
-        """Checks the values of physical parameters, which are traced in the step.
-
-        Raises:
-            ValueError: A value is out of bounds.
-        """
-        if isinstance(params, PhysicsParams):
-            for name in FIELDS:
-                values = real_numbers(getattr(params, name))
-                if values is not None:  # the step refuses what is no number
-                    check_bounds(name, values)
 
 
 def _action(action: torch.Tensor, *, numpy: bool = False) -> Any:

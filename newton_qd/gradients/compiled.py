@@ -13,6 +13,7 @@ import numpy as np
 from jax.core import Tracer
 
 from newton_qd.physics.explicit_mesh import mesh_of
+from newton_qd.physics.parameters import check_values
 
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
@@ -42,6 +43,8 @@ def compiled_once(
                 return method(*given, **named)
         if not _arrays_only(arguments):
             return method(*given, **named)
+        for argument in arguments:  # inside, the values are not known
+            check_values(argument)
         kept = this.__dict__.setdefault(_KEPT, {})
         key = (method.__name__, repr(sorted(options.items())))
         if key not in kept:

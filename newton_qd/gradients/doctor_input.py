@@ -70,7 +70,10 @@ def checked_genotypes(
     dtype = env.dtype
     arrays = jax.tree.map(np.asarray, genotypes)
     genotypes = jax.tree.map(
-        lambda x: jnp.asarray(x, dtype if x.dtype.kind == "f" else None), arrays
+        lambda x: jnp.asarray(
+            x, dtype if jnp.issubdtype(x.dtype, jnp.floating) else None
+        ),
+        arrays,
     )
     shapes = [np.shape(x) for x in jax.tree.leaves(genotypes)]
     given = Fact(f"leaves of shapes {shapes}")

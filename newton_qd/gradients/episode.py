@@ -159,15 +159,18 @@ class Episode:
 
         Raises:
             TypeError: ``start`` is neither a key nor a state.
-            ValueError: ``start`` is a state of several worlds, it has no state
-                descriptor but a descriptor is extracted, or there is no policy and the
-                genotype is not a plan of actions.
+            ValueError: ``start`` is several keys or a state of several worlds or of
+                another precision, it has no state descriptor but a descriptor is
+                extracted, or there is no policy and the genotype is not a plan of
+                actions.
         """
         parameters = self.unravel(genotype)
         is_key = isinstance(start, (jax.Array, np.ndarray))
+        if is_key and isinstance(self.env, Env):
+            require_key("start", start)
         first: Any = self.env.reset(start) if is_key else start
         described = self.descriptor_extractor is not None or self.transitions
-        check_first(first, described)
+        check_first(self.env, first, described)
         kept = self.options.exact and self.options.checkpoint_every in (None, 1)
         if self.policy is None and kept and not self.transitions:
             if isinstance(self.env, Env):
@@ -226,8 +229,9 @@ class Episode:
     ) -> EpisodeGradients:
         """Runs N episodes, with the gradients of weighted sums of their results.
 
-        The result is that of :meth:`gradient` multiplied by weights. It costs only as
-        many rows as there are sums: one launch of the physics' adjoint has N R worlds.
+        The result is that of :meth:`gradient` multiplied by weights. (With ``clip`` it
+        is not: then the adjoint of a weighted sum is clipped.) It costs only as many
+        rows as there are sums: one launch of the physics' adjoint has N R worlds.
 
         Args:
             genotypes: Leaves (N, ...).
@@ -350,11 +354,13 @@ class Episode:
             ValueError: The parameters are not a plan of actions.
         """
         shape = (self.episode_length, self.env.action_size)
-        if np.size(parameters) != math.prod(shape):
-            given = Fact(f"shape {np.shape(parameters)}")
+        found = jax.tree.leaves(parameters)
+        if len(found) != 1 or np.size(found[0]) != math.prod(shape):
+            shapes = [str(np.shape(leaf)) for leaf in found]
+            given = Fact(f"shape {checks.listed(shapes, 'none')}")
             allowed = f"actions of shape {shape} for each world"
             raise ValueError(message("genotype", given, allowed))
-        return jnp.asarray(parameters).reshape(shape)
+        return jnp.asarray(found[0]).reshape(shape)
 
     def _advance(
         self,
@@ -369,6 +375,8 @@ class Episode:
         state = begin
         if "factor" in row:
             state = passed_back(state, row["factor"], self.options.clip)
+            going = passed_back(tally.going, row["factor"], None)  # slope of done
+            tally = dataclasses.replace(tally, going=going)
         if self.policy is None:
             action = row["action"]
         else:

@@ -8,21 +8,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from newton_qd import checks
 from newton_qd.checks import Fact, message
+from newton_qd.envs.base import Env
 from newton_qd.types import Genotype
 
 
-def check_first(first: Any, described: bool) -> None:
+def check_first(env: Any, first: Any, described: bool) -> None:
     """Checks the first state of an episode.
 
     Args:
+        env: The environment.
         first: The state.
         described: Whether the episode reads its state descriptor.
 
     Raises:
         TypeError: It is not a state.
-        ValueError: It is a state of several worlds, or lacks the state descriptor.
+        ValueError: It is a state of several worlds or of another precision, or lacks
+            the state descriptor.
     """
     if not hasattr(first, "reward"):
         allowed = "a key of jax.random, or a state of the environment"
@@ -31,6 +33,9 @@ def check_first(first: Any, described: bool) -> None:
         given = Fact(f"a state of a batch of shape {jnp.shape(first.reward)}")
         allowed = "of one world, under jax.vmap for more"
         raise ValueError(message("start", given, allowed))
+    if isinstance(env, Env) and jnp.result_type(first.reward) != env.dtype:
+        given = Fact(f"a state of {jnp.result_type(first.reward)}")
+        raise ValueError(message("start", given, f"{env.dtype}, as the environment"))
     if described and "state_descriptor" not in first.info:
         given = Fact("states with no state descriptor")
         allowed = (
@@ -51,7 +56,9 @@ def check_weights(genotypes: Genotype, weights: Any) -> None:
         ValueError: They have another shape.
     """
     allowed = "an array of shape (N, R, 1 + D)"
-    checks.instance("weights", weights, (jax.Array, np.ndarray), allowed)
+    if not isinstance(weights, jax.Array | np.ndarray):
+        given = Fact(f"a {type(weights).__name__}")
+        raise TypeError(message("weights", given, allowed))
     shape, number = jnp.shape(weights), len(jax.tree.leaves(genotypes)[0])
     if len(shape) != 3 or shape[0] != number or not shape[1]:
         allowed = f"shape ({number}, R, 1 + D), R from 1"

@@ -75,10 +75,7 @@ def differentiate(
         TypeError: A genotype is not of floating point, so it has no gradient.
         ValueError: The weights have another number of columns.
     """
-    for leaf in jax.tree.leaves(genotype):
-        if not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
-            given = Fact(f"an array of {jnp.result_type(leaf)}")
-            raise TypeError(message("genotypes", given, "arrays of floating point"))
+    require_floating(genotype)
 
     def values(genotype: Genotype) -> tuple[jax.Array, Outcome]:
         outcome = run(genotype)
@@ -103,6 +100,18 @@ def differentiate(
         faulty=outcome.faulty,
         overflowed=~sound & ~outcome.faulty,
     )
+
+
+def require_floating(genotypes: Genotype) -> None:
+    """Checks that genotypes have a gradient.
+
+    Raises:
+        TypeError: A leaf is not of floating point.
+    """
+    for leaf in jax.tree.leaves(genotypes):
+        if not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
+            given = Fact(f"an array of {jnp.result_type(leaf)}")
+            raise TypeError(message("genotypes", given, "arrays of floating point"))
 
 
 def finite_rows(tree: PyTree) -> jax.Array:

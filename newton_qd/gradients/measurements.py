@@ -14,7 +14,7 @@ from newton_qd.envs.base import Env
 from newton_qd.gradients.exact import finite_rows
 from newton_qd.gradients.flow import tree_norm
 from newton_qd.gradients.mixed import Mixture, mixture
-from newton_qd.gradients.outcome import at_fault
+from newton_qd.gradients.outcome import Tally, at_fault
 from newton_qd.physics.system import PhysicsState
 from newton_qd.types import Genotype, Policy, PyTree, RNGKey
 
@@ -41,20 +41,21 @@ class Subject:
         """Returns rewards (steps,), 0 after the end; alive, contacts and faults."""
 
         def advance(carry: PyTree, action: jax.Array | None) -> tuple[PyTree, PyTree]:
-            state, over = carry
+            state, tally = carry
             if action is None:
                 assert self.policy is not None
                 action = self.policy(genotype, state.obs)
             state = self.env.step(state, action)
-            reward = jnp.where(over, 0, state.reward)
+            over, reward = tally.over, tally.gained(state.reward)
             physics = state.pipeline_state
             touching = jnp.zeros((0,), bool)
             if isinstance(physics, PhysicsState):
                 touching = physics.normal_impulse > 0
             seen = (reward, ~over, touching & ~over, at_fault(state) & ~over)
-            return (state, over | (state.done > 0)), seen
+            return (state, tally.add(state.reward, state.done)), seen
 
-        start = (self.env.reset(self.key), jnp.zeros((), bool))
+        first = self.env.reset(self.key)
+        start = (first, Tally.zero(first.reward.dtype))
         plan = genotype if self.policy is None else None
         body = jax.checkpoint(advance, prevent_cse=False)
         _, (rewards, *seen) = jax.lax.scan(body, start, plan, length=self.steps)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from newton_qd import checks
 from newton_qd.envs.state import select
-from newton_qd.gradients.exact import EpisodeGradients, finite_rows
+from newton_qd.gradients.exact import EpisodeGradients, finite_rows, require_floating
 from newton_qd.gradients.outcome import Outcome
 from newton_qd.moved import moved_name
 from newton_qd.physics.explicit_mesh import rows_split_as
@@ -86,7 +86,11 @@ def mixed_gradients(
         samples: Pairs of samples of a genotype.
         sigma: Standard deviation of the noise, in the units of the genotype.
         tolerance: Allowed error if the two orders disagree.
+
+    Raises:
+        TypeError: A genotype is not of floating point.
     """
+    require_floating(genotypes)
     noise = _noise(noise_key, genotypes, samples, sigma)
     noise = rows_split_as(jax.tree.leaves(genotypes)[0], noise)
     found = _pairs(gradient, genotypes, noise)
@@ -106,7 +110,8 @@ def _pairs(
 
     around = jax.tree.map(moved, genotypes, noise)
     shape = jax.tree.leaves(around)[0].shape[:3]
-    found = gradient(jax.tree.map(lambda x: x.reshape(-1, *x.shape[3:]), around))
+    rows = math.prod(shape)  # not -1: a leaf may have no elements
+    found = gradient(jax.tree.map(lambda x: x.reshape(rows, *x.shape[3:]), around))
     return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), found)
 
 
@@ -144,11 +149,14 @@ def _combined(
         values, found.gradients, noise, sound, lost, sigma=sigma, tolerance=tolerance
     )
     few = (sound.sum() < 2) | (lost & jnp.isinf(mixed.zeroth_variance))
-    zeros = jax.tree.map(jnp.zeros_like, mixed.gradients)
+    gradients = jax.tree.map(
+        lambda x, like: x.astype(like.dtype), mixed.gradients, found.gradients
+    )
+    zeros = jax.tree.map(jnp.zeros_like, gradients)
     return MixedGradients(
         fitnesses=centre.fitness,
         descriptors=centre.descriptor,
-        gradients=select(~few & ~centre.faulty, mixed.gradients, zeros),
+        gradients=select(~few & ~centre.faulty, gradients, zeros),
         faulty=centre.faulty,
         overflowed=few & ~centre.faulty,
         order=mixed.order,
@@ -206,7 +214,7 @@ def mixture(
     first_mean, first_variance = spread(first)
     zeroth_mean, zeroth_variance = spread(zeroth)
     apart, apart_variance = spread(jax.tree.map(jnp.subtract, first, zeroth))
-    pairs = jnp.maximum(sound.sum(), 1)
+    pairs = jnp.maximum(sound.sum(), 1).astype(values.dtype)
     # the part of the distance of the means that the variance of the samples explains
     distance = _squared(apart)
     explained = jnp.where(lost, 0, apart_variance / pairs)
@@ -294,7 +302,8 @@ def _mean_and_variance(samples: PyTree, sound: jax.Array) -> tuple[PyTree, jax.A
     scatter = jax.tree.map(lambda x, m: mean(jnp.square(x - m)), samples, means)
     parts = [x.reshape(x.shape[0], -1).sum(axis=1) for x in jax.tree.leaves(scatter)]
     total = functools.reduce(jnp.add, parts)
-    return means, total * count / jnp.maximum(count - 1, 1)
+    own = count.astype(total.dtype)
+    return means, total * own / jnp.maximum(own - 1, 1)
 
 
 def _squared(rows: PyTree) -> jax.Array:

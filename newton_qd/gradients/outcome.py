@@ -56,12 +56,19 @@ class Tally:
             done: () above 0 if the step ends the episode, else 0.
         """
         over, dtype = self.over, self.going.dtype
-        # after the end, both may be NaN
-        gained = self.going * jnp.where(over, 0, reward)
+        # after the end, reward and done may be NaN
         slope = jnp.where(over, 0, done).astype(dtype)
         # 0 or 1, with the gradient of done
         ends = (slope > 0).astype(dtype) + (slope - jax.lax.stop_gradient(slope))
-        return Tally(self.fitness + gained, self.going * (1 - ends))
+        return Tally(self.fitness + self.gained(reward), self.going * (1 - ends))
+
+    def gained(self, reward: jax.Array) -> jax.Array:
+        """Returns what the fitness gains by the reward of one more step; 0 at the end.
+
+        Args:
+            reward: () reward of the step, or (N,) several of them.
+        """
+        return self.going * jnp.where(self.over, 0, reward)
 
 
 @jax.tree_util.register_dataclass

@@ -14,6 +14,7 @@ from newton_qd import checks
 from newton_qd.checks import message
 from newton_qd.physics import layout
 from newton_qd.physics.system import System, takes_system
+from newton_qd.real_numbers import real_numbers
 
 
 @jax.tree_util.register_dataclass
@@ -101,6 +102,22 @@ def check_bounds(name: str, values: np.ndarray) -> None:
         allowed = f"finite numbers {'above' if positive else 'from'} 0"
         wrong = np.extract(~valid, values)[0].item()
         raise ValueError(message(f"params.{name}", wrong, allowed))
+
+
+def check_values(params: object) -> None:
+    """Checks the values of parameters that are not traced.
+
+    Args:
+        params: Parameters of one world or of several; the step refuses other objects.
+
+    Raises:
+        ValueError: A value is out of bounds.
+    """
+    if isinstance(params, PhysicsParams):
+        for name in FIELDS:
+            values = real_numbers(getattr(params, name))
+            if values is not None:  # the step refuses what is no number
+                check_bounds(name, values)
 
 
 def _checked(

@@ -13,6 +13,7 @@ from newton_qd.checks import Fact, message
 from newton_qd.envs.base import Env
 from newton_qd.envs.inputs import require_key, require_state
 from newton_qd.envs.state import State
+from newton_qd.physics.parameters import check_values
 from newton_qd.types import Action, Params, RNGKey
 from newton_qd.wrappers.base import Wrapper, outermost
 
@@ -134,11 +135,12 @@ def _batch(state: State) -> tuple[int]:
 
 
 def _require_batch(params: Params, batch: tuple[int]) -> None:
-    """Checks that parameters have the batch axis in front.
+    """Checks that parameters have the batch axis in front, and values in bounds.
 
     Raises:
         ValueError: One has not.
     """
+    check_values(params)
     for leaf in jax.tree.leaves(params):
         if jnp.shape(leaf)[:1] != batch:
             allowed = (

@@ -274,7 +274,8 @@ class ExactAsciiEmitter(Emitter):
 
         Returns:
             (parents * branches, size) offspring, and whether a derivative
-            ``overflowed``, (parents,). Such a parent does not move.
+            ``overflowed`` or was lost to a fault, (parents,). Such a parent does not
+            move, and neither does one whose derivative is 0.
         """
         del emitter_state
         cell_key, rate_key, step_key, score_key = jax.random.split(key, 4)
@@ -303,10 +304,12 @@ class ExactAsciiEmitter(Emitter):
         keys = jax.random.split(step_key, shape)
         branch = jax.vmap(vary, (None, None, 0, 0))
         offspring = jax.vmap(branch)(weights, better, rates, keys)
-        overflowed = jnp.any(found.overflowed, axis=1)
+        lost = jnp.any(found.overflowed, axis=1) | found.faulty
+        flat = ~jnp.any(found.gradients[:, 0] != 0, axis=(1, 2))
         # without slopes, Adam would make full steps of rounding errors
-        offspring = jnp.where(overflowed[:, None, None], weights[:, None], offspring)
-        return offspring.reshape(-1, weights.shape[1]), {"overflowed": overflowed}
+        still = (lost | flat)[:, None, None]
+        offspring = jnp.where(still, weights[:, None], offspring)
+        return offspring.reshape(-1, weights.shape[1]), {"overflowed": lost}
 
 
 def improved(own: Behavior, slopes: jax.Array, reach: float) -> jax.Array:

@@ -58,10 +58,14 @@ class GradientLineEmitter(Emitter):
             steered: Share of the parents that move towards empty cells [-].
 
         Raises:
+            TypeError: ``gradient`` is not a function, or a number is none.
             ValueError: A number is out of its range.
         """
+        checks.function("gradient", gradient, "such as Episode.directional")
         for name, value in (("parents", parents), ("branches", branches)):
             checks.integer(name, value, most=None)
+        for name, value in (("shortest", shortest), ("longest", longest)):
+            checks.number(name, value, above=0)
         if not 0 < shortest <= longest < math.inf:
             given = (shortest, longest)
             allowed = "0 < shortest <= longest, finite"

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from newton_qd import checks
+from newton_qd.checks import message
 from newton_qd.qd.emitters.actor_critic_learner import ActorCritic, Learner
 from newton_qd.qd.emitters.arborescence_state import ArborescenceState
 from newton_qd.qd.emitters.cma_maega import CMAMAEGAEmitter
@@ -70,8 +71,13 @@ class WindowArborescenceEmitter(CMAMAEGAEmitter):
             **options: Those of ``CMAMAEGAEmitter``, without ``optimizer``.
 
         Raises:
+            TypeError: ``method`` is no actor-critic, or ``optimizer`` is given.
             ValueError: A number is out of its range.
         """
+        if "optimizer" in options:
+            allowed = "no optimizer: an actor moves a point"
+            raise TypeError(message("optimizer", options["optimizer"], allowed))
+        checks.instance("method", method, ActorCritic, "an ActorCritic")
         super().__init__(scoring_function, **options)
         checks.integer("probes", probes, most=None)
         checks.integer("walks", walks, most=None)

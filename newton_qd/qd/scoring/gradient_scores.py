@@ -18,6 +18,7 @@ from collections.abc import Mapping
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from newton_qd.checks import Fact, listed, message
 from newton_qd.types import Genotype, PyTree
@@ -111,6 +112,8 @@ def check_genotypes(genotypes: Genotype) -> jax.Array:
     Raises:
         GradientsError: They are not one array.
     """
+    if isinstance(genotypes, np.ndarray):
+        genotypes = jnp.asarray(genotypes)
     if not isinstance(genotypes, jax.Array) or genotypes.ndim != 2:
         shapes = jax.tree.map(jnp.shape, genotypes)
         allowed = (
