@@ -95,6 +95,8 @@ def test_the_numbers_are_those_of_env_step(torch: Any, door: Any, maze: Any) -> 
         assert not plain.obs.requires_grad and graph.obs.requires_grad
     with torch.no_grad():
         assert not step(graph, actions).obs.requires_grad
+    step(plain, actions)
+    assert not {"reward", "pipeline_state", "info"} & set(vars(plain)), "not read"
 
 
 @pytest.mark.slow

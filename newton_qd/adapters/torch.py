@@ -139,7 +139,8 @@ class _Door:
             raise ValueError(message("action", wrong, f"one on {state.obs.device}"))
         given = jax.tree.map(to_jax, params)
         check_values(given)
-        _check_forward((state.parts, action, params))
+        if forward_ad._current_level >= 0:  # then the tensors of the state are made
+            _check_forward((state.parts, action, params))
         tracked = action.requires_grad or state.tracked
         tracked = tracked or (params is not None and is_tracked(params))
         if not tracked or not torch.is_grad_enabled():
@@ -185,8 +186,6 @@ def _check_forward(tree: PyTree) -> None:
     Raises:
         RuntimeError: A tensor has a tangent.
     """
-    if forward_ad._current_level < 0:
-        return
     for leaf in jax.tree.leaves(tree):
         if isinstance(leaf, torch.Tensor):
             if forward_ad.unpack_dual(leaf).tangent is not None:
