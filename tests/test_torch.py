@@ -95,6 +95,7 @@ def test_the_numbers_are_those_of_env_step(torch: Any, door: Any, maze: Any) -> 
         assert not plain.obs.requires_grad and graph.obs.requires_grad
     with torch.no_grad():
         assert not step(graph, actions).obs.requires_grad
+    plain = step(reset(0), actions)
     step(plain, actions)
     assert not {"reward", "pipeline_state", "info"} & set(vars(plain)), "not read"
 
@@ -214,7 +215,8 @@ def test_a_state_is_frozen_but_for_its_dictionaries(
     with pytest.raises(dataclasses.FrozenInstanceError, match=r"state\.replace\(obs="):
         state.obs = state.obs + 1
     state.info["steps"] = torch.ones_like(state.info["steps"])
-    for copied in (state, copy.copy(state), copy.deepcopy(state)):
+    cut = door.detached(state)
+    for copied in (state, cut, copy.copy(state), copy.deepcopy(state)):
         assert (step(copied, actions).info["steps"] == 2).all()
     with pytest.raises(TypeError, match=r"^state\.obs: got .*; allowed: tensors of"):
         step(state.replace(obs=state.obs.cpu().numpy()), actions)

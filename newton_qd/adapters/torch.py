@@ -82,12 +82,11 @@ def detached(state: TorchState) -> TorchState:
 
     Args:
         state: A state.
+
+    Raises:
+        TypeError: A leaf of it is no tensor of PyTorch.
     """
-    if state.arrays is not None:
-        return TorchState(state.arrays, {})
-    return jax.tree.map(
-        lambda leaf: leaf.detach() if isinstance(leaf, torch.Tensor) else leaf, state
-    )
+    return TorchState(State(**state.as_arrays()), {})
 
 
 class _Door:
