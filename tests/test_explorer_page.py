@@ -236,5 +236,7 @@ def test_wrong_runs_are_named(capsys: pytest.CaptureFixture[str]) -> None:
         assert cli.main([command, "ant", "--out", "config.json"]) == 2
         refused = "--out: got 'config.json'; allowed: files that end with .html"
         assert refused in capsys.readouterr().err
+        assert cli.main([command, "no_run", "--out", "A.HTML"]) != 0
+        assert "--out: got" not in capsys.readouterr().err
     assert cli.main(["explore", "a", "b", "c"]) == 2
     assert "DIR: got 3 folders; allowed: one folder or two" in capsys.readouterr().err

@@ -116,6 +116,8 @@ def test_wrong_arguments_are_named(ant: Any, walk: Trajectory) -> None:
         Recorder(ant, 3, 5)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"steps: got 1.5; allowed: integers from 1"):
         Recorder(ant, lambda _, obs: obs[:8], 1.5)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="q: got coordinates that are not finite; all"):
+        dataclasses.replace(walk, q=np.full_like(walk.q, np.nan))
     with pytest.raises(TypeError, match="trajectory: got 3; allowed: a Trajectory"):
         render(3, "a.png")  # type: ignore[arg-type]
     for runs in ("a", ["a"], walk):

@@ -294,7 +294,7 @@ def _check_page(out: Path) -> None:
     Raises:
         ConfigError: The file does not end as a page does.
     """
-    if out.suffix not in (".html", ".htm"):
+    if out.suffix.lower() not in (".html", ".htm"):
         raise ConfigError(message("--out", str(out), "files that end with .html"))
 
 

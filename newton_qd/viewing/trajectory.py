@@ -51,7 +51,8 @@ class Trajectory:
         contacts: Contact impulses, ``None`` if they were not recorded.
 
     Raises:
-        ValueError: The shapes of two arrays do not fit together.
+        ValueError: The shapes of two arrays do not fit together, or a coordinate is not
+            finite.
     """
 
     drawing: Drawing
@@ -79,6 +80,9 @@ class Trajectory:
             given = np.shape(getattr(self, name))
             if given != shape:
                 raise ValueError(message(name, Fact(f"shape {given}"), f"{shape}"))
+        if not np.isfinite(self.q).all():
+            given = Fact("coordinates that are not finite")
+            raise ValueError(message("q", given, "finite numbers"))
 
     @property
     def worlds(self) -> int:
