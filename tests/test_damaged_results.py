@@ -15,6 +15,7 @@ from newton_qd.qd.config import ConfigError
 from newton_qd.qd.run.archive import ArchiveError
 from newton_qd.qd.run.checkpoint import CheckpointError
 from newton_qd.qd.run.opened import Run
+from newton_qd.qd.run.results import read_archive
 
 __all__ = ["compile_once", "reference"]  # fixtures
 
@@ -60,10 +61,15 @@ def test_files_of_another_run_are_refused(reference: Path, tmp_path: Path) -> No
         opened(out)
     (out / "config.json").write_text(text)
     metrics = (reference / "metrics.csv").read_text()
-    for wrong in ("iteration,colour\n0,red\n", metrics[:-3], ""):
+    for wrong in ("iteration,colour\n0,red\n", ""):
         (out / "metrics.csv").write_text(wrong)
         with pytest.raises(ConfigError, match="numbers with the columns iteration, e"):
             opened(out)
+    (out / "metrics.csv").write_text(metrics[:-3])
+    with pytest.raises(ConfigError, match=r"last line without an end, .*: whole lines"):
+        opened(out)
+    genotypes = opened(reference).archive.genotypes
+    assert np.array_equal(read_archive(out).genotypes, genotypes), "a warm start"
     (out / "metrics.csv").write_text(metrics)
     whole = '{"reevaluations": 1, "qd_score": "a", "coverage": 1, "max_fitness": 1}'
     for text in ("[1]", "{", whole):

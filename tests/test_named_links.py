@@ -38,6 +38,15 @@ def test_a_torso_has_the_frame_of_its_body(tmp_path: Path) -> None:
     """The position of the robot is that of its frame."""
     text = skid("0 0 0", "1 2 0.5")
     assert built(tmp_path, text, "low").torso == 0
+    half = '<origin rpy="0 0 3.14159"/>'  # twice: the quaternion (0, 0, 0, -1)
+    turned = robot_text(
+        *(link(name) for name in "abc"),
+        joint("one", "fixed", "a", "b", half),
+        joint("two", "fixed", "b", "c", half),
+    )
+    assert built(tmp_path, turned, "c").torso == 0
+    with pytest.raises(RobotDescriptionError, match="'b', which is fixed to 'a'"):
+        built(tmp_path, turned, "b")
     allowed = r"fixed to 'body', at another place or turned; allowed: body, low$"
     with pytest.raises(RobotDescriptionError, match=allowed):
         built(tmp_path, text, "high")

@@ -218,6 +218,10 @@ def test_a_state_is_frozen_but_for_its_dictionaries(
     cut = door.detached(state)
     for copied in (state, cut, copy.copy(state), copy.deepcopy(state)):
         assert (step(copied, actions).info["steps"] == 2).all()
+    renamed = reset(0)
+    renamed.info["fault_"] = renamed.info.pop("fault")  # in the same place
+    with pytest.raises(ValueError, match="info without 'fault'"):
+        step(renamed, actions)
     with pytest.raises(TypeError, match=r"^state\.obs: got .*; allowed: tensors of"):
         step(state.replace(obs=state.obs.cpu().numpy()), actions)
 
@@ -236,6 +240,14 @@ def test_what_pytorch_cannot_do_here_is_an_error(
     for transform in given:
         with pytest.raises(TypeError, match=r"^action: got .*outside of torch\.func$"):
             transform(lambda action: step(reset(0), action).reward.sum())(actions)
+    state, actions = reset(0), actions.detach()
+    for transform in given:
+        with pytest.raises(
+            TypeError, match=r"^state\.obs: got .*outside of torch\.func$"
+        ):
+            transform(lambda o: step(state.replace(obs=o), actions).obs.sum())(
+                state.obs
+            )
     for wrong in (actions.bfloat16(), actions.detach().to_sparse()):
         with pytest.raises(TypeError, match=r"^action: got .*; allowed: an? "):
             step(reset(0), wrong)

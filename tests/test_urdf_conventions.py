@@ -356,7 +356,8 @@ def test_a_template_is_refused(tmp_path: Path) -> None:
 
 def test_prefixed_elements_are_left_out(tmp_path: Path) -> None:
     """Extensions of simulators do not need their namespace."""
-    extension = "<x:sensor y:on='1'/><gazebo><x:plugin/></gazebo>"
+    twice = "<link><collision><origin/><origin/></collision></link>"
+    extension = f"<x:sensor y:on='1'/><gazebo><x:plugin/>{twice}</gazebo>"
     text = robot_text(link("a", extension), extension)
     assert built(tmp_path, text, "a").nb == 1
     own = text.replace("<robot ", "<robot xmlns='http://www.ros.org' ")

@@ -136,47 +136,23 @@ class _Door:
         if action.device != state.obs.device:
             wrong = Fact(f"a tensor on {action.device}")
             raise ValueError(message("action", wrong, f"one on {state.obs.device}"))
-        given = jax.tree.map(to_jax, params)
+        given = jax.tree.map(lambda x: to_jax(x, "params"), params)
         check_values(given)
         if forward_ad._current_level >= 0:  # then the tensors of the state are made
             _check_forward((state.parts, action, params))
         tracked = action.requires_grad or state.tracked
         tracked = tracked or (params is not None and is_tracked(params))
         if not tracked or not torch.is_grad_enabled():
-            array = _action(action, numpy=action.device.type == "cpu")
+            array = to_jax(action, "action", numpy=action.device.type == "cpu")
             after = TorchState(self._run(parts, array, given), {})
             after.obs  # noqa: B018 - waits for the step: the inputs may change now
             return after
         found: list[State] = []
-        inputs = parts, _action(action), given
+        inputs = parts, to_jax(action, "action"), given
         leaves = jax.tree.leaves((state.parts, action, params))
         results = Step.apply(self, inputs, found, *leaves)
         structure = jax.tree.structure(parts_of(found[0]))
         return TorchState(found[0], jax.tree.unflatten(structure, results))
-
-
-def _action(action: torch.Tensor, *, numpy: bool = False) -> Any:
-    """Returns an action as an array that shares its memory.
-
-    Args:
-        action: The action.
-        numpy: Whether it is an array of NumPy, whose exchange takes less time.
-
-    Raises:
-        TypeError: The tensor is not dense, has no memory, or has a type that NumPy
-            lacks.
-    """
-    try:
-        return action.detach().numpy() if numpy else to_jax(action)
-    except (BufferError, RuntimeError, TypeError) as error:
-        wrong = Fact(f"a {action.layout} tensor of {action.dtype}: {error}")
-        raise TypeError(
-            message(
-                "action",
-                wrong,
-                "a dense tensor of float32 or float64, outside of torch.func",
-            )
-        ) from error
 
 
 def _check_forward(tree: PyTree) -> None:

@@ -123,7 +123,7 @@ class Back(torch.autograd.Function):
         pairs = zip(slopes, step.shapes, strict=True)
         try:
             given = [to_jax(slope) for slope, shape in pairs if shape is not None]
-        except RuntimeError as error:
+        except TypeError as error:
             raise RuntimeError(
                 "newton_qd.adapters.torch has no batches of slopes; allowed: one "
                 "gradient at a time, without vectorize or is_grads_batched"

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import torch
 
 from newton_qd import checks
-from newton_qd.checks import message
+from newton_qd.checks import Fact, message
 from newton_qd.envs.state import State
 from newton_qd.types import PyTree
 
@@ -46,7 +46,7 @@ class TorchState:
             arrays: State of JAX, if there is one.
             parts: Attributes that are tensors already; all of them without ``arrays``.
         """
-        read = {name: jax.tree.leaves(part) for name, part in parts.items()}
+        read = {name: jax.tree.flatten(part) for name, part in parts.items()}
         vars(self).update(parts, arrays=arrays, _read=read)
 
     def __getattr__(self, name: str) -> Any:
@@ -55,7 +55,7 @@ class TorchState:
             raise AttributeError(f"{kind!r} object has no attribute {name!r}")
         value = jax.tree.map(to_torch, getattr(self.arrays, name))
         vars(self)[name] = value
-        vars(self)["_read"][name] = jax.tree.leaves(value)
+        vars(self)["_read"][name] = jax.tree.flatten(value)
         return value
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -95,14 +95,14 @@ class TorchState:
         if self.arrays is not None:
             if name not in vars(self):
                 return getattr(self.arrays, name)
-            read = vars(self)["_read"][name]
-            leaves = jax.tree.leaves(getattr(self, name))
-            if len(read) == len(leaves) and all(map(operator.is_, read, leaves)):
+            read, form = vars(self)["_read"][name]
+            leaves, structure = jax.tree.flatten(getattr(self, name))
+            if form == structure and all(map(operator.is_, read, leaves)):
                 return getattr(self.arrays, name)
         for leaf in jax.tree.leaves(getattr(self, name)):
             if not isinstance(leaf, torch.Tensor | jax.Array):
                 raise TypeError(message(f"state.{name}", leaf, "tensors of PyTorch"))
-        return jax.tree.map(to_jax, getattr(self, name))
+        return jax.tree.map(lambda x: to_jax(x, f"state.{name}"), getattr(self, name))
 
     def replace(self, **changes: Any) -> TorchState:
         """Returns a copy with some attributes replaced.
@@ -134,16 +134,33 @@ def to_torch(leaf: Any) -> Any:
     return torch.from_dlpack(leaf)
 
 
-def to_jax(leaf: Any) -> Any:
-    """Returns a tensor as an array of JAX that shares its memory.
+def to_jax(leaf: Any, name: str = "tensor", *, numpy: bool = False) -> Any:
+    """Returns a tensor as an array that shares its memory.
 
     Args:
         leaf: A tensor; other leaves stay what they are. A tensor with gaps in its
             memory is copied.
+        name: Name of the argument, for the error.
+        numpy: Whether it is an array of NumPy, whose exchange takes less time.
+
+    Raises:
+        TypeError: The tensor is not dense, has no memory, or has a type that NumPy
+            lacks.
+        OutOfMemoryError: PyTorch has no memory for a copy.
+        JaxRuntimeError: JAX has none.
     """
     if not isinstance(leaf, torch.Tensor):
         return leaf
-    return jax.dlpack.from_dlpack(leaf.detach().contiguous())
+    try:
+        if numpy:
+            return leaf.detach().numpy()
+        return jax.dlpack.from_dlpack(leaf.detach().contiguous())
+    except (torch.OutOfMemoryError, jax.errors.JaxRuntimeError):
+        raise
+    except (BufferError, RuntimeError, TypeError) as error:
+        wrong = Fact(f"a {leaf.layout} tensor of {leaf.dtype}: {error}")
+        allowed = "a dense tensor of float32 or float64, outside of torch.func"
+        raise TypeError(message(name, wrong, allowed)) from error
 
 
 def is_tracked(tree: PyTree) -> bool:

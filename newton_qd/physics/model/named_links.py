@@ -10,10 +10,10 @@ import numpy as np
 from newton_qd.checks import Fact, listed
 from newton_qd.physics.model.description import Body
 from newton_qd.physics.model.robot_checks import index_of, refusal
-from newton_qd.physics.model.xml_reader import IDENTITY
 from newton_qd.robots import RobotSpec
 
-_SAME = 1e-9  # of two frames [m], [-]
+_NEAR = 1e-6  # two positions that count as the same [m]
+_TURNED = 1e-5  # two rotations, half of the angle [rad]; files round pi to six digits
 
 
 def body_of(robot: RobotSpec, field: str, link: str, bodies: list[Body]) -> int:
@@ -46,12 +46,17 @@ def torso_body(robot: RobotSpec, bodies: list[Body]) -> int:
     """
     found = body_of(robot, "torso", robot.torso, bodies)
     body = bodies[found]
-    if np.abs(body.links[robot.torso] - IDENTITY).max() > _SAME:
-        frames = body.links.items()
-        same = [name for name, at in frames if np.abs(at - IDENTITY).max() <= _SAME]
+    same = [name for name, at in body.links.items() if _is_identity(at)]
+    if robot.torso not in same:
         why = f"which is fixed to {body.link.name!r}, at another place or turned"
         raise refusal(robot, "torso", robot.torso, listed(same), why=why)
     return found
+
+
+def _is_identity(frame: np.ndarray) -> bool:
+    """Returns whether a frame (7,) is the one in which it is given."""
+    position, turn = frame[:3], frame[3:6]  # q and -q are the same rotation
+    return bool(np.abs(position).max() <= _NEAR and np.abs(turn).max() <= _TURNED)
 
 
 def feet_bodies(robot: RobotSpec, bodies: list[Body]) -> np.ndarray:

@@ -7,10 +7,10 @@ from newton_qd.physics.model.xml_reader import XmlReader
 
 _ONCE = {
     "joint": ("origin", "parent", "child", "axis", "limit", "dynamics", "mimic"),
-    "inertial": ("origin", "mass", "inertia"),
-    "collision": ("origin", "geometry"),
+    "link/inertial": ("origin", "mass", "inertia"),
+    "link/collision": ("origin", "geometry"),
 }
-"""Elements that must not stand twice inside each element."""
+"""Elements that must not stand twice inside those of a path."""
 
 
 def refuse_unread(reader: XmlReader) -> None:
@@ -30,6 +30,8 @@ def refuse_unread(reader: XmlReader) -> None:
                 "URDF; run xacro on the file first",
             )
             raise reader.refused(element, "element", given, allowed)
-        for tag in _ONCE.get(element.tag, ()):
-            for second in element.findall(tag)[1:]:
-                raise reader.error(second, f"second <{tag}> of this {element.tag}")
+    for path, tags in _ONCE.items():
+        for element in reader.root.findall(path):  # not those of simulators
+            for tag in tags:
+                for second in element.findall(tag)[1:]:
+                    raise reader.error(second, f"second <{tag}> of this {element.tag}")

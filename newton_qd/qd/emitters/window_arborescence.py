@@ -74,7 +74,7 @@ class WindowArborescenceEmitter(CMAMAEGAEmitter):
             TypeError: ``method`` is no actor-critic, or ``optimizer`` is given.
             ValueError: A number is out of its range.
         """
-        if "optimizer" in options:
+        if options.get("optimizer") is not None:
             allowed = "no optimizer: an actor moves a point"
             raise TypeError(message("optimizer", options["optimizer"], allowed))
         checks.instance("method", method, ActorCritic, "an ActorCritic")

@@ -15,7 +15,7 @@ from newton_qd import checks
 from newton_qd.checks import Fact, message
 from newton_qd.qd.config import ConfigError, EvolveConfig
 from newton_qd.qd.run.archive import ARCHIVE, Archive, load_archive
-from newton_qd.qd.run.checkpoint import CheckpointError, load_checkpoint
+from newton_qd.qd.run.checkpoint import Checkpoint, CheckpointError, load_checkpoint
 from newton_qd.qd.run.folder import (
     CHECKPOINT,
     COLUMNS,
@@ -42,36 +42,70 @@ def read_results(
         FileNotFoundError: The run was stopped before its first checkpoint.
     """
     path = Path(folder)
-    checkpoint = path / CHECKPOINT
-    if checkpoint.is_file():  # never older than the archive
-        try:
-            state = load_checkpoint(checkpoint)
-        except CheckpointError as error:
-            if not (path / ARCHIVE).is_file():
-                raise
-            text = f"{error}; its archive and metrics are read from {ARCHIVE} instead"
-            warnings.warn(text, stacklevel=3)
-        else:
-            if config is not None:
-                require_same_run(checkpoint, state, config)
-            arrays = [getattr(state, f.name) for f in dataclasses.fields(Archive)]
-            columns = complete_metrics(np.asarray(state.metrics)).T
-            return Archive(*arrays), dict(zip(COLUMNS, columns, strict=True))
-    return load_archive(path), _metrics(path / METRICS)
+    state = _newest(path)
+    if state is None:
+        return load_archive(path), _metrics(path / METRICS)
+    if config is not None:
+        require_same_run(path / CHECKPOINT, state, config)
+    columns = complete_metrics(np.asarray(state.metrics)).T
+    return _archive(state), dict(zip(COLUMNS, columns, strict=True))
+
+
+def read_archive(folder: str | os.PathLike[str]) -> Archive:
+    """Returns the archive of a results folder, from the newest file.
+
+    Raises:
+        ArchiveError: ``archive.npz`` is damaged, and there is no checkpoint.
+        CheckpointError: The checkpoint is damaged, and there is no ``archive.npz``.
+        FileNotFoundError: The run was stopped before its first checkpoint.
+    """
+    path = Path(folder)
+    state = _newest(path)
+    return load_archive(path) if state is None else _archive(state)
+
+
+def _archive(state: Checkpoint) -> Archive:
+    """Returns the archive in a checkpoint."""
+    return Archive(*(getattr(state, f.name) for f in dataclasses.fields(Archive)))
+
+
+def _newest(path: Path) -> Checkpoint | None:
+    """Returns the checkpoint, which is never older than the archive.
+
+    Returns:
+        The checkpoint; ``None`` if there is none, or, with a warning, if it is damaged
+        and there is an archive.
+
+    Raises:
+        CheckpointError: It is damaged, and there is no ``archive.npz``.
+    """
+    if not (path / CHECKPOINT).is_file():
+        return None
+    try:
+        return load_checkpoint(path / CHECKPOINT)
+    except CheckpointError as error:
+        if not (path / ARCHIVE).is_file():
+            raise
+        text = f"{error}; its archive and metrics are read from {ARCHIVE} instead"
+        warnings.warn(text, stacklevel=4)
+        return None
 
 
 def _metrics(path: Path) -> dict[str, np.ndarray]:
     """Reads ``metrics.csv``.
 
     Raises:
-        ConfigError: It has other columns, or values that are not numbers.
+        ConfigError: It has other columns, values that are not numbers, or a last line
+            without an end.
     """
     text = path.read_text(encoding="utf-8")
+    if text and not text.endswith("\n"):
+        given = Fact("a last line without an end, whose last number may be cut")
+        raise ConfigError(message(str(path), given, "whole lines"))
     head, *rows = list(csv.reader(text.splitlines())) or [[]]
     try:
         table = np.asarray([[float(x) for x in row] for row in rows])
-        fits = tuple(head) == COLUMNS[: len(head)] and table.shape[1:] == (len(head),)
-        if fits and text.endswith("\n"):  # else the last number may lack digits
+        if tuple(head) == COLUMNS[: len(head)] and table.shape[1:] == (len(head),):
             return dict(zip(COLUMNS, complete_metrics(table).T, strict=True))
     except ValueError:
         pass

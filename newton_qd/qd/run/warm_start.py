@@ -15,7 +15,7 @@ from newton_qd.checks import Fact, message
 from newton_qd.qd.config import ConfigError
 from newton_qd.qd.run.archive import ARCHIVE
 from newton_qd.qd.run.folder import CHECKPOINT
-from newton_qd.qd.run.results import read_results
+from newton_qd.qd.run.results import read_archive
 from newton_qd.qd.scoring.rollout import Policy
 from newton_qd.types import PyTree
 
@@ -78,7 +78,7 @@ def _contents(source: StartFrom) -> tuple[PyTree, np.ndarray]:
         if not any((folder / name).is_file() for name in (CHECKPOINT, ARCHIVE)):
             why = "which has no archive"
             raise ConfigError(message("start_from", Fact(folder), _ALLOWED, why=why))
-        source = read_results(folder)[0]
+        source = read_archive(folder)
     source = getattr(source, "archive", source)
     if hasattr(source, "solution_dim"):  # of pyribs
         data = source.data(["solution", "objective"])
