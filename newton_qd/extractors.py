@@ -81,7 +81,10 @@ def get_feet_contact_proportion(data: StateDescriptors, mask: Mask) -> Descripto
         ValueError: ``mask`` has another shape than the steps of ``data``.
     """
     _require_steps(data, mask)
-    valid = (1.0 - mask)[..., None].astype(data.state_desc.dtype)
+    dtype = data.state_desc.dtype
+    if not jnp.issubdtype(dtype, jnp.floating):  # a sum of flags would not fit
+        dtype = jnp.promote_types(dtype, jnp.float32)
+    valid = (1.0 - mask)[..., None].astype(dtype)
     # If all components had one number of steps, XLA would multiply by its reciprocal in
     # some batches, and 41 * (1 / 41) is not 1.
     steps = folded_sum(jnp.broadcast_to(valid, data.state_desc.shape), 1)

@@ -12,7 +12,7 @@ import inspect
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from newton_qd.checks import listed, message
+from newton_qd.checks import Fact, listed, message
 from newton_qd.envs.acrobot import Acrobot
 from newton_qd.envs.ant import Ant
 from newton_qd.envs.arm_reach import TIP, ArmReach
@@ -92,6 +92,12 @@ class WrapperSpec:
         parameters = [*inspect.signature(self.wrapper).parameters.values()]
         if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
             return
+        second = parameters[1:2]
+        if not second or second[0].default is not second[0].empty:
+            given = Fact(str(inspect.signature(self.wrapper)))
+            allowed = "(env, env_name, ...): the second argument is the name"
+            name = getattr(self.wrapper, "__name__", repr(self.wrapper))
+            raise TypeError(message(f"arguments of {name}", given, allowed))
         allowed = [p.name for p in parameters[2:]]  # after the environment and its name
         for name, value in options.items():
             if name not in allowed:

@@ -20,6 +20,7 @@ from newton_qd.compat.scoring import (
 )
 from newton_qd.envs.base import Env
 from newton_qd.envs.state import State
+from newton_qd.extractors import check_extractor
 from newton_qd.types import DescriptorExtractor, ExtraScores, Genotype, PyTree, RNGKey
 
 if TYPE_CHECKING:
@@ -230,7 +231,11 @@ def create_brax_scoring_fn(
 
     Returns:
         The scoring function and a new key.
+
+    Raises:
+        ValueError: The extractor is for another state descriptor than that of ``env``.
     """
+    check_extractor(env, bd_extraction_fn)
     if play_step_fn is None:
         play_step_fn = make_policy_network_play_step_fn_brax(env, policy_network)
     if deterministic:

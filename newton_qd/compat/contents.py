@@ -200,6 +200,7 @@ BRAX_V1: Mapping[str, Contents] = {
     "brax.v1.envs": {
         "newton_qd.envs.base": ("Env",),
         "newton_qd.envs.state": ("State",),
+        "newton_qd.wrappers.base": ("Wrapper",),
     },
     "brax.v1.io": {},
     "brax.v1.io.html": {"newton_qd.compat.brax_v1": ("render", "save_html")},

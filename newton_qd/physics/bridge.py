@@ -202,7 +202,8 @@ def rollout(
     if controls.ndim != 2 or controls.shape[1] != system.nu:
         allowed = f"an array of shape (steps, {system.nu}), {system.dtype}"
         raise ValueError(message("controls", controls, allowed))
-    if not row_calls.native(row_calls.default_device()):
+    # without controls, the rows do not say how many steps there are
+    if not system.nu or not row_calls.native(row_calls.default_device()):
         return _scanned(system, q, v, controls, params)
     thread_count()  # raises for a wrong setting now, not inside a compiled call
     steps, parametric = len(controls), params is not None

@@ -285,6 +285,7 @@ def _entries(system: System, adjoint: bool) -> dict[str, int]:
     steps = n + 1 if adjoint else 1
     motions = turns + 1 if adjoint else 1
     solves = turns * chosen.solves if adjoint else 1
+    several = np.count_nonzero(system.parent < 0) > 1  # roots
     pairs = len(system.contact_pairs)
     coupled = solves * pairs
     return {
@@ -303,7 +304,7 @@ def _entries(system: System, adjoint: bool) -> dict[str, int]:
         **dict.fromkeys(_PER_SOLVE_CONTACT, solves * nc),
         **dict.fromkeys(_PER_SOLVE_BODY, solves * (system.nb + 1)),
         **dict.fromkeys(_PER_SOLVE_DOF, solves * system.nv),
-        **dict.fromkeys(_ROOT_FACTORS, solves),
+        **dict.fromkeys(_ROOT_FACTORS, solves * (system.nb + 1 if several else 1)),
         **dict.fromkeys(_ANSWERS[:2], coupled * (system.nb + 1)),
         "answer_dv": coupled * system.nv,
         **dict.fromkeys(_PAIRED, coupled),

@@ -24,6 +24,7 @@ from newton_qd.physics.kernels.rows import Inputs, Outputs
 from newton_qd.physics.launch import Launcher
 from newton_qd.physics.model import load_system, newton_builder
 from newton_qd.physics.model.description import read_description
+from newton_qd.physics.model.xml_reader import RobotDescriptionError
 from newton_qd.physics.system import JointKind, System
 from newton_qd.physics.warp_internals import tape_is_recording
 from newton_qd.robots import RobotSpec
@@ -136,6 +137,7 @@ class NewtonQDSolver(SolverBase):
             self.impulse = self._zeros(nb, 6)
             self.normal_impulse = self._zeros(nb)
             self.fault = self._zeros()
+        _check_roots(self._system)
         free = self._system.joint_kind[0] == JointKind.FREE
         self._root = (int(free), wp.vec3(*self._system.com[0]))
         self._launcher = functools.lru_cache(_HELD_STEPS)(
@@ -331,3 +333,22 @@ def _compare(
             "copy of newton_builder()'s"
         )
         raise ValueError(message(field, Fact(worlds[place]), allowed))
+
+
+def _check_roots(system: System) -> None:
+    """Checks that a free body whose centre of mass is off its origin is the first.
+
+    Newton's velocities of a free joint are those of the centre of mass. They are
+    converted for the first body only.
+
+    Raises:
+        RobotDescriptionError: Another body is free, and its centre of mass is off.
+    """
+    free = system.joint_kind == JointKind.FREE
+    off = np.abs(system.com).max(axis=1) > 0
+    for body in np.flatnonzero(free & off):
+        if body > 0:
+            given = Fact(f"{system.body_names[body]!r}, with its centre of mass off")
+            allowed = "the first body, or one whose centre of mass is its origin"
+            name = f"robot {system.robot.name!r}, free body"
+            raise RobotDescriptionError(message(name, given, allowed))

@@ -121,6 +121,8 @@ class SceneTaskWrapper(Wrapper):
     @property
     def observation_size(self) -> int:
         """Length of an observation."""
+        if not self._effective:  # a wrapper between may have made it longer
+            return self.env.observation_size
         return sum(size for _, size in self.observation_layout)
 
 

@@ -10,7 +10,7 @@ from .cpp.algebra import add_diagonal, outer, skew, translation, transpose, vect
 from .cpp.memory import load, store
 from .cpp.numbers import uniform
 from .cpp.operators import add, mul, sub  # noqa: F401
-from .structs import Model, Offsets, Scratch
+from .structs import Model, Offsets, Scratch, root_factors
 
 
 @plain
@@ -132,11 +132,12 @@ def answer_free(m: Model, sc: Scratch, offsets: Offsets, j: int, i: int):
     """
     at = answer_body(m, offsets, j) + i
     k = answer_dof(m, offsets, j) + load(m.v_start, i)
-    reduced = load(sc.root_wv, offsets.solve)
+    factors = root_factors(m, offsets, i)
+    reduced = load(sc.root_wv, factors)
     n = load(sc.answer_w, at)
     f = load(sc.answer_v, at)
-    w = load(sc.root_ww, offsets.solve) * (n - reduced * f)
-    v = load(sc.root_vv, offsets.solve) * f - transpose(reduced) * w
+    w = load(sc.root_ww, factors) * (n - reduced * f)
+    v = load(sc.root_vv, factors) * f - transpose(reduced) * w
     store(sc.answer_w, at, w)
     store(sc.answer_v, at, v)
     origin = v - skew(translation(load(sc.pose, offsets.body + i))) * w

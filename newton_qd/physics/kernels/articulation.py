@@ -35,7 +35,7 @@ from .cpp.algebra import (
 from .cpp.memory import load, store
 from .cpp.operators import add, div, mul, sub  # noqa: F401
 from .parameters import body_mass
-from .structs import Model, Offsets, Scratch
+from .structs import Model, Offsets, Scratch, root_factors
 
 PAIRS = wp.constant(pairs)
 SHARED = wp.constant(shared)
@@ -276,7 +276,7 @@ def solve_free(
     """Solve a free root's own equation: 6 x 6, by blocks.
 
     With C = vv^-1 and Y = (ww - wv C wv^T)^-1, w = Y (n - wv C f) and
-    v = C f - (wv C)^T w. A system has one free root at most.
+    v = C f - (wv C)^T w.
 
     Reads: m.v_start, sc.pose, sc.joint_push.
     Writes: sc.dv, sc.change_w, sc.change_v, sc.root_ww, sc.root_wv, sc.root_vv.
@@ -299,9 +299,10 @@ def solve_free(
     compliance = inverse(vv)
     reduced = wv * compliance
     turning = inverse(ww - symmetric(reduced * transpose(wv)))
-    store(sc.root_ww, offsets.solve, turning)
-    store(sc.root_wv, offsets.solve, reduced)
-    store(sc.root_vv, offsets.solve, compliance)
+    at = root_factors(m, offsets, i)
+    store(sc.root_ww, at, turning)
+    store(sc.root_wv, at, reduced)
+    store(sc.root_vv, at, compliance)
     w = turning * (n - reduced * f)
     v = compliance * f - w * reduced
     store(sc.change_w, offsets.solve_body + i, w)

@@ -12,7 +12,7 @@ from .coupling import PAIRS, answered, pair_motion, with_answers
 from .cpp.algebra import cross, dot, translation, vector
 from .cpp.memory import add_adjoint, load, load_adjoint, store, store_adjoint
 from .cpp.operators import add, mul, neg, sub  # noqa: F401
-from .structs import Model, Offsets, Scratch
+from .structs import Model, Offsets, Scratch, root_factors
 
 
 @plain
@@ -114,9 +114,10 @@ def multiplier_free(m: Model, sc: Scratch, offsets: Offsets, i: int, n: vec3, f:
     )
     n = n + turn + cross(p, origin)
     f = f + origin
-    reduced = load(sc.root_wv, offsets.solve)
-    w = load(sc.root_ww, offsets.solve) * (n - reduced * f)
-    v = load(sc.root_vv, offsets.solve) * f - w * reduced
+    factors = root_factors(m, offsets, i)
+    reduced = load(sc.root_wv, factors)
+    w = load(sc.root_ww, factors) * (n - reduced * f)
+    v = load(sc.root_vv, factors) * f - w * reduced
     store(sc.multiplier_w, offsets.reading + i, w)
     store(sc.multiplier_v, offsets.reading + i, v)
 

@@ -311,3 +311,15 @@ def offsets_after(m: Model, slot: int, keep: int):
     Reads: m.substeps.
     """
     return offsets_at(m, slot, keep, m.substeps + 1, 0)
+
+
+@wp.func
+def root_factors(m: Model, offsets: Offsets, i: int):
+    """Where the factors of free root ``i`` are: with one root, in a place of its own.
+
+    Reads: m.roots.
+    """
+    at = offsets.solve
+    if m.roots > 1:
+        at = offsets.solve_body + i
+    return at

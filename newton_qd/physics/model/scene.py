@@ -179,6 +179,8 @@ def check_scene(scene: Scene | None) -> None:
     ):
         allowed = 'None, a tuple of names of links, such as ("foot",)'
         raise RobotDescriptionError(message(f"{field}, links", names, allowed))
+    if names is not None and len(set(names)) < len(names):
+        raise RobotDescriptionError(message(f"{field}, links", names, "each once"))
 
 
 def wall_contacts(

@@ -68,7 +68,11 @@ def shard_scoring(score: ScoringFunction, mesh: Mesh) -> ScoringFunction:
 
     Each device evaluates an equal part of the individuals. If necessary, the batch is
     extended with copies of the last individual, and their results are dropped. Every
-    device then has all results. They are bitwise equal for any number of devices.
+    device then has all results. They are bitwise equal for any number of devices, if
+    the result of an individual does not depend on its place in the batch. Every device
+    has the same key. So a scoring function that splits it by individual, such as those
+    of QDax with ``deterministic=False``, gives individuals of several devices the same
+    start.
 
     Args:
         score: Scoring function of genotypes (N, size) or a pytree of (N, ...), and a

@@ -1,0 +1,112 @@
+"""Robots of several free bodies: what one of them does leaves the others right."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from urdf_text import row, write
+
+from newton_qd import physics
+from newton_qd.physics import reference
+from newton_qd.physics.system import System
+from newton_qd.robots import Contact
+
+
+def loose(name: str, mass: float) -> str:
+    """A ball that moves freely; its centre of mass is not its centre."""
+    inertia = '<inertia ixx=".01" iyy=".02" izz=".015" ixy="0" ixz="0" iyz="0"/>'
+    return f"""<link name="{name}"><inertial><origin xyz=".02 .01 -.03"/>
+      <mass value="{mass}"/>{inertia}</inertial>
+      <collision><geometry><sphere radius="0.1"/></geometry></collision></link>
+      <joint name="free_{name}" type="floating"><parent link="world"/>
+      <child link="{name}"/></joint>"""
+
+
+def system_of(folder: Path, masses: dict[str, float], **changes: object) -> System:
+    links = "".join(loose(name, mass) for name, mass in masses.items())
+    text = f'<robot name="r"><link name="world"/>{links}</robot>'
+    pair = ((Contact("a"), Contact("b")),)
+    robot = row(write(folder, text), "a", pairs=pair, **changes)
+    return physics.load_system(robot, "float64")
+
+
+def placed(system: System, *places: tuple[float, float, float]) -> np.ndarray:
+    q = system.rest_q.copy().reshape(-1, 7)
+    q[:, :3] = places
+    return q.reshape(-1)
+
+
+def momentum(system: System, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Linear momentum (3,) of all bodies, from the velocities of their centres."""
+    turn = [reference.rotation_matrix(x[3:]) for x in q.reshape(-1, 7)]
+    levers = np.array([r @ com for r, com in zip(turn, system.com, strict=True)])
+    linear, angular = v.reshape(-1, 2, 3).swapaxes(0, 1)
+    return system.mass @ (linear + np.cross(angular, levers))
+
+
+def test_a_third_body_changes_no_impact(x64: None, tmp_path: Path) -> None:
+    """Momentum is conserved, and who is far away stays where it is."""
+    system = system_of(
+        tmp_path, {"a": 1.0, "b": 2.0, "c": 5.0}, gravity=0.0, dt=1e-3, substeps=1
+    )
+    q = placed(system, (0, 0, 1), (-0.18, 0.03, 1.03), (3, 3, 3))
+    v = np.zeros(18)
+    v[0], v[6] = 3.0, 10.0
+    step = jax.jit(lambda q, v: physics.step(system, state_of(q, v), jnp.zeros(0))[0])
+
+    def state_of(q: jax.Array, v: jax.Array) -> physics.PhysicsState:
+        return physics.initial_state(system, q, v)
+
+    after = step(q, v)
+    assert np.abs(after.impulse[0, :3]).max() > 0.1
+    # nothing turns before the impact, so the levers are those of the begin
+    before, now = (
+        momentum(system, np.asarray(x), np.asarray(y))
+        for x, y in ((q, v), (q, after.v))
+    )
+    lost = before - now
+    assert np.abs(lost).max() < 1e-12 * np.abs(before).max()
+    np.testing.assert_array_equal(after.v[12:], 0.0)
+
+
+@pytest.mark.parametrize("near", [2.0, 0.19])
+def test_gradients_are_those_of_differences(
+    x64: None, tmp_path: Path, near: float
+) -> None:
+    """On the ground, apart from each other and in touch."""
+    contacts = (Contact("a"), Contact("b"))
+    system = system_of(tmp_path, {"a": 1.0, "b": 3.0}, contacts=contacts, dt=0.01)
+    q = placed(system, (0, 0, 0.095), (near, 0, 0.095))
+    rng = np.random.default_rng(0)
+    v, weights, ways = (
+        rng.normal(size=12),
+        rng.normal(size=12),
+        rng.normal(size=(4, 12)),
+    )
+
+    @jax.jit
+    def value(v: jax.Array) -> jax.Array:
+        state = physics.initial_state(system, q, v)
+        return physics.step(system, state, jnp.zeros(0))[0].v @ weights
+
+    slope, h = jax.jit(jax.grad(value))(v), 1e-6
+    for way in ways:
+        central = (value(v + h * way) - value(v - h * way)) / (2 * h)
+        assert slope @ way == pytest.approx(float(central), rel=1e-6, abs=1e-6)
+
+
+def test_a_plan_of_no_actuators(x64: None, tmp_path: Path) -> None:
+    """It has no numbers that could tell its length."""
+    system = system_of(tmp_path, {"a": 1.0, "b": 1.0})
+    state = physics.initial_state(system, system.rest_q, np.zeros(12))
+    plan = jnp.zeros((3, 0))
+    found = jax.jit(lambda s: physics.rollout(system, s, plan))(state)
+    step = jax.jit(lambda s, u: physics.step(system, s, u))
+    for k in range(3):
+        state, fault = step(state, plan[k])
+        np.testing.assert_array_equal(found.after.q[k], state.q)
+        assert found.fault[k] == fault == 0
