@@ -55,6 +55,7 @@ def test_brax_v1_is_there_for_scripts_of_qdax(name: str) -> None:
 def test_environments_are_those_of_brax_v1() -> None:
     old: Any = importlib.import_module("brax.v1.envs")
     assert isinstance(newton_qd.create("pointmaze"), old.Env)
+    assert issubclass(newton_qd.wrappers.EpisodeWrapper, old.Wrapper)
     jp: Any = importlib.import_module("brax.v1.jumpy")
     assert jp.random_uniform(jp.random_prngkey(seed=0), (2,), 1.0, 2.0).min() >= 1
 

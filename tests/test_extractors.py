@@ -317,3 +317,13 @@ def test_a_kernel_refuses_rows_of_another_precision() -> None:
     run = _episode_reduction("final", "float64", 4, 2, 2)
     with pytest.raises(TypeError, match=r"^row of a kernel: got .*float32; .* 8 bytes"):
         run(jnp.zeros(12, np.float32))
+
+
+@pytest.mark.parametrize("kind", [bool, np.uint8, np.int8, np.int32])
+def test_proportions_of_flags(kind: type) -> None:
+    """Their number does not fit into a byte."""
+    flags = np.tile([1, 0, 0], 100).astype(kind)[None, :, None]
+    data = Transitions(jnp.asarray(flags))
+    for proportion in (get_feet_contact_proportion, get_mean_state_descriptor):
+        found = jax.jit(proportion)(data, jnp.zeros((1, 300)))
+        assert found.dtype == np.float32 and found == pytest.approx(1 / 3)

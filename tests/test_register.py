@@ -14,6 +14,7 @@ import newton_qd
 import newton_qd.authoring as nq
 from newton_qd import tasks
 from newton_qd.envs.ant import Ant
+from newton_qd.envs.hopper import Hopper
 from newton_qd.envs.pointmaze import PointMaze
 from newton_qd.extractors import (
     get_feet_contact_proportion,
@@ -21,6 +22,8 @@ from newton_qd.extractors import (
 from newton_qd.robots import ANT
 from newton_qd.wrappers import (
     FeetContactWrapper,
+    OffsetRewardWrapper,
+    StateDescriptorResetWrapper,
 )
 
 
@@ -204,3 +207,15 @@ def test_register_gives_the_robot_and_options(rows: None) -> None:
     ):
         nq.register("other", nq.Locomotion, descriptor=3)  # pyright: ignore
     assert "other" not in nq.registered_envs()
+
+
+def test_a_registered_wrapper_takes_the_name() -> None:
+    """Else ``create`` could not make it."""
+    for wrapper, options in (
+        (OffsetRewardWrapper, {"offset": 5.0}),
+        (StateDescriptorResetWrapper, {}),
+    ):
+        spec = nq.WrapperSpec(wrapper, options)
+        words = rf"arguments of {wrapper.__name__}: got .*; allowed: \(env, env_name"
+        with pytest.raises(TypeError, match=words):
+            newton_qd.register("unnamed", Hopper, wrappers=(spec,))

@@ -267,6 +267,9 @@ def test_refused_rows(tmp_path: Path) -> None:
         message = r"scene 'trap', links: got .*; allowed: None, a tuple of names"
         with pytest.raises(RobotDescriptionError, match=message):
             load_system(ANT, scene=dataclasses.replace(TRAP, links=wrong))
+    twice = dataclasses.replace(TRAP, links=("aux_1", "aux_1"))
+    with pytest.raises(RobotDescriptionError, match=r"links: got .*allowed: each once"):
+        load_system(ANT, scene=twice)
     wrong = 4
     with pytest.raises(RobotDescriptionError, match=r"'trap', urdf: got 4; allowed: a"):
         load_system(ANT, scene=dataclasses.replace(TRAP, urdf=wrong))

@@ -90,7 +90,7 @@ def test_gradients_are_those_of_differences(
 
     @jax.jit
     def value(v: jax.Array) -> jax.Array:
-        state = physics.initial_state(system, q, v)
+        state = physics.initial_state(system, jnp.asarray(q), v)
         return physics.step(system, state, jnp.zeros(0))[0].v @ weights
 
     slope, h = jax.jit(jax.grad(value))(v), 1e-6
@@ -102,7 +102,7 @@ def test_gradients_are_those_of_differences(
 def test_a_plan_of_no_actuators(x64: None, tmp_path: Path) -> None:
     """It has no numbers that could tell its length."""
     system = system_of(tmp_path, {"a": 1.0, "b": 1.0})
-    state = physics.initial_state(system, system.rest_q, np.zeros(12))
+    state = physics.initial_state(system, jnp.asarray(system.rest_q), jnp.zeros(12))
     plan = jnp.zeros((3, 0))
     found = jax.jit(lambda s: physics.rollout(system, s, plan))(state)
     step = jax.jit(lambda s, u: physics.step(system, s, u))

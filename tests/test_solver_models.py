@@ -11,8 +11,9 @@ import newton
 import pytest
 import warp as wp
 from newton_loops import ARM, Loop, finalized, off_centre, one_world, replicated
-from urdf_text import sphere
+from urdf_text import joint, link, robot_text, row, sphere, write
 
+from newton_qd.physics.model import RobotDescriptionError, newton_builder
 from newton_qd.physics.solver import NewtonQDSolver
 from newton_qd.robots import ANT, RobotSpec
 
@@ -114,6 +115,29 @@ def test_another_joint_and_nothing(tmp_path: Path, device: jax.Device) -> None:
         NewtonQDSolver(finalized(builder, device), robot)
     with pytest.raises(ValueError, match=r"model\.body_count: got 0; allowed: 2"):
         NewtonQDSolver(finalized(newton.ModelBuilder(), device), robot)
+
+
+def test_a_second_free_body_has_its_mass_at_its_origin(
+    tmp_path: Path, device: jax.Device
+) -> None:
+    """Newton's velocities of a free joint are those of the centre of mass."""
+    off = '<inertial><origin xyz="0.2 0 0"/>'
+    text = robot_text(
+        '<link name="world"/>',
+        link("a"),
+        link("b").replace("<inertial>", off),
+        *(joint(f"to_{name}", "floating", "world", name) for name in "ab"),
+    )
+    for given, refused in ((text, True), (text.replace(off, "<inertial>"), False)):
+        robot = row(write(tmp_path, given), "a")
+        builder = newton.ModelBuilder()
+        builder.replicate(newton_builder(robot.urdf, False, 9.81), 1)
+        model = finalized(builder, device)
+        if refused:
+            with pytest.raises(RobotDescriptionError, match="free body: got 'b', with"):
+                NewtonQDSolver(model, robot)
+        else:
+            NewtonQDSolver(model, robot)
 
 
 def test_bad_arguments_of_a_step(tmp_path: Path, device: jax.Device) -> None:

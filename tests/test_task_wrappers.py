@@ -23,10 +23,13 @@ from newton_qd.wrappers import (
     ClipRewardWrapper,
     EpisodeWrapper,
     FeetContactWrapper,
+    MazeWrapper,
     NoForwardRewardWrapper,
     OffsetRewardWrapper,
     QDWrapper,
+    TrapWrapper,
     VectorWrapper,
+    Wrapper,
     XYPositionWrapper,
 )
 
@@ -318,3 +321,18 @@ def test_position_follows_the_auto_reset() -> None:
     assert float(state.done) == 1.0
     assert same_readings(state, first)
     assert np.array_equal(state.info["xy_position"], state.pipeline_state.q[:2])
+
+
+class Longer(Wrapper):
+    """One more number in an observation."""
+
+    @property
+    def observation_size(self) -> int:
+        return self.env.observation_size + 1
+
+
+def test_a_wrapper_below_a_scene_may_make_observations_longer() -> None:
+    env = newton_qd.create("ant", episode_length=None, auto_reset=False)
+    for kind in (TrapWrapper, MazeWrapper):
+        alone = kind(env, "ant").observation_size
+        assert kind(Longer(env), "ant").observation_size == alone + 1
