@@ -92,8 +92,7 @@ class WrapperSpec:
         parameters = [*inspect.signature(self.wrapper).parameters.values()]
         if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
             return
-        second = parameters[1:2]
-        if not second or second[0].default is not second[0].empty:
+        if not any(map(_takes_name, parameters[1:2])):
             given = Fact(str(inspect.signature(self.wrapper)))
             allowed = "(env, env_name, ...): the second argument is the name"
             name = getattr(self.wrapper, "__name__", repr(self.wrapper))
@@ -105,6 +104,13 @@ class WrapperSpec:
                 why = f"which is not an argument of {owner}"
                 known = listed(allowed, "no argument")
                 raise TypeError(message(f"{where}, {name}", value, known, why=why))
+
+
+def _takes_name(parameter: inspect.Parameter) -> bool:
+    """Returns whether an argument may be the name of the environment."""
+    if parameter.default is parameter.empty or isinstance(parameter.default, str):
+        return True
+    return parameter.name in ("env_name", "name")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -213,6 +213,7 @@ def test_a_registered_wrapper_takes_the_name() -> None:
     """Else ``create`` could not make it."""
     for wrapper, options in (
         (OffsetRewardWrapper, {"offset": 5.0}),
+        (OffsetRewardWrapper, {}),
         (StateDescriptorResetWrapper, {}),
     ):
         spec = nq.WrapperSpec(wrapper, options)
