@@ -25,11 +25,8 @@ def refuse_unread(reader: XmlReader) -> None:
     """
     for element in reader.root.iter():
         if element.tag.startswith("xacro:"):
-            given, allowed = (
-                Fact(f"<{element.tag}>"),
-                "URDF; run xacro on the file first",
-            )
-            raise reader.refused(element, "element", given, allowed)
+            allowed = "URDF; run xacro on the file first"
+            raise reader.refused(element, "element", Fact(f"<{element.tag}>"), allowed)
     for path, tags in _ONCE.items():
         for element in reader.root.findall(path):  # not those of simulators
             for tag in tags:

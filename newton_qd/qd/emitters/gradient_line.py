@@ -61,7 +61,7 @@ class GradientLineEmitter(Emitter):
             TypeError: ``gradient`` is not a function, or a number is none.
             ValueError: A number is out of its range.
         """
-        checks.function("gradient", gradient, "such as Episode.directional")
+        checks.function("gradient", gradient, "a function, such as Episode.directional")
         for name, value in (("parents", parents), ("branches", branches)):
             checks.integer(name, value, most=None)
         for name, value in (("shortest", shortest), ("longest", longest)):
