@@ -236,9 +236,20 @@ def test_an_inner_gradient_may_be_constant() -> None:
     def product(a: jax.Array) -> jax.Array:
         return advance(a).sum() * first(jax.lax.stop_gradient(a)).sum()
 
-    np.testing.assert_allclose(
-        jax.grad(product)(action), first(action) * first(action).sum(), rtol=1e-6
-    )
+    def stopped(a: jax.Array) -> jax.Array:
+        return advance(a).sum() * jax.lax.stop_gradient(first(a)).sum()
+
+    for loss in (product, stopped):
+        np.testing.assert_allclose(
+            jax.grad(loss)(action), first(action) * first(action).sum(), rtol=1e-6
+        )
+
+    def told(a: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return advance(a).sum(), jnp.linalg.norm(first(a))
+
+    slope, size = jax.jit(jax.grad(told, has_aux=True))(action)
+    np.testing.assert_allclose(slope, first(action), rtol=1e-6)
+    assert size == pytest.approx(float(jnp.linalg.norm(slope)), rel=1e-5)
 
 
 def test_wrong_precision(x64: None) -> None:

@@ -178,6 +178,38 @@ def test_devices_that_do_not_exist_are_refused(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
+def test_xla_splits_a_batch_on_automatic_axes(devices: Devices) -> None:
+    """Without explicit axes, a call that XLA cannot split runs on all worlds."""
+    code = """
+import newton_qd
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+env = newton_qd.create("hopper_uni", auto_reset=False)
+split = NamedSharding(Mesh(np.array(jax.devices()), ("x",)), PartitionSpec("x"))
+states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 16))
+actions = jax.random.uniform(jax.random.key(1), (16, 3))
+
+@jax.jit
+def both(states, actions):
+    step = jax.vmap(env.step)
+    slope = jax.grad(lambda a: step(states, a).reward.sum())(actions)
+    return step(states, actions).obs, slope
+
+@jax.jit
+def rolled(states, actions):
+    plan = jnp.stack([actions, -actions], axis=1)
+    return jax.vmap(env.rollout)(states, plan).reward
+
+answer = []
+for function in (both, rolled):
+    given = jax.device_put((states, actions), split)
+    gathers = function.lower(*given).compile().as_text().count("all-gather(")
+    pairs = zip(*map(jax.tree.leaves, (function(states, actions), function(*given))))
+    answer += [gathers, all(np.array_equal(a, b) for a, b in pairs)]
+"""
+    assert devices.answer(code) == [0, True] * 2
+
+
 EVOLVE = """
 import warnings
 warnings.simplefilter("ignore")

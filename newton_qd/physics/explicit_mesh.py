@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_batching import custom_vmap
+from jax.experimental.xla_metadata import set_xla_metadata
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
 Tree = TypeVar("Tree")
@@ -136,12 +137,26 @@ def _split(call: Rows, rows: tuple[jax.Array, ...]) -> jax.Array:
     """Calls a function of rows on arrays (..., size), on each device for its worlds."""
     for _ in range(rows[0].ndim - 1):
         call = jax.vmap(call)
+    call = _marked(call, rows[0].ndim - 1)
     found = [sharding for row in rows if (sharding := _explicit(row)) is not None]
     if not found:
         return call(*rows)
     own = [jax.sharding.reshard(row, found[0]) for row in rows]
     mesh, worlds = found[0].mesh, found[0].spec
     return jax.shard_map(call, mesh=mesh, in_specs=worlds, out_specs=worlds)(*own)
+
+
+def _marked(call: Rows, axes: int) -> Rows:
+    """Returns a call that XLA may split along its first axes, which are worlds.
+
+    XLA splits it on a mesh whose axes are not explicit.
+    """
+
+    def marked(*rows: jax.Array) -> jax.Array:
+        with set_xla_metadata(num_batch_dims=str(axes)):
+            return call(*rows)
+
+    return marked
 
 
 def _explicit(row: jax.Array) -> NamedSharding | None:

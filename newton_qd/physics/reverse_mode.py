@@ -3,8 +3,8 @@
 A kernel has an adjoint, but no forward derivative, and the adjoint has no derivative.
 JAX's own errors for this name neither the cause nor the cure. Two primitives stand
 before the kernel: the identity, and its tangent. The way back passes the tangent
-unchanged. Only forward mode computes it. Another identity stands before the adjoint. It
-refuses any tangent.
+unchanged. Only forward mode computes it. The adjoint has a rule of its own for its way
+back, which refuses. So a gradient that is only a constant of another one is allowed.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _FORWARD = (
 
 _SECOND = (
     "the physics has first derivatives only: a gradient of it cannot be differentiated "
-    "again; take the inner gradient at jax.lax.stop_gradient(x), or use differences of "
+    "again; stop the inner gradient with jax.lax.stop_gradient, or use differences of "
     "gradients (docs/physics.md)"
 )
 
@@ -34,9 +34,20 @@ def reverse_mode_only(x: jax.Array) -> jax.Array:
     return _same.bind(x)
 
 
-def first_derivatives_only(x: jax.Array) -> jax.Array:
-    """Returns ``x`` unchanged. Its derivative is a ``TypeError``."""
-    return _first.bind(x)
+def first_derivatives_only(
+    adjoint: Callable[..., jax.Array],
+) -> Callable[..., jax.Array]:
+    """Returns a function of rows. Its derivative, where used, is a ``TypeError``."""
+
+    @jax.custom_vjp
+    def run(*rows: jax.Array) -> jax.Array:
+        return adjoint(*rows)
+
+    def refuse(_: None, cotangent: jax.Array) -> Any:
+        raise TypeError(_SECOND)
+
+    run.defvjp(lambda *rows: (run(*rows), None), refuse)
+    return lambda *rows: run(*map(reverse_mode_only, rows))
 
 
 def _refuse(*arguments: object, **options: object) -> Any:
@@ -55,31 +66,15 @@ def _differentiated(primals: tuple, tangents: tuple) -> tuple[Any, Any]:
     return _same.bind(x), tangent
 
 
-def _differentiated_again(primals: tuple, tangents: tuple) -> Any:
-    """Refuses to differentiate an adjoint.
-
-    Raises:
-        TypeError: Always.
-    """
-    raise TypeError(_SECOND)
-
-
-def _identity(name: str, differentiated: Callable[[tuple, tuple], Any]) -> Primitive:
-    """Returns an identity with a derivative of its own."""
-    same = Primitive(name)
-    same.def_abstract_eval(lambda x: x)
-    same.def_impl(lambda x: x)
-    mlir.register_lowering(same, lambda context, x: [x])
-    batching.primitive_batchers[same] = lambda arguments, axes: (
-        same.bind(*arguments),
-        axes[0],
-    )
-    ad.primitive_jvps[same] = differentiated
-    return same
-
-
-_same = _identity("newton_qd_reverse_mode_only", _differentiated)
-_first = _identity("newton_qd_first_derivatives_only", _differentiated_again)
+_same = Primitive("newton_qd_reverse_mode_only")
+_same.def_abstract_eval(lambda x: x)
+_same.def_impl(lambda x: x)
+mlir.register_lowering(_same, lambda context, x: [x])
+batching.primitive_batchers[_same] = lambda arguments, axes: (
+    _same.bind(*arguments),
+    axes[0],
+)
+ad.primitive_jvps[_same] = _differentiated
 
 _tangent = Primitive("newton_qd_tangent")
 _tangent.def_abstract_eval(lambda x: x)

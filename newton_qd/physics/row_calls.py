@@ -149,6 +149,7 @@ def _register() -> None:
     for name, address in library().handlers.items():
         capsule = jax.ffi.pycapsule(address)
         jax.ffi.register_ffi_target(name, capsule, platform="cpu")
+        jax.ffi.register_ffi_target_as_batch_partitionable(name)
     stop_at_exit(library().stop, library().stopped, in_python=False)
 
 
@@ -213,8 +214,11 @@ def differentiable(
         return y, (x, y) if keeps_outputs else (x,)
 
     def run_backward(kept: tuple[jax.Array, ...], y_bar: jax.Array) -> tuple[jax.Array]:
-        rows = [first_derivatives_only(x) for x in (*kept, y_bar)]
-        return (call(f"{name}_backward")(*rows, output_dims=size)[0],)
+        adjoint = call(f"{name}_backward")
+        run_adjoint = first_derivatives_only(
+            lambda *rows: adjoint(*rows, output_dims=size)[0]
+        )
+        return (run_adjoint(*kept, y_bar),)
 
     run.defvjp(run_forward, run_backward)
     return lambda x: run(reverse_mode_only(x))
