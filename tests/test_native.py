@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import concurrent.futures
 import ctypes
 import dataclasses
 import gc
 import subprocess
 import sys
+import threading
 import time
 import weakref
+from types import ModuleType
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +21,7 @@ import pytest
 import warp as wp
 
 from newton_qd import physics
-from newton_qd.physics import bridge, ending, layout
+from newton_qd.physics import bridge, ending, layout, precision
 from newton_qd.physics.launch import Launcher
 from newton_qd.physics.native import all_plans
 from newton_qd.physics.native.plans import _parts, _Plan
@@ -211,3 +214,26 @@ def test_threads_change_nothing(
     monkeypatch.setenv("NEWTON_QD_THREADS", threads)
     for _ in range(3):
         jax.tree.map(np.testing.assert_array_equal, step(q, v, control), expected)
+
+
+def test_threads_build_a_variant_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half of a package would be imported by the next thread."""
+    begun, names = threading.Barrier(4), []
+    real = precision._run_template
+
+    def slow(name: str) -> ModuleType:
+        names.append(name)
+        time.sleep(0.05)
+        return real(name)
+
+    monkeypatch.setattr(precision, "_run_template", slow)
+    variant = precision.Variant("float32", 5, boxes=True)
+
+    def build(_: int) -> precision.Kernels:
+        begun.wait(60)
+        return precision.build_kernels(variant)
+
+    with concurrent.futures.ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(build, range(4)))
+    assert len(names) == 2  # with boxes, and what it shares with the plain variant
+    assert all(each is found[0] for each in found)

@@ -11,7 +11,7 @@ from newton_qd.checks import listed, message
 from newton_qd.physics import buffers, layout
 from newton_qd.physics.native import Plan, Rollouts
 from newton_qd.physics.native.library import usable_cores
-from newton_qd.physics.precision import pack_width
+from newton_qd.physics.precision import BUILDING, pack_width
 from newton_qd.physics.system import System
 from newton_qd.physics.warp_internals import cpu_entry
 
@@ -166,7 +166,8 @@ class Launcher:
     def prepare(self, name: str) -> wp.Module:
         """Compile a kernel now, before a callback needs it. Returns its module."""
         module = self._kernel(name).module
-        module.load(self.device, self._block)
+        with BUILDING:
+            module.load(self.device, self._block)
         return module
 
     def plan(self, name: str) -> Plan:
@@ -175,8 +176,9 @@ class Launcher:
         Args:
             name: Name of the kernel. If it ends in ``_backward``, its adjoint runs.
         """
-        if name not in self._plans:
-            self._plans[name] = self._build_plan(name)
+        with BUILDING:
+            if name not in self._plans:
+                self._plans[name] = self._build_plan(name)
         return self._plans[name]
 
     def forward(self, worlds: int, x: wp.array, y: wp.array) -> None:

@@ -13,6 +13,7 @@ import functools
 import importlib
 import importlib.util
 import sys
+import threading
 from pathlib import Path
 from types import ModuleType
 
@@ -118,7 +119,10 @@ def variant_of(package: str) -> Variant:
     return _VARIANTS[package]
 
 
-@functools.cache
+BUILDING = threading.RLock()
+"""Held while kernels are built or compiled: several threads may make environments."""
+
+
 def build_kernels(variant: Variant) -> Kernels:
     """Runs the kernel package for a variant. It does not compile anything.
 
@@ -132,6 +136,12 @@ def build_kernels(variant: Variant) -> Kernels:
         Warp compiles and caches each variant separately. What does not depend on boxes
         and pairs comes from the variant without them.
     """
+    with BUILDING:
+        return _built(variant)
+
+
+@functools.cache
+def _built(variant: Variant) -> Kernels:
     _VARIANTS[variant.package] = variant
     package = _run_template(variant.package)
     plain = dataclasses.replace(variant, boxes=False, pairs=False)

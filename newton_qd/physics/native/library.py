@@ -6,6 +6,7 @@ import ctypes
 import functools
 import os
 import tempfile
+import threading
 from pathlib import Path
 
 from newton_qd.physics.warp_internals import load_native
@@ -121,11 +122,19 @@ def _address(process: ctypes.CDLL | None, name: str) -> int | None:
     return ctypes.cast(getattr(process, name), ctypes.c_void_p).value
 
 
-@functools.cache
+_COMPILING = threading.RLock()
+
+
 def library() -> Library:
     """Returns the functions. The first call compiles them.
 
     Raises:
         UnsupportedWarpError: The installed Warp cannot compile them.
     """
+    with _COMPILING:
+        return _library()
+
+
+@functools.cache
+def _library() -> Library:
     return Library()
