@@ -250,5 +250,7 @@ def test_the_humanoid_lies_on_its_back() -> None:
     expected = {"torso": 5, "right_shin": 2, "left_shin": 2}
     expected |= {"right_lower_arm": 3, "left_lower_arm": 3}
     assert {name: names.count(name) for name in names} == expected
-    with pytest.raises(RobotDescriptionError, match=r"rest_rotation: got .*not free"):
+    with pytest.raises(
+        RobotDescriptionError, match=r"rest_rotation: got .*no free root"
+    ):
         variant(REACHERANGLE, "float32", rest_rotation=(1.0, 0.0, 0.0))

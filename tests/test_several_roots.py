@@ -110,3 +110,20 @@ def test_a_plan_of_no_actuators(x64: None, tmp_path: Path) -> None:
         state, fault = step(state, plan[k])
         np.testing.assert_array_equal(found.after.q[k], state.q)
         assert found.fault[k] == fault == 0
+
+
+def test_a_ball_beside_the_robot_keeps_its_place(x64: None, tmp_path: Path) -> None:
+    """The torso alone is put on the ground, wherever other bodies are."""
+    contacts = (Contact("a"), Contact("b"))
+    turned: object = (0.0, 0.0, 0.5)
+    for spec in ({}, {"rest_rotation": turned}):
+        system = system_of(tmp_path, {"a": 1.0, "b": 1.0}, contacts=contacts, **spec)
+        a, b = system.rest_q.reshape(-1, 7)
+        assert a[2] == pytest.approx(0.1) and b.tolist() == [0, 0, 0, 0, 0, 0, 1]
+        assert (a[5] == 0) == (not spec)
+        q = placed(system, (0, 0, 3), (0, 0, -5))
+        moved = np.asarray(physics.on_ground(system, jnp.asarray(q)))
+        assert moved[2] == pytest.approx(0.1)
+        np.testing.assert_array_equal(np.delete(moved, 2), np.delete(q, 2))
+    only_b = system_of(tmp_path, {"a": 1.0, "b": 1.0}, contacts=contacts[1:])
+    assert physics.grounding_coordinate(only_b) is None and only_b.rest_q[2] == 0

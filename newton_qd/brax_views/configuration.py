@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from newton_qd.envs.joints import joint_chains
-from newton_qd.physics.system import System
+from newton_qd.physics.system import JointKind, System
 
 _DEGREES = 180.0 / math.pi
 _FULL_TURN = 360.0  # a limit of an axis that turns freely [degree]
@@ -123,11 +123,17 @@ def default_pose(system: System) -> Defaults:
         tuple(
             DefaultAngle(
                 system.joint_names[chain[-1]],
-                Vector(*(system.rest_q[system.q_start[chain]] * _DEGREES).tolist()),
+                Vector(*_angles(system, chain)),
             )
             for chain in _chains(system)
         )
     )
+
+
+def _angles(system: System, chain: list[int]) -> list[float]:
+    """Returns the angles of a joint [degree]; slides have none."""
+    turning = [x for x in chain if system.joint_kind[x] == JointKind.REVOLUTE]
+    return (system.rest_q[system.q_start[turning]] * _DEGREES).tolist()
 
 
 def _chains(system: System) -> list[list[int]]:

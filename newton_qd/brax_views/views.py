@@ -25,7 +25,6 @@ from newton_qd.brax_views.configuration import (
 )
 from newton_qd.checks import Fact, message
 from newton_qd.envs.joints import joint_chains, joint_indices, solid_bodies
-from newton_qd.physics.model.rest import grounding_coordinate
 from newton_qd.physics.system import PhysicsState, System
 
 _GROUND = ("Ground", "floor")  # names of the last row in the original
@@ -234,10 +233,7 @@ class SystemView:
         joint_q, joint_v = joint_indices(system)
         if joint_angle is not None:
             q = q.at[joint_q].set(_checked("joint_angle", joint_angle, joint_q, dtype))
-            grounding = grounding_coordinate(system)
-            if grounding is not None:
-                coordinate, sign = grounding
-                q = q.at[coordinate].add(-sign * physics.lowest_contact(system, q))
+            q = physics.on_ground(system, q)
         if joint_velocity is not None:
             v = v.at[joint_v].set(
                 _checked("joint_velocity", joint_velocity, joint_v, dtype)

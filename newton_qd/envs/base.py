@@ -108,7 +108,6 @@ class PhysicsEnv(Env):
         self.system: System = system
         self._joint_q, self._joint_v = joint_indices(system)
         inputs.require_actuators(system)
-        self._grounding = physics.grounding_coordinate(system)
         rest = jax.eval_shape(self._rest)
         action = jax.ShapeDtypeStruct((self.action_size,), self._dtype)
         self._layout: tuple[tuple[str, int], ...] = ()
@@ -267,9 +266,7 @@ class PhysicsEnv(Env):
         q = self._number(self.reset_pose(root_key, rest.q))
         q = physics.unit_quaternions(self.system, q)
         q = q.at[self._joint_q].add(self._noise(angle_key, self._angle_noise))
-        if self._grounding is not None:
-            coordinate, sign = self._grounding
-            q = q.at[coordinate].add(-sign * physics.lowest_contact(self.system, q))
+        q = physics.on_ground(self.system, q)
         noise = self._noise(velocity_key, self._velocity_noise)
         v = rest.v.at[self._joint_v].set(noise)
         state = self._first_state(physics.initial_state(self.system, q, v))

@@ -12,6 +12,7 @@ from newton_qd.physics.inspection import (
     forward_kinematics,
     lowest_contact,
     mass_matrix,
+    on_ground,
     seen_bodies,
 )
 from newton_qd.physics.messages import quiet
@@ -45,6 +46,7 @@ __all__ = [
     "load_system",
     "lowest_contact",
     "mass_matrix",
+    "on_ground",
     "raising_coordinate",
     "recommended_substeps",
     "rollout",

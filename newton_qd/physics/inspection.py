@@ -9,6 +9,7 @@ import numpy as np
 from newton_qd import checks
 from newton_qd.checks import message
 from newton_qd.physics import bridge
+from newton_qd.physics.model.rest import grounding_coordinate, own_ground_contacts
 from newton_qd.physics.system import (
     Kinematics,
     PhysicsState,
@@ -55,6 +56,7 @@ def forward_kinematics(system: System, q: jax.Array, v: jax.Array) -> Kinematics
         The kinematics. Differentiable in reverse mode.
 
     Raises:
+        TypeError: ``q`` or ``v`` does not have real numbers.
         ValueError: ``q`` or ``v`` has the wrong shape.
     """
     q = checked_vector(system, "q", q, system.nq)
@@ -97,6 +99,7 @@ def mass_matrix(system: System, q: jax.Array) -> jax.Array:
         (nv, nv) symmetric matrix M in the equation M dv/dt + bias = force.
 
     Raises:
+        TypeError: ``q`` does not have real numbers.
         ValueError: ``q`` has the wrong shape.
     """
     q = checked_vector(system, "q", q, system.nq)
@@ -118,6 +121,7 @@ def bias_forces(system: System, q: jax.Array, v: jax.Array) -> jax.Array:
         (nv,) generalized force [N or N m] that makes dv/dt zero.
 
     Raises:
+        TypeError: ``q`` or ``v`` does not have real numbers.
         ValueError: ``q`` or ``v`` has the wrong shape.
     """
     q = checked_vector(system, "q", q, system.nq)
@@ -140,6 +144,7 @@ def contact_gaps(system: System, q: jax.Array) -> jax.Array:
         penetration. Both rows of a pair have the same gap.
 
     Raises:
+        TypeError: ``q`` does not have real numbers.
         ValueError: ``q`` has the wrong shape.
     """
     q = checked_vector(system, "q", q, system.nq)
@@ -193,11 +198,42 @@ def lowest_contact(system: System, q: jax.Array) -> jax.Array:
         () height above z = 0 [m].
 
     Raises:
+        TypeError: ``q`` does not have real numbers.
         ValueError: ``q`` has the wrong shape, or the robot has no ground contacts.
     """
+    q = checked_vector(system, "q", q, system.nq)
+    return _lowest(system, q, system.ground_contacts)
+
+
+@takes_system
+def on_ground(system: System, q: jax.Array) -> jax.Array:
+    """Moves the torso, and what hangs on it, up or down to the ground.
+
+    Args:
+        system: The system.
+        q: (nq,) coordinates [m or rad].
+
+    Returns:
+        (nq,) coordinates; ``q`` if the robot has no coordinate that does this (see
+        ``grounding_coordinate``).
+
+    Raises:
+        TypeError: ``q`` does not have real numbers.
+        ValueError: ``q`` has the wrong shape.
+    """
+    q = checked_vector(system, "q", q, system.nq)
+    grounding = grounding_coordinate(system)
+    if grounding is None:
+        return q
+    coordinate, sign = grounding
+    lowest = _lowest(system, q, own_ground_contacts(system))
+    return q.at[coordinate].add(-sign * lowest)
+
+
+def _lowest(system: System, q: jax.Array, ground: np.ndarray) -> jax.Array:
+    """Returns the height () of the lowest of some contacts [m]."""
     still = jnp.zeros((system.nv,), q.dtype)
     kinematics = forward_kinematics(system, q, still)
-    ground = system.ground_contacts
     bodies = system.contact_body[ground]
     local = jnp.asarray(system.contact_position[ground], q.dtype)
     centre = kinematics.position[bodies] + _rotate(kinematics.rotation[bodies], local)

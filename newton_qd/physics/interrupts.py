@@ -16,6 +16,8 @@ from collections.abc import Callable
 from types import CodeType, FrameType
 
 _RETRY_SECONDS = 0.02
+# JAX runs this function while Python collects garbage. Python drops its exceptions.
+_SWALLOWING = ("_xla_gc_callback",)
 _protected: set[CodeType] = set()
 _files: set[str] = set()
 # The signal handler writes to this queue. The handler may interrupt any code, including
@@ -43,7 +45,7 @@ def protect(function: Callable) -> None:
 def _inside_callback(frame: FrameType | None) -> bool:
     while frame is not None:
         code = frame.f_code
-        if code in _protected:
+        if code in _protected or code.co_name in _SWALLOWING:
             return True
         if code.co_filename in _files and "<locals>" in code.co_qualname:
             return True

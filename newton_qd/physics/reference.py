@@ -183,10 +183,18 @@ def penetration(gap: float, width: float) -> float:
     return (width - gap) ** 3 * (3 * width + gap) / (16 * width**3)
 
 
-def lowest_contact(system: System, q: np.ndarray) -> float:
-    """Returns the height above z = 0 of the lowest ground-contact sphere [m]."""
+def lowest_contact(
+    system: System, q: np.ndarray, contacts: np.ndarray | None = None
+) -> float:
+    """Returns the height above z = 0 of the lowest ground-contact sphere [m].
+
+    Args:
+        system: The system.
+        q: (nq,) coordinates.
+        contacts: Rows of the contact tables; ``None``: all ground contacts.
+    """
     frames = body_frames(system, q)
-    ground = system.ground_contacts
+    ground = system.ground_contacts if contacts is None else contacts
     heights = [
         compose(frames[body], np.append(position, [0, 0, 0, 1.0]))[2] - radius
         for body, position, radius in zip(

@@ -84,8 +84,10 @@ class RobotSpec:
             ``end`` 0.
         rest_pose: ``(joint, angle)`` of the default pose [rad]; 0 for all other joints.
         rest_height: Height of the torso in the default pose [m]; ``None`` puts
-            the lowest contact on the ground.
-        rest_rotation: Roll, pitch and yaw of a free root in the default pose [rad].
+            the lowest contact on the ground. Free bodies that do not hang on the torso
+            stay at the origin; ``reset_pose`` can place them.
+        rest_rotation: Roll, pitch and yaw of the torso's free root in the default pose
+            [rad].
         servos: Joints of ``actuators`` that hold an angle. Their action is the target
             [rad or m]. Their gear is the torque per radian of error [N m/rad], or the
             force per metre [N/m].

@@ -42,14 +42,12 @@ from newton_qd.physics.model.substeps import (
 from newton_qd.physics.model.verify import BuiltModel, ModelMismatchError, verify
 from newton_qd.physics.model.wall_speeds import SoftWallWarning, soft_walls
 from newton_qd.physics.model.xml_reader import RobotDescriptionError
-from newton_qd.physics.system import TAILS, JointKind, System
+from newton_qd.physics.system import STANDARD_GRAVITY, TAILS, JointKind, System
 from newton_qd.robots import RobotSpec
 from newton_qd.scenes import Scene
 
 if TYPE_CHECKING:
     import newton
-
-_EARTH_GRAVITY = 9.81  # [m/s^2]
 
 
 def newton_builder(
@@ -277,7 +275,7 @@ def _system(
         obstacle_tables(links),
     )
     total_mass = sum(body.link.mass for body in bodies)
-    weight = total_mass * (robot.gravity or _EARTH_GRAVITY)
+    weight = total_mass * (robot.gravity or STANDARD_GRAVITY)
     material = robot.material
     system = System(
         robot=robot,

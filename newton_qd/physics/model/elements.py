@@ -27,7 +27,8 @@ UNLIMITED = 1e9
 _POINT = 1e-9
 
 _JOINT_TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating")
-_WITHOUT_AXIS = ("fixed", "floating")
+WITHOUT_AXIS = ("fixed", "floating")
+"""Types of a joint that have no axis."""
 _SHORTEST = 1e-6  # of an axis: Newton divides by its length in single precision
 # Attributes that a shape must have. Newton uses 1 for a missing size.
 _SHAPES = {
@@ -259,7 +260,7 @@ def read_joint(reader: XmlReader, element: ElementTree.Element) -> Joint:
     child = reader.text(reader.child(element, "child"), "link")
     frame = reader.frame(element)
     axis, damping, limits = np.array([1.0, 0.0, 0.0]), 0.0, None
-    if kind not in _WITHOUT_AXIS:  # what such a joint says of an axis has no meaning
+    if kind not in WITHOUT_AXIS:  # what such a joint says of an axis has no meaning
         axis, damping = _read_axis(reader, element), _read_damping(reader, element)
         limits = _read_limits(reader, element)
     lower, upper = limits or (-math.inf, math.inf)

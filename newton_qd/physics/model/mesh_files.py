@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from urllib.parse import unquote, urlsplit
 from xml.etree import ElementTree
 
 from newton_qd.checks import listed
@@ -49,7 +50,7 @@ class Folders:
         if not mark:
             places = [self._base / name]
         elif scheme.lower() == "file":
-            places = [Path(rest)]
+            places = [Path(unquote(urlsplit(name).path))]
         elif scheme.lower() in ("package", "model"):
             package, _, inside = rest.partition("/")
             above = [self._base, *self._base.parents, *self._packages]

@@ -19,6 +19,7 @@ import numpy as np
 
 from newton_qd.checks import Fact, message
 from newton_qd.physics.model.description import merged_inertia
+from newton_qd.physics.model.elements import WITHOUT_AXIS
 from newton_qd.physics.model.mesh_files import Folders
 from newton_qd.physics.model.xml_reader import (
     IDENTITY,
@@ -29,7 +30,6 @@ from newton_qd.physics.reference import compose, inverse, rotation_matrix
 
 _READ = ("link", "joint", "material")
 _MOTION = ("axis", "dynamics", "limit")
-_WITHOUT_AXIS = ("fixed", "floating")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -170,7 +170,7 @@ def _drop_unread(root: ElementTree.Element) -> None:
     for joint in root.iter("joint"):
         for child in list(joint):
             # what a joint without an axis says of one has no meaning
-            if joint.get("type") in _WITHOUT_AXIS and child.tag in _MOTION:
+            if joint.get("type") in WITHOUT_AXIS and child.tag in _MOTION:
                 joint.remove(child)
             for name in ("effort", "velocity"):
                 if child.tag == "limit" and not _is_number(child.get(name, "0")):

@@ -50,9 +50,28 @@ def grounding_coordinate(system: System) -> tuple[int, float] | None:
         ``None`` if the robot has no such coordinate, if its ``RobotSpec`` sets the
         height, or if the robot has no ground contacts.
     """
-    if system.robot.rest_height is not None or not len(system.ground_contacts):
+    if system.robot.rest_height is not None or not len(own_ground_contacts(system)):
         return None
     return raising_coordinate(system)
+
+
+def own_ground_contacts(system: System) -> np.ndarray:
+    """Returns the ground contacts of the bodies that hang together with the torso.
+
+    Other free bodies, such as a ball, do not move with the torso.
+
+    Args:
+        system: The robot.
+
+    Returns:
+        Their rows in the system's contact tables.
+    """
+    roots = np.arange(len(system.parent))
+    for body, parent in enumerate(system.parent):
+        if parent >= 0:
+            roots[body] = roots[parent]
+    ground = system.ground_contacts
+    return ground[roots[system.contact_body[ground]] == roots[system.torso]]
 
 
 def rest_coordinates(system: System) -> np.ndarray:
@@ -65,11 +84,15 @@ def rest_coordinates(system: System) -> np.ndarray:
     robot = system.robot
     q = np.array(system.rest_q)
     free = system.q_start[system.joint_kind == JointKind.FREE]
-    if not len(free) and any(robot.rest_rotation):
-        why = "and the root is not free"
+    free_root = _free_root(system)
+    if free_root is None and any(robot.rest_rotation):
+        why = "and the torso has no free root"
         raise refusal(robot, "rest_rotation", robot.rest_rotation, "zeros", why=why)
     for start in free:
-        q[start + 3 : start + 7] = reference.rpy_quaternion(*robot.rest_rotation)
+        q[start + 6] = 1.0
+    if free_root is not None:
+        turned = reference.rpy_quaternion(*robot.rest_rotation)
+        q[free_root + 3 : free_root + 7] = turned
     for joint, angle in robot.rest_pose:
         q[system.q_start[index_of(robot, "rest_pose", joint, system.joint_names)]] = (
             angle
@@ -92,6 +115,15 @@ def rest_coordinates(system: System) -> np.ndarray:
     if robot.rest_height is not None:
         torso = reference.body_frames(posed, q)[system.torso, 2]
         q[coordinate] += sign * (robot.rest_height - torso)
-    elif robot.contacts:
-        q[coordinate] -= sign * reference.lowest_contact(posed, q)
+    elif len(contacts := own_ground_contacts(posed)):
+        q[coordinate] -= sign * reference.lowest_contact(posed, q, contacts)
     return q
+
+
+def _free_root(system: System) -> int | None:
+    """Returns the first coordinate of the torso's free root; ``None``: it has none."""
+    body = system.torso
+    while system.parent[body] >= 0:
+        body = int(system.parent[body])
+    free = system.joint_kind[body] == JointKind.FREE
+    return int(system.q_start[body]) if free else None

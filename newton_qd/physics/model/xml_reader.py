@@ -36,16 +36,18 @@ def asset_file(urdf: Path, name: str) -> Path | None:
             ``package://NAME/path`` with a folder NAME that contains the URDF file.
     """
     folder = urdf.absolute().parent
-    if name.startswith(("package://", "model://")):
-        package = name.split("://")[1].split("/")[0]
+    scheme, mark, rest = name.partition("://")
+    scheme = scheme.lower()
+    if mark and scheme in ("package", "model"):
+        package = rest.partition("/")[0]
         roots = [above.parent for above in (folder, *folder.parents)]
         names = [above.name for above in (folder, *folder.parents)]
         if package not in names:
             return None
-        path = roots[names.index(package)] / name.split("://")[1]
-    elif name.startswith("file://"):
+        path = roots[names.index(package)] / rest
+    elif mark and scheme == "file":
         path = Path(unquote(urlsplit(name).path))
-    elif "://" in name:
+    elif mark:
         return None
     else:
         path = folder / name
