@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import newton_qd
-from newton_qd import cli
+from newton_qd import cli, tasks
 from newton_qd.envs.state import State
 from newton_qd.errors import FaultError
 from newton_qd.gradients import GradientReport, diagnose_gradients
@@ -201,3 +201,52 @@ def test_command(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     captured = capsys.readouterr()
     assert "--out" in captured.err and not captured.out  # before any work
     assert cli.main(["doctor", "gradients", "nothing"]) == cli.BAD_ARGUMENTS
+
+
+class Miscounted(Growing):
+    """A reward whose gradient is wrong by a factor."""
+
+    def __init__(self, factor: float) -> None:
+        super().__init__(0.5)
+        self.factor = factor
+
+    def _state(self, x: jax.Array, steps: jax.Array) -> State:
+        state = super()._state(x, steps)
+        still = jax.lax.stop_gradient(state.reward)
+        return state.replace(reward=still + self.factor * (state.reward - still))
+
+
+@pytest.mark.parametrize("factor", [0.0, 2.0])
+def test_a_wrong_gradient_is_found(factor: float) -> None:
+    """One of length 0, and one of the right direction and the wrong length."""
+    env: Any = Miscounted(factor)
+    report = diagnose_gradients(env, horizons=(1, 2), worlds=2, directions=2, samples=4)
+    assert report.exact_horizon == 0
+    assert "over none of these horizons" in report.verdict
+    for row in report.horizons:
+        assert row.cosine == pytest.approx(0.0 if factor == 0 else 1.0)
+        assert row.length < 1e-9 if factor == 0 else row.length == pytest.approx(2)
+
+
+class Still(Growing):
+    """A reward that does not change."""
+
+    def _state(self, x: jax.Array, steps: jax.Array) -> State:
+        return super()._state(x, steps).replace(reward=jnp.ones(()))
+
+
+def test_a_gradient_of_nothing_is_of_no_use(tmp_path: Path) -> None:
+    env: Any = Still(0.5)
+    report = diagnose_gradients(env, horizons=(1, 2), worlds=2, samples=4)
+    assert report.exact_horizon == 2 and report.useful_horizon == 0
+    assert report.verdict.startswith("The gradient is 0 up to 2 control steps (0.2 s)")
+    report.write(tmp_path)
+
+
+def test_an_environment_without_precision(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tasks, "ENVIRONMENTS", dict(tasks.ENVIRONMENTS))
+    newton_qd.register("single_only", lambda: newton_qd.create("pointmaze").unwrapped)
+    assert cli.main(["doctor", "gradients", "single_only"]) == cli.BAD_ARGUMENTS
+    assert "error: dtype: got 'float64', which is not" in capsys.readouterr().err

@@ -15,6 +15,7 @@ from test_episode_gradients import Line, make
 
 import newton_qd
 from newton_qd import physics
+from newton_qd.envs.pointmaze import PointMaze
 from newton_qd.envs.state import State
 from newton_qd.extractors import get_feet_contact_proportion
 from newton_qd.gradients import (
@@ -24,6 +25,7 @@ from newton_qd.gradients import (
     make_episode_gradient,
     with_smooth_descriptor,
 )
+from newton_qd.wrappers import EpisodeWrapper
 
 STEPS, KEY = 16, jax.random.key(3)
 
@@ -148,3 +150,18 @@ def test_parameters_are_checked_before_anything_is_compiled() -> None:
     ):
         with pytest.raises(ValueError, match=r"^params\.friction: got -1\.0; allowed"):
             run()
+
+
+def test_transitions_need_no_wrapper() -> None:
+    """Only an ``EpisodeWrapper`` cuts episodes; without one, none is cut."""
+    env = PointMaze()
+    episode = newton_qd.Episode(env, None, episode_length=3, transitions=True)
+    found = episode(jnp.zeros((3, 2)), jax.random.key(0)).transitions
+    assert found["truncations"].tolist() == [0, 0, 0]
+
+
+def test_a_fault_may_be_a_python_number() -> None:
+    env = EpisodeWrapper(PointMaze(), 5, 1)
+    state = env.reset(jax.random.key(0))
+    state = state.replace(info={**state.info, "fault": 0})
+    assert env.step(state, jnp.zeros(2)).info["steps"] == 1

@@ -28,6 +28,7 @@ from newton_qd.gradients.mixed import Mixture
 from newton_qd.gradients.report import ContactRow, GradientReport, HorizonRow
 from newton_qd.types import Genotype, Policy, RNGKey
 
+_ROUNDING = 1e-9  # central differences of a constant are below it
 _BREAK = 0.1  # relative error above which the derivative of a step is broken
 
 
@@ -152,7 +153,7 @@ def _rows(
     rows = []
     for index, end in enumerate(ends):
         alive = difference.alive[:, end - 1]
-        cosines = _cosines(difference, int(end) - 1)
+        cosines, lengths = _agreement(difference, int(end) - 1)
         norms = difference.norms[:, end - 1]
         rows.append(
             HorizonRow(
@@ -163,6 +164,7 @@ def _rows(
                 largest_norm=float(norms.max()),
                 cosine=float(np.median(cosines)),
                 worst_cosine=float(cosines.min()),
+                length=float(lengths[np.abs(np.log(lengths)).argmax()]),
                 first_deviation=_root(mixed.first_variance, index),
                 zeroth_deviation=_root(mixed.zeroth_variance, index),
                 bias=float(apart[:, index].mean()),
@@ -177,14 +179,29 @@ def _root(variance: jax.Array, index: int) -> float:
     return float(np.sqrt(np.median(np.asarray(variance)[:, index])))
 
 
-def _cosines(difference: Differences, step: int) -> np.ndarray:
-    """Returns the cosine (worlds,) of exact and central derivatives."""
+def _agreement(difference: Differences, step: int) -> tuple[np.ndarray, np.ndarray]:
+    """Compares exact and central derivatives, at the distance where they agree best.
+
+    Returns:
+        Their cosine (worlds,), and the ratio of their lengths (worlds,). Both are 1 if
+        both derivatives are 0, and the smallest number if one alone is.
+    """
     exact = difference.exact[:, :, step]
     central = difference.central[:, :, :-1, step]
-    scale = np.linalg.norm(exact, axis=1)[:, None] * np.linalg.norm(central, axis=1)
+    own, other = np.linalg.norm(exact, axis=1), np.linalg.norm(central, axis=1)
+    # A derivative of 0 is right only if no difference is larger than its rounding.
+    still = (own == 0) & (other <= _ROUNDING).all(axis=1)
+    scale = own[:, None] * other
+    lost = scale == 0
     inner = (exact[:, :, None] * central).sum(axis=1)
-    zero = scale == 0
-    return np.where(zero, 1.0, inner / np.where(zero, 1.0, scale)).max(axis=1)
+    cosines = np.where(lost, 0.0, inner / np.where(lost, 1.0, scale))
+    tiny = np.finfo(np.float64).tiny
+    ratios = np.where(lost, tiny, own[:, None] / np.where(lost, 1.0, other))
+    best = cosines.argmax(axis=1)[:, None]
+    cosine, ratio = (
+        np.take_along_axis(x, best, axis=1)[:, 0] for x in (cosines, ratios)
+    )
+    return np.where(still, 1.0, cosine), np.where(still, 1.0, np.maximum(ratio, tiny))
 
 
 def _contacts(subject: Subject, difference: Differences) -> tuple[ContactRow, ...]:

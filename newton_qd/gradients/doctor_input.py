@@ -102,7 +102,8 @@ def made_env(env: Env | str) -> Env:
     """Returns the environment to diagnose.
 
     Raises:
-        TypeError: It is neither a name nor an environment.
+        TypeError: It is neither a name nor an environment, or its base takes no
+            ``dtype``.
         ValueError: It is float32, or has a batch.
     """
     if isinstance(env, str):

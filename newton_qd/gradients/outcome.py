@@ -116,7 +116,8 @@ def transition(
         "next_obs": end.obs,
         "rewards": end.reward,
         "dones": end.done,
-        "truncations": end.info["truncation"],
+        # only ``EpisodeWrapper`` knows when an episode ends because of its length
+        "truncations": end.info.get("truncation", jnp.zeros_like(end.done)),
         "actions": action,
         "state_desc": begin.info["state_descriptor"],
         "next_state_desc": end.info["state_descriptor"],

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 AGREEMENT = 0.999
 """Smallest cosine with central differences of a correct gradient [-]."""
+LENGTH_ERROR = 0.05
+"""Largest error of the length of a correct gradient [-], as a logarithm."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,6 +35,8 @@ class HorizonRow:
         largest_norm: Norm of the gradient, maximum over the worlds.
         cosine: Cosine with central differences along random directions, median [-].
         worst_cosine: The same cosine, minimum over the worlds [-].
+        length: Length of the gradient along these directions divided by that of the
+            central differences [-], of the world where it is farthest from 1.
         first_deviation: Standard deviation of a first-order sample, over the whole
             genotype, median; infinite if a sample was not finite.
         zeroth_deviation: Standard deviation of a zeroth-order sample, in the same way.
@@ -49,6 +53,7 @@ class HorizonRow:
     largest_norm: float
     cosine: float
     worst_cosine: float
+    length: float
     first_deviation: float
     zeroth_deviation: float
     bias: float
@@ -108,12 +113,17 @@ class GradientReport:
     @property
     def exact_horizon(self) -> int:
         """Longest horizon at which the gradient agrees with differences, or 0."""
-        return self._last(lambda row: row.worst_cosine >= AGREEMENT)
+        return self._last(
+            lambda row: (
+                row.worst_cosine >= AGREEMENT
+                and abs(math.log(row.length)) <= LENGTH_ERROR
+            )
+        )
 
     @property
     def useful_horizon(self) -> int:
         """Longest horizon at which first orders vary less than zeroth orders, or 0."""
-        return self._last(lambda row: row.order > 0.5)
+        return self._last(lambda row: row.order > 0.5 and row.norm > 0)
 
     def _last(self, good: Callable[[HorizonRow], bool]) -> int:
         last = 0
@@ -129,6 +139,12 @@ class GradientReport:
         exact, useful = self.exact_horizon, self.useful_horizon
         longest = self.horizons[-1].steps
         usable = min(exact, useful)
+        if exact == longest and all(row.largest_norm == 0 for row in self.horizons):
+            return (
+                f"The gradient is 0 up to {self._time(longest)}, and so are the "
+                "differences: small changes do not change the return. Use zeroth-order "
+                "gradients."
+            )
         agrees = (
             f"The gradient agrees with differences up to {self._time(exact)}"
             if exact
@@ -174,8 +190,9 @@ class GradientReport:
                 "largest",
                 "cosine",
                 "worst",
-                "1st order sd",
-                "0th order sd",
+                "length",
+                "sd 1",
+                "sd 0",
                 "bias",
                 "alpha",
             ),
@@ -188,6 +205,7 @@ class GradientReport:
                     f"{row.largest_norm:.3g}",
                     f"{row.cosine:.6f}",
                     f"{row.worst_cosine:.6f}",
+                    f"{row.length:.3g}",
                     f"{row.first_deviation:.3g}",
                     f"{row.zeroth_deviation:.3g}",
                     f"{row.bias:.2f} +- {row.bias_error:.2f}",
@@ -282,7 +300,8 @@ class GradientReport:
         right.set_ylabel(f"deviation of a sample, noise {self.sigma:g}")
         for axes in (left, middle, right):
             axes.set_xscale("log", base=2)
-            axes.set_yscale("log")
+            if any(y > 0 for line in axes.lines for y in line.get_ydata()):
+                axes.set_yscale("log")
             axes.set_xticks(steps, [str(s) for s in steps])
             axes.set_xlabel("control steps of the return")
             axes.grid(True, color="0.9")
