@@ -186,7 +186,7 @@ def _descriptor_specs(
         checks.function("descriptor", descriptor, allowed)
         _refuse_robot("descriptor", descriptor)
         descriptor = WrapperSpec(descriptor)
-    _check_wrappers((descriptor,))
+    _check_wrapper("descriptor", descriptor)
     return (descriptor,)
 
 
@@ -218,14 +218,22 @@ def _check_wrappers(wrappers: object) -> None:
         allowed += "(WrapperSpec(FeetContactWrapper),)"
         raise TypeError(message("wrappers", wrappers, allowed))
     for index, spec in enumerate(wrappers):
-        name = f"wrappers[{index}]"
         allowed = "a WrapperSpec, such as WrapperSpec(FeetContactWrapper)"
-        checks.instance(name, spec, WrapperSpec, allowed)
-        checks.function(f"{name}.wrapper", spec.wrapper, "a class or a function")
-        _refuse_robot(f"{name}.wrapper", spec.wrapper)
-        allowed = "a mapping of keyword arguments"
-        checks.instance(f"{name}.options", spec.options, Mapping, allowed)
-        spec.check_options(f"{name}.options", spec.options)
+        checks.instance(f"wrappers[{index}]", spec, WrapperSpec, allowed)
+        _check_wrapper(f"wrappers[{index}]", spec)
+
+
+def _check_wrapper(name: str, spec: WrapperSpec) -> None:
+    """Checks a wrapper and its options.
+
+    Raises:
+        TypeError: It is a class of robots, or does not take one of its options.
+    """
+    checks.function(f"{name}.wrapper", spec.wrapper, "a class or a function")
+    _refuse_robot(f"{name}.wrapper", spec.wrapper)
+    allowed = "a mapping of keyword arguments"
+    checks.instance(f"{name}.options", spec.options, Mapping, allowed)
+    spec.check_options(f"{name}.options", spec.options)
 
 
 def create(
@@ -265,6 +273,8 @@ def create(
         UnknownEnvironment: ``env_name`` is not registered.
         TypeError: An argument has the wrong type, or a keyword argument is unknown.
         ValueError: A value or a combination of values is not allowed.
+        NotImplementedError: ``material`` or ``brax_views`` is given, and the
+            environment has no physics.
     """
     spec = _spec(env_name)
     checks.flag("auto_reset", auto_reset)

@@ -22,6 +22,7 @@ from collections.abc import Iterator, Mapping
 from typing import Generic, TypeAlias, TypeVar
 
 from newton_qd import tasks
+from newton_qd.checks import message
 from newton_qd.tasks import EnvironmentSpec
 from newton_qd.types import DescriptorExtractor
 
@@ -51,6 +52,16 @@ class _Column(Mapping[str, Value], Generic[Value]):
         raise KeyError(
             f"{env_name!r} has no {self._attribute}; known: {', '.join(self)}"
         )
+
+    def __setitem__(self, env_name: str, value: Value) -> None:
+        """Refuses to change the table.
+
+        Raises:
+            TypeError: Always.
+        """
+        name, why = f"{self._attribute}[{env_name!r}]", "and the table is read-only"
+        allowed = "environments of newton_qd.register, with what belongs to them"
+        raise TypeError(message(name, value, allowed, why=why))
 
     def __iter__(self) -> Iterator[str]:
         return iter(dict(self._items()))

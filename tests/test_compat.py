@@ -82,6 +82,45 @@ def test_voronoi_plots_of_qdax_run_with_numpy_2() -> None:
     assert len(regions) == 5
 
 
+def test_pareto_plots_of_qdax_run_with_new_matplotlib() -> None:
+    plotting: Any = importlib.import_module("qdax.utils.plotting")
+    assert plotting.cm.get_cmap("viridis", 3).N == 3
+
+
+def test_submodules_are_attributes_of_their_packages() -> None:
+    newton_qd.compat.uninstall()
+    newton_qd.compat.install()
+    home: Any = importlib.import_module("qdax.tasks.brax.v1")
+    assert home.envs.pointmaze.PointMaze is newton_qd.envs.pointmaze.PointMaze
+    assert home.wrappers.base_wrappers.QDEnv is newton_qd.envs.base.QDEnv
+    old: Any = importlib.import_module("qdax.environments")
+    assert old.wrappers.ClipRewardWrapper is newton_qd.wrappers.ClipRewardWrapper
+
+
+def test_a_search_leaves_the_imports_of_others_alone() -> None:
+    newton_qd.compat.uninstall()
+    with newton_qd.compat.installed():
+        importlib.import_module("qdax.tasks.brax.v1")
+        with newton_qd.compat.installed():  # inside, nothing is undone
+            pass
+        assert finder._FINDER in sys.meta_path
+    assert finder._FINDER not in sys.meta_path
+    assert not set(CONTENTS) & set(sys.modules)
+    newton_qd.compat.install()
+
+
+def test_functions_of_jumpy() -> None:
+    jp: Any = importlib.import_module("brax.v1.jumpy")
+    x = jnp.array([[3.0, 4.0], [0.0, 0.0]])
+    assert jp.norm(x) == 5 and jp.safe_norm(x, axis=1).tolist() == [5, 0]
+    slope = jax.grad(lambda x: jp.safe_norm(x, axis=1).sum())(x)
+    np.testing.assert_allclose(slope, [[0.6, 0.8], [0, 0]], rtol=1e-6)
+    assert jp.safe_norm(x[1]) == 0
+    assert jp.take({"x": x}, [1, 0])["x"].tolist() == [[0, 0], [3, 4]]
+    assert jp.index_update(x, (1, 0), 7).tolist() == [[3, 4], [7, 0]]
+    assert 2 <= jp.randint(jp.random_prngkey(0), low=2, high=4) < 4
+
+
 def test_installing_is_silent() -> None:
     newton_qd.compat.uninstall()
     with warnings.catch_warnings():

@@ -109,3 +109,24 @@ def test_plans_are_arrays_and_begin_with_a_state() -> None:
     state = jax.eval_shape(batch.reset, KEY)
     with pytest.raises(ValueError, match=r"^params: got .* the batch axis \(2,\)"):
         batch.rollout(state, jnp.zeros((4, 2, 3)), one.default_params)
+
+
+class OfQDax(nq.Wrapper):
+    """A wrapper whose ``step`` has no argument for parameters, as in QDax."""
+
+    def step(self, state: Any, action: Any) -> Any:  # type: ignore[override]
+        state = self.env.step(state, action)
+        return state.replace(reward=state.reward + 1)
+
+
+def test_a_step_of_two_arguments_works_inside_wrappers() -> None:
+    point = newton_qd.create("pointmaze", episode_length=None, auto_reset=False)
+    inside: Any = OfQDax(point)
+    env = newton_qd.wrappers.AutoResetWrapper(
+        newton_qd.wrappers.EpisodeWrapper(inside, 5, 1)
+    )
+    state, action = env.reset(KEY), jnp.zeros(2)
+    plain = point.step(point.reset(KEY), action)
+    assert env.step(state, action).reward == plain.reward + 1
+    with pytest.raises(TypeError, match="params: got parameters, and step of OfQDax"):
+        inside.step(inside.reset(KEY), action, 3)

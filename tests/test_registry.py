@@ -321,3 +321,15 @@ def test_old_names_say_the_new_ones(module: str, old: str, new: str) -> None:
     assert found is getattr(importlib.import_module(home), name)
     with pytest.raises(AttributeError, match=f"'{module}' has no attribute 'nothing'"):
         importlib.import_module(module).nothing  # noqa: B018
+
+
+def test_tables_say_how_they_grow() -> None:
+    table: Any = newton_qd.tables.reward_offset
+    with pytest.raises(TypeError, match=r"\['mine'\]: got 3.0, and the table is"):
+        table["mine"] = 3.0
+
+
+def test_a_wrong_descriptor_is_named() -> None:
+    wrong: Any = newton_qd.tasks.WrapperSpec(3)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match=r"^descriptor\.wrapper: got 3"):
+        newton_qd.register("mine", lambda: None, descriptor=wrong)  # type: ignore

@@ -9,6 +9,6 @@ After this, ``qdax.tasks.brax.v1`` and the older ``qdax.environments`` and
 library. All other modules of QDax are its own. No file of QDax is changed.
 """
 
-from newton_qd.compat.finder import SUPPORTED, install, uninstall
+from newton_qd.compat.finder import SUPPORTED, install, installed, uninstall
 
-__all__ = ["SUPPORTED", "install", "uninstall"]
+__all__ = ["SUPPORTED", "install", "installed", "uninstall"]

@@ -22,11 +22,15 @@ from newton_qd.files import write_atomically
 __all__ = [
     "QP",
     "Joint",
+    "index_update",
+    "randint",
     "random_prngkey",
     "random_split",
     "random_uniform",
     "render",
+    "safe_norm",
     "save_html",
+    "take",
     "vec_to_arr",
 ]
 
@@ -50,6 +54,31 @@ def random_uniform(
     """Returns uniform random numbers from ``low`` to ``high``."""
     most = 1.0 if high is None else high
     return jax.random.uniform(rng, shape, jnp.float32, low or 0.0, most)
+
+
+def randint(
+    rng: jax.Array, shape: tuple[int, ...] = (), low: int = 0, high: int = 1
+) -> jax.Array:
+    """Returns uniform random integers from ``low`` to below ``high``."""
+    return jax.random.randint(rng, shape, low, high)
+
+
+def take(tree: Any, i: Any, axis: int = 0) -> Any:
+    """Returns elements of each leaf along an axis."""
+    indices = jnp.asarray(i)
+    return jax.tree.map(lambda x: jnp.take(x, indices, axis=axis, mode="clip"), tree)
+
+
+def index_update(x: jax.Array, idx: Any, y: Any) -> jax.Array:
+    """Returns a copy with ``x[idx]`` replaced by ``y``."""
+    return jnp.asarray(x).at[idx].set(y)
+
+
+def safe_norm(x: jax.Array, axis: int | None = None) -> jax.Array:
+    """Returns the norm of a vector. At 0, its gradient is 0."""
+    zero = jnp.all(x == 0, axis=axis, keepdims=True)
+    norm = jnp.linalg.norm(jnp.where(zero, 1.0, x), axis=axis)
+    return jnp.where(zero.reshape(norm.shape), 0.0, norm)
 
 
 def vec_to_arr(vector: Any) -> np.ndarray:

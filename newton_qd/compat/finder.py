@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import importlib.metadata
 import sys
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder
 from importlib.util import find_spec, spec_from_loader
@@ -52,6 +53,9 @@ class _Finder(MetaPathFinder, Loader):
             source = importlib.import_module(home)
             for name in names:
                 setattr(module, name, getattr(source, name))
+        for name in self.contents:  # as the originals, which import their submodules
+            if name.rpartition(".")[0] == module.__name__:
+                importlib.import_module(name)
 
 
 _FINDER = _Finder()
@@ -80,8 +84,8 @@ def install() -> None:
     imported = [name for name in CONTENTS if name in sys.modules]
     if imported:
         raise ImportError(
-            f"{imported[0]} is imported already, with environments that are not of "
-            "newton_qd; call newton_qd.compat.install() before importing QDax"
+            f"{imported[0]} is imported already, from QDax itself; call "
+            "newton_qd.compat.install() before importing QDax"
         )
     _restore_jax()  # first, so that a warning as an error leaves nothing half done
     _FINDER.contents = CONTENTS if _has_brax_v1() else {**CONTENTS, **BRAX_V1}
@@ -89,6 +93,25 @@ def install() -> None:
     for name, mend in MENDED.items():
         if name in sys.modules:
             mend(sys.modules[name])
+
+
+@contextlib.contextmanager
+def installed() -> Iterator[None]:
+    """Installs for a while: for modules of QDax that import its environments.
+
+    Raises:
+        MissingExtra: QDax is not installed.
+        ImportError: The installed release of QDax is not in ``SUPPORTED``.
+    """
+    own = any(name in sys.modules for name in CONTENTS)
+    if own or _FINDER in sys.meta_path:  # QDax has its environments, or ours
+        yield
+        return
+    install()
+    try:
+        yield
+    finally:
+        uninstall()
 
 
 def uninstall() -> None:

@@ -6,7 +6,7 @@ import functools
 from collections.abc import Callable
 from importlib.abc import Loader
 from importlib.machinery import ModuleSpec
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,15 @@ from newton_qd.envs.env import Env
 
 
 def mend_plotting(module: ModuleType) -> None:
-    """Lets QDax's Voronoi plots run with NumPy 2, which has lost ``ndarray.ptp``."""
+    """Lets QDax's plots run with new releases.
+
+    NumPy 2 has lost ``ndarray.ptp``, which Voronoi plots need. Matplotlib 3.9 has lost
+    ``cm.get_cmap``, which plots of Pareto fronts need.
+    """
+    if not hasattr(module.cm, "get_cmap"):
+        get_cmap = module.plt.get_cmap
+        names = SimpleNamespace(**vars(module.cm), get_cmap=get_cmap)
+        module.cm = names  # type: ignore[attr-defined]
     original = module.get_voronoi_finite_polygons_2d
 
     @functools.wraps(original)

@@ -13,6 +13,7 @@ import numpy as np
 
 from newton_qd.checks import message
 from newton_qd.envs import rollouts
+from newton_qd.envs.renamed import accept_params
 from newton_qd.envs.shown import described
 from newton_qd.envs.state import State, no_brax_view
 from newton_qd.robots import Material
@@ -26,6 +27,11 @@ class Env(abc.ABC):
     Environments are immutable. They compare and hash by identity, so they can be static
     arguments of jitted functions.
     """
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Lets ``step`` do without ``params``, as in wrappers written for QDax."""
+        super().__init_subclass__(**options)
+        accept_params(cls)
 
     def __repr__(self) -> str:
         return described(self)

@@ -70,8 +70,8 @@ def _make(context: EmitterContext, options: DCRLMEOptions) -> Any:
 
     from newton_qd import compat
 
-    compat.install()  # QDax's file imports environments that fail with today's JAX
-    from qdax.core.emitters.dcrl_me_emitter import DCRLMEConfig, DCRLMEEmitter
+    with compat.installed():  # its file imports environments that fail with today's JAX
+        from qdax.core.emitters.dcrl_me_emitter import DCRLMEConfig, DCRLMEEmitter
     from qdax.core.neuroevolution.buffers.buffer import DCRLTransition
     from qdax.core.neuroevolution.networks.networks import MLPDC
 

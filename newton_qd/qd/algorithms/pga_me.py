@@ -39,8 +39,8 @@ def _make(context: EmitterContext, options: PGAMEOptions) -> Any:
     """
     from newton_qd import compat
 
-    compat.install()  # QDax's file imports environments that fail with today's JAX
-    from qdax.core.emitters.pga_me_emitter import PGAMEConfig, PGAMEEmitter
+    with compat.installed():  # its file imports environments that fail with today's JAX
+        from qdax.core.emitters.pga_me_emitter import PGAMEConfig, PGAMEEmitter
     from qdax.core.neuroevolution.buffers.buffer import QDTransition
 
     from newton_qd.qd.algorithms.network_emitter import OfParameters
