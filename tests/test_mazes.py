@@ -160,3 +160,15 @@ def test_mazes_of_others(tmp_path: Path) -> None:
     for wrong, error, message in wrongs:
         with pytest.raises(error, match=f"^{message}"):
             MazeWrapper(Ant(), "ant", **wrong)
+
+
+def test_another_scene_has_another_target() -> None:
+    env: Any = newton_qd.create("antmaze_u", episode_length=5)
+    moved: Any = env.with_scene(ANTMAZE_HARDEST)
+    links = moved.system.scene_links
+    target = moved.system.scene_frames[links.index("target"), :2]
+    state = moved.fixed_state()
+    place = state.pipeline_state.q[:2]
+    assert state.reward == pytest.approx(-float(jnp.linalg.norm(place - target)))
+    with pytest.raises(ValueError, match=r"scene: got None with .*a link 'target'"):
+        env.with_scene(None)

@@ -192,7 +192,9 @@ def test_state_descriptor_follows_the_auto_reset() -> None:
         ({"wall_width_ratio": np.nan}, r"wall_width_ratio: got nan.*from 0 to 1"),
         ({"wall_width_ratio": -1.0}, r"wall_width_ratio: got -1.0.*from 0 to 1"),
         ({"x_max": np.inf}, r"x_max: got inf.*finite"),
-        ({"x_min": 2.0}, r"x_min, x_max: got \(2.0, 1.0\).*x_min below"),
+        ({"x_min": 2.0}, r"x_min, x_max: got \(2.0, 1.0\).*x_min at most 0"),
+        ({"x_min": 0.5}, r"x_min, x_max: got \(0.5, 1.0\).*x_min at most 0"),
+        ({"x_min": 0.0, "x_max": 0.0}, r"x_min, x_max: .*not both 0"),
         ({"y_min": -0.5}, r"y_min, y_max: got \(-0.5.*below -0.7"),
         ({"upper_wall_height_offset": -0.6}, r"upper_wall_height_offset: got .*-0.6"),
         ({"dtype": "float16"}, r"dtype: got 'float16'.*float32, float64"),
@@ -223,3 +225,21 @@ def test_another_maze() -> None:
     np.testing.assert_allclose(maze.goal, (-0.5, 2.0))
     state = maze.step(at((-0.3, 1.9), maze), jnp.zeros(2, np.float32))
     assert float(state.done) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("position", "action", "end"),
+    [
+        ((0.9, 0.4), (0, -1), (0.9, -0.49)),  # through the gap of the upper wall
+        ((-0.9, -0.6), (0, 1), (-0.9, 0.2)),  # through that of the lower one
+        ((0, 0.9), (0, -1), (0, 0.21)),
+        ((0, -0.9), (0, 1), (0, -0.5)),
+        ((0.6, 0.4), (-1, -1), (-0.4, 0.21)),
+    ],
+)
+def test_long_steps_stop_at_the_first_wall(
+    position: Any, action: Any, end: Any
+) -> None:
+    env = PointMaze(scale_action_space=1.0)
+    found = env.step(at(position, env), jnp.asarray(action, np.float32)).obs
+    np.testing.assert_allclose(found, end, atol=1e-6)

@@ -57,8 +57,9 @@ class PointMaze(QDEnv):
         Args:
             scale_action_space: A step moves the point by the clipped action divided by
                 this number.
-            x_min: Left border of the box.
-            x_max: Right border.
+            x_min: Left border of the box, at most 0. A reset puts the point between a
+                tenth of ``x_min`` and of ``x_max``.
+            x_max: Right border, at least 0.
             y_min: Lower border, below -0.7. A reset puts the point between ``y_min``
                 and -0.7.
             y_max: Upper border.
@@ -173,29 +174,20 @@ class PointMaze(QDEnv):
         low, high = self._array(self._low), self._array(self._high)
         move = rounded(jnp.clip(action, low, high) / self._scale)
         new = old + move
-        new = new.at[1].set(self._stopped_by_lower(old, new))
-        new = new.at[1].set(self._stopped_by_upper(old, new))
-        return jnp.clip(new, low, high)
+        return jnp.clip(new.at[1].set(self._stopped(old, new)), low, high)
 
-    def _stopped_by_lower(self, old: jax.Array, new: jax.Array) -> jax.Array:
-        """Returns y () of a point that meets the lower wall."""
-        top = self._lower + _WALL_THICKNESS
-        y_old, y = old[1], new[1]
-        up = (y_old <= self._lower) & (self._lower < y)
-        down = (y < top) & (top <= y_old) & (y_old < self._upper)
-        blocked = _crossing(old, new, self._lower, up | down) >= self._lower_begins
-        y = jnp.where(up & blocked, self._array(self._lower), y)
-        return jnp.where(down & blocked, self._array(top), y)
-
-    def _stopped_by_upper(self, old: jax.Array, new: jax.Array) -> jax.Array:
-        """Returns y () of a point that meets the upper wall."""
-        top = self._upper + _WALL_THICKNESS
-        y_old, y = old[1], new[1]
-        up = (y > self._upper) & (self._upper >= y_old) & (y_old > self._lower)
-        down = (y_old >= top) & (top > y)
-        blocked = _crossing(old, new, self._upper, up | down) <= self._upper_ends
-        y = jnp.where(down & blocked, self._array(top), y)
-        return jnp.where(up & blocked, self._array(self._upper), y)
+    def _stopped(self, old: jax.Array, new: jax.Array) -> jax.Array:
+        """Returns y () of a point that stops at the first wall that it meets."""
+        lower, upper = self._lower, self._upper
+        up, down, x = _crossing(old, new, lower)
+        lower_up, lower_down = (way & (x >= self._lower_begins) for way in (up, down))
+        up, down, x = _crossing(old, new, upper)
+        upper_up, upper_down = (way & (x <= self._upper_ends) for way in (up, down))
+        # on the way up, a path meets the lower wall first; on the way down, the upper
+        y = jnp.where(upper_up, self._array(upper), new[1])
+        y = jnp.where(lower_up, self._array(lower), y)
+        y = jnp.where(lower_down, self._array(lower + _WALL_THICKNESS), y)
+        return jnp.where(upper_down, self._array(upper + _WALL_THICKNESS), y)
 
     def _in_zone(self, position: jax.Array) -> jax.Array:
         inside = jnp.ones((), jnp.bool_)
@@ -312,17 +304,22 @@ class PointMaze(QDEnv):
 
 
 def _crossing(
-    old: jax.Array, new: jax.Array, height: float, crosses: jax.Array
-) -> jax.Array:
-    """Returns x () at which the path from ``old`` to ``new`` (2,) meets a height.
+    old: jax.Array, new: jax.Array, height: float
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Returns how the path from ``old`` to ``new`` (2,) meets the height of a wall.
 
-    If the path does not cross that height, the result is finite but has no meaning.
+    Returns:
+        Whether it crosses the lower face on the way up (), and the upper face on the
+        way down (). And x () at which it meets the lower face, which is finite but has
+        no meaning if it crosses neither.
     """
-    x_old, y_old = old
-    x, y = new
+    (x_old, y_old), (x, y) = old, new
+    top = height + _WALL_THICKNESS
+    up = (y_old <= height) & (height < y)
+    down = (y < top) & (top <= y_old)
     # without this, a horizontal path would divide 0 by 0
-    rise = jnp.where(crosses, y - y_old, jnp.ones_like(y))
-    return rounded((height - y_old) / rise * (x - x_old)) + x_old
+    rise = jnp.where(up | down, y - y_old, jnp.ones_like(y))
+    return up, down, rounded((height - y_old) / rise * (x - x_old)) + x_old
 
 
 def _require_box(
@@ -333,8 +330,8 @@ def _require_box(
     Raises:
         ValueError: They are not in the right order.
     """
-    if not x[0] < x[1]:
-        allowed = "x_min below x_max"
+    if not x[0] <= 0 <= x[1] or x[0] == x[1]:
+        allowed = "x_min at most 0, x_max at least 0, not both 0"
         raise ValueError(message("x_min, x_max", x, allowed))
     if not y[0] < _HIGHEST_START < y[1]:
         allowed = f"y_min below {_HIGHEST_START}, y_max above it"

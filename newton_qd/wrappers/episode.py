@@ -113,4 +113,4 @@ def _moving(state: State) -> jax.Array:
     """Returns 1 if the next step counts, because the world has no fault, else 0."""
     if "fault" not in state.info:
         return jnp.ones_like(state.done)
-    return (state.info["fault"] == 0).astype(state.done.dtype)
+    return jnp.asarray(state.info["fault"] == 0, state.done.dtype)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 
@@ -65,11 +68,31 @@ class MazeWrapper(SceneTaskWrapper):
             checks.interval("heights", heights)
             self.heights = heights
         super().__init__(env, env_name)
-        links = self.system.scene_links
+        self._target()  # its error comes before the first episode
+
+    def _target(self) -> np.ndarray:
+        """Returns x and y (2,) of the target [m].
+
+        Raises:
+            ValueError: The scene has none.
+        """
+        system = self.system
+        links = system.scene_links
         if "target" not in links:
-            given = Fact(f"{self.scene.name!r} with {listed(links)}")
+            scene = None if system.scene is None else system.scene.name
+            given = Fact(f"{scene!r} with {listed(links)}")
             raise ValueError(message("scene", given, "a scene with a link 'target'"))
-        self._target = self.system.scene_frames[links.index("target"), :2]
+        return system.scene_frames[links.index("target"), :2]
+
+    def with_base(self, change: Callable[[Env], Env]) -> Env:
+        """Returns the same wrappers around another environment.
+
+        Raises:
+            ValueError: It has no target.
+        """
+        changed: Any = super().with_base(change)
+        changed._target()
+        return changed
 
     def _inside(self, env: Env, env_name: str) -> Env:
         return type(self)(env, env_name, self.scene, self.area, self.heights)
@@ -77,7 +100,7 @@ class MazeWrapper(SceneTaskWrapper):
     def _outcome(self, state: State) -> State:
         """Returns the state with the reward and the end of the task."""
         position = self._position(state)
-        away = position[:2] - np.asarray(self._target, self.dtype)
+        away = position[:2] - np.asarray(self._target(), self.dtype)
         base = self.unwrapped
         assert isinstance(base, PhysicsEnv)
         safe = within(position[2], self.heights, base.termination_width)
