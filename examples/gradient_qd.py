@@ -6,6 +6,7 @@ python examples/gradient_qd.py
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import functools
 from typing import Any
 
@@ -14,7 +15,7 @@ from qdax.core.containers.mapelites_repertoire import compute_euclidean_centroid
 from qdax.core.map_elites import MAPElites
 from qdax.utils.metrics import default_qd_metrics
 
-from newton_qd.gradients import GradientOptions
+from newton_qd.gradients import GradientOptions, with_smooth_descriptor
 from newton_qd.qd import EvolveConfig, episode_of, make_policy, make_task
 from newton_qd.qd.emitters import CMAMEGAEmitter
 
@@ -30,6 +31,9 @@ def main() -> None:
 
     config = EvolveConfig(env_name=options.env, episode_length=options.episode_length)
     task = make_task(config)
+    if task.env.state_descriptor_name == "feet_contact":  # its gradient is 0 without
+        env = with_smooth_descriptor(task.env, 0.1, straight_through=True)
+        task = dataclasses.replace(task, env=env)
     policy = make_policy(task.env, (32,))
     start, key = jax.random.key(0), jax.random.key(1)
     # The loop evaluates all offspring without gradients, the emitter four points with.
@@ -51,7 +55,8 @@ def main() -> None:
         functools.partial(default_qd_metrics, qd_offset=offset),
     )
     low, high = (limit.tolist() for limit in task.limits)
-    cells = compute_euclidean_centroids((32, 32), low, high)
+    side = round(1024 ** (1 / len(low)))
+    cells = compute_euclidean_centroids((side,) * len(low), low, high)
     population = jax.vmap(policy.init)(jax.random.split(key, emitter.batch_size))
     repertoire, state, metrics = jax.jit(search.init)(population, cells, key)
     update = jax.jit(search.update)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 
 import jax
 import numpy as np
@@ -10,7 +11,7 @@ from ribs.archives import GridArchive
 from ribs.emitters import GradientArborescenceEmitter
 from ribs.schedulers import Scheduler
 
-from newton_qd.gradients import GradientOptions
+from newton_qd.gradients import GradientOptions, with_smooth_descriptor
 from newton_qd.qd import (
     EvolveConfig,
     episode_of,
@@ -30,6 +31,9 @@ def main() -> None:
 
     config = EvolveConfig(env_name=options.env, episode_length=options.episode_length)
     task = make_task(config)
+    if task.env.state_descriptor_name == "feet_contact":  # its gradient is 0 without
+        env = with_smooth_descriptor(task.env, 0.1, straight_through=True)
+        task = dataclasses.replace(task, env=env)
     policy = make_policy(task.env, (16,))
     worst = -task.reward_offset * config.episode_length
     common = {"key": jax.random.key(1), "limits": task.limits, "worst": worst}
@@ -43,7 +47,7 @@ def main() -> None:
 
     grid = {
         "solution_dim": policy.size,
-        "dims": (32,) * task.descriptor_length,
+        "dims": (round(1024 ** (1 / task.descriptor_length)),) * task.descriptor_length,
         "ranges": list(zip(*task.limits, strict=True)),
         "qd_score_offset": worst,
     }

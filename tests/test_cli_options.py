@@ -167,6 +167,9 @@ def test_wrong_options_of_the_environment(
     ):
         assert cli.main([*ant, option]) == cli.BAD_ARGUMENTS, option
         assert text in capsys.readouterr().err
+    point = ["evolve", "pointmaze", "--env-option", "material.friction=1"]
+    assert cli.main(point) == cli.BAD_ARGUMENTS
+    assert "env_options: " in capsys.readouterr().err
     assert cli.main([*ant[:2], "--randomize", "fric=1,2"]) == cli.BAD_ARGUMENTS
     error = capsys.readouterr().err
     assert "randomize: fric: got (1.0, 2.0), which is no physical parameter; " in error
@@ -175,6 +178,12 @@ def test_wrong_options_of_the_environment(
     with pytest.raises(SystemExit):
         cli.main([*ant, "healthy_reward"])
     assert "a name and a value like healthy_reward=0.5" in capsys.readouterr().err
+    numbers: Any = {"sigma_g": np.float32(0.5), "n": np.int64(3)}
+    plain = EvolveConfig(options=numbers)
+    assert plain.options == (("n", 3), ("sigma_g", 0.5))
+    assert type(plain.options[0][1]) is int and type(plain.options[1][1]) is float
+    with pytest.raises(ConfigError, match=r"options: a: got an array"):
+        EvolveConfig(options={"a": np.zeros(2)})  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match=r"env_options: a\[1\]: got <object"):
         EvolveConfig(env_options={"a": [1, object()]})  # type: ignore[arg-type]
 

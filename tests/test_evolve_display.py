@@ -7,7 +7,7 @@ import io
 import numpy as np
 import pytest
 
-from newton_qd.cli.progress import Progress as Pages
+from newton_qd.cli.progress import ProgressCount
 from newton_qd.qd.run import plot
 from newton_qd.qd.run.archive import Archive
 from newton_qd.qd.run.progress import Progress
@@ -92,6 +92,16 @@ def test_bar_fits_the_terminal(monkeypatch: pytest.MonkeyPatch, columns: int) ->
     drawn = stream.getvalue().split("\r")[1:]
     assert len(drawn) == 2 and stream.getvalue().endswith("\x1b[K\n")
     assert all(len(line.partition("\x1b")[0]) < columns for line in drawn)
+    numbers = [line.partition("\x1b")[0] for line in drawn]
+    if columns >= 40:  # whole numbers, or none
+        shown = numbers[1].split("  ")
+        assert set(shown[1:-1]) <= {
+            "200/200",
+            "QD score 1,234,567",
+            "coverage 12.3%",
+            "best 56.8",
+        }
+        assert "200/200" in shown and shown[-1].endswith("<0:00")
     if columns >= 120:
         assert "QD score 1,234,567  coverage 12.3%  best 56.8" in drawn[1]
         assert "█" * 20 in drawn[1] and "200/200" in drawn[1]
@@ -127,7 +137,7 @@ def test_a_reader_that_leaves_ends_the_display_only(
     progress.update(200, ROW)
     progress.close()
     monkeypatch.setattr("sys.stderr", Gone())
-    with Pages("frames") as shown:
+    with ProgressCount("frames") as shown:
         shown(1, 2)
     assert capsys.readouterr().out == ""
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import base64
 import dataclasses
 import re
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -22,7 +24,7 @@ from newton_qd.qd.run.opened import Run
 from newton_qd.qd.run.reevaluation import Reevaluated
 from newton_qd.viewing import record, write_explorer
 from newton_qd.viewing.elites import record_elites
-from newton_qd.viewing.explorer import explorer_html
+from newton_qd.viewing.explorer import _motion_data, explorer_html
 
 __all__ = ["chrome", "pages"]  # fixtures
 
@@ -240,3 +242,21 @@ def test_wrong_runs_are_named(capsys: pytest.CaptureFixture[str]) -> None:
         assert "--out: got" not in capsys.readouterr().err
     assert cli.main(["explore", "a", "b", "c"]) == 2
     assert "DIR: got 3 folders; allowed: one folder or two" in capsys.readouterr().err
+
+
+def test_the_feet_of_a_page_are_those_of_the_descriptor() -> None:
+    """At the start of each step, so not in the last state."""
+    feet = np.array([1, 1, 0, 1, 0])[None, :, None]
+    shown: Any = SimpleNamespace(
+        q=np.zeros((1, 5, 1)),
+        steps=4,
+        lengths=np.array([4]),
+        rewards=np.ones((1, 4)),
+        feet=feet,
+    )
+    for every, expected in ((1, [1, 1, 0, 1]), (2, [2, 1])):
+        data = _motion_data(shown, every)
+        assert list(base64.b64decode(data["feet"]["data"])) == expected
+        assert data["lengths"] == [4 // every]
+    shown.lengths = np.array([3])
+    assert _motion_data(shown, 2)["lengths"] == [2]

@@ -11,7 +11,7 @@ from newton_qd.adapters.pickled import Pickled
 from newton_qd.envs.base import Env, PhysicsEnv
 from newton_qd.envs.state import State
 
-_AREA = 20.0  # half width of the grid on the ground [radii of the robot]
+_AREA = 20.0  # half width of the grid on the ground [radii of the robot, or lines]
 
 
 class LiveCamera(Pickled):

@@ -61,7 +61,7 @@ def main(
     _repair_streams()
     code = OK
     try:
-        arguments = parser.parse_args(argv)
+        arguments = _parsed(parser, argv)
         code = _run(arguments, task_factory)
         sys.stdout.flush()
     except BrokenPipeError:  # as in: newton-qd envs | head
@@ -76,6 +76,22 @@ def main(
             except OSError:
                 abandon(stream)
     return code
+
+
+def _parsed(
+    parser: argparse.ArgumentParser, argv: Sequence[str] | None
+) -> argparse.Namespace:
+    """Parses the arguments.
+
+    Raises:
+        OSError: The output does not take the help.
+        SystemExit: They are wrong, or help is wanted.
+    """
+    try:
+        return parser.parse_args(argv)
+    except SystemExit:
+        sys.stdout.flush()
+        raise
 
 
 def _repair_streams() -> None:

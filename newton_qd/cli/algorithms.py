@@ -8,11 +8,9 @@ from collections.abc import Iterable, Iterator
 from typing import Any
 
 from newton_qd.cli import modules
-from newton_qd.cli.arguments import OK, Commands
+from newton_qd.cli.arguments import OK, Commands, terminal_width
 from newton_qd.qd.algorithms import AlgorithmSpec, algorithm_named, algorithms
 from newton_qd.qd.algorithms.options import option_texts
-
-_WIDTH = 79
 
 
 def add_parser(commands: Commands) -> None:
@@ -56,7 +54,7 @@ def _plain(spec: AlgorithmSpec[Any]) -> str:
 
 def details(spec: AlgorithmSpec[Any]) -> Iterator[str]:
     """Yields the lines that describe an algorithm and its options."""
-    yield from textwrap.wrap(f"{spec.name}: {_plain(spec)}", _WIDTH)
+    yield from textwrap.wrap(f"{spec.name}: {_plain(spec)}", terminal_width())
     rows = [
         (f"{name}={default}" if default else name, meaning.replace("``", ""))
         for name, default, meaning in option_texts(spec.options)
@@ -81,7 +79,7 @@ def _columns(rows: Iterable[tuple[str, str]]) -> Iterator[str]:
     for head, text in rows:
         yield from textwrap.wrap(
             f"  {head.ljust(width)}  {text}",
-            max(_WIDTH, width + 34),
+            max(terminal_width(), width + 34),
             subsequent_indent=" " * (width + 4),
             break_on_hyphens=False,
         )

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import argparse
 import os
+import shutil
 import sys
+from pathlib import Path
 from typing import TextIO, TypeAlias
 
+from newton_qd.checks import message
+from newton_qd.qd.config import ConfigError
 from newton_qd.qd.facts import changed_facts, environment_facts
 from newton_qd.qd.run.progress import for_stream
 
@@ -64,6 +68,27 @@ def warn_of_changes(facts: dict[str, object], when: str) -> None:
             f"warning: {name} was {old} {when} and is {new} now; the result may differ",
             sys.stderr,
         )
+
+
+def require_writable(name: str, path: Path) -> None:
+    """Checks that a file or folder can be made or replaced, before the slow part.
+
+    Args:
+        name: Name of the argument.
+        path: The file or folder, which need not exist.
+
+    Raises:
+        ConfigError: Its folder cannot be written.
+    """
+    folder = next(parent for parent in path.absolute().parents if parent.exists())
+    if not os.access(folder, os.W_OK):
+        why = f"and {folder} cannot be written"
+        raise ConfigError(message(name, str(path), "a place that can be", why=why))
+
+
+def terminal_width() -> int:
+    """Returns the columns of a table for the terminal: 79, or fewer if it is narrow."""
+    return max(24, min(79, shutil.get_terminal_size().columns - 1))
 
 
 def widths(text: str) -> tuple[int, ...]:

@@ -6,7 +6,15 @@ import argparse
 from pathlib import Path
 
 from newton_qd.cli import health, modules
-from newton_qd.cli.arguments import BAD_ARGUMENTS, OK, Commands, complain, widths
+from newton_qd.cli.arguments import (
+    BAD_ARGUMENTS,
+    OK,
+    Commands,
+    complain,
+    require_writable,
+    say,
+    widths,
+)
 
 
 def add_parser(commands: Commands) -> None:
@@ -67,7 +75,11 @@ def add_parser(commands: Commands) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Prints a report, and writes it to files with ``--out``. Returns the exit code."""
+    """Prints a report, and writes it to files with ``--out``. Returns the exit code.
+
+    Raises:
+        ConfigError: The folder for the files cannot be written.
+    """
     import newton_qd
     from newton_qd.physics.precision import quiet
 
@@ -79,6 +91,8 @@ def run(arguments: argparse.Namespace) -> int:
     if out is not None and out.exists() and not out.is_dir():  # not after minutes
         refused = f"--out: got {out}, a file; allowed: a folder, or a new name"
         return complain(arguments, refused, BAD_ARGUMENTS)
+    if out is not None:
+        require_writable("--out", out)
     try:
         report = newton_qd.diagnose_gradients(
             arguments.env_name,
@@ -89,9 +103,11 @@ def run(arguments: argparse.Namespace) -> int:
             sigma=arguments.sigma,
             seed=arguments.seed,
         )
-    except ValueError as error:
+    except (TypeError, ValueError) as error:
         return complain(arguments, error, BAD_ARGUMENTS)
-    print(report)
+    table, _, verdict = str(report).rpartition("\n")
+    print(table)
+    say(verdict)
     if out is not None:
         report.write(out)
         print(f"written to {out}")

@@ -11,9 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from newton_qd.cli import modules
-from newton_qd.cli.arguments import OK, Commands
-
-_WIDTH = 79
+from newton_qd.cli.arguments import OK, Commands, terminal_width
 
 
 def add_parser(commands: Commands) -> None:
@@ -177,7 +175,7 @@ def _description(found: dict[str, Any]) -> str:
     wrapped = [
         textwrap.fill(
             line,
-            _WIDTH,
+            terminal_width(),
             subsequent_indent="    " if line.startswith("  ") else "",
             break_on_hyphens=False,
             break_long_words=False,

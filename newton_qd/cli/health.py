@@ -20,9 +20,13 @@ _ANT_HEIGHT = (0.1, 1.5)  # of the torso of an ant that stands or lies [m]
 
 def run(arguments: argparse.Namespace) -> int:
     """Prints what is installed and whether it works. Returns the exit code."""
+    # here, because the physics is slow to import
+    from newton_qd.physics.native.library import usable_cores
+
+    machine = f"{platform.system()} {platform.machine()}"
     found = {
         "python": platform.python_version(),
-        "machine": f"{platform.system()} {platform.machine()}, {_cores()} usable cores",
+        "machine": f"{machine}, {usable_cores()} usable cores",
         "packages": _packages(),
         "devices": _devices(),
         "kernel_cache": _kernel_cache(),
@@ -31,13 +35,6 @@ def run(arguments: argparse.Namespace) -> int:
     }
     print(json.dumps(found, indent=2) if arguments.json else _text(found))
     return OK if found["check"]["passed"] else FAILED
-
-
-def _cores() -> int:
-    """Returns the number of cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _packages() -> dict[str, str | None]:
@@ -51,10 +48,14 @@ def _devices() -> list[str]:
     """Returns the devices that JAX uses."""
     import jax
 
+    try:
+        devices = jax.devices()
+    except (AssertionError, RuntimeError) as error:  # such as JAX_PLATFORMS=cuda
+        return [f"none: {type(error).__name__}: {error}".partition("\n")[0]]
     return [
         f"{device.platform}:{device.id}"
         + ("" if device.device_kind == device.platform else f" {device.device_kind}")
-        for device in jax.devices()
+        for device in devices
     ]
 
 
@@ -63,8 +64,11 @@ def _kernel_cache() -> dict[str, Any]:
     from newton_qd.physics.cache import kernel_cache
     from newton_qd.physics.precision import quiet
 
-    quiet()
-    folder = Path(kernel_cache())
+    try:
+        quiet()
+        folder = Path(kernel_cache())
+    except OSError as error:  # Warp cannot make it
+        return {"folder": error.filename, "writable": False}
     return {"folder": str(folder), "writable": os.access(folder, os.W_OK)}
 
 

@@ -8,7 +8,7 @@ import time
 from types import TracebackType
 
 
-class Progress:
+class ProgressCount:
     """Shows how many of a number of things are done, on standard error.
 
     On a terminal it is one line that changes. Elsewhere nothing is shown before ten
@@ -25,7 +25,7 @@ class Progress:
         self._terminal = sys.stderr.isatty()
         self._next = time.monotonic() + (0.0 if self._terminal else 10.0)
 
-    def __enter__(self) -> Progress:
+    def __enter__(self) -> ProgressCount:
         return self
 
     def __call__(self, done: int, total: int) -> None:

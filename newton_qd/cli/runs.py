@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import io
+import sys
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -88,9 +90,13 @@ def opened(folder: Path, task_factory: TaskFactory) -> Run:
         why = "which is a file" if folder.exists() else "which does not exist"
         allowed = "a results folder, as newton-qd evolve writes it"
         raise ConfigError(message("DIR", str(folder), allowed, why=why))
-    run = load_run(
-        folder, task_factory=make_task if task_factory is None else task_factory
-    )
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UserWarning)
+        run = load_run(
+            folder, task_factory=make_task if task_factory is None else task_factory
+        )
+    for warning in caught:
+        say(f"warning: {warning.message}", sys.stderr)
     warn_of_changes(run.facts, "when the run began")
     return run
 

@@ -17,8 +17,9 @@ from newton_qd.cli.arguments import (
     add_elite_choice,
     complain,
     integers,
+    require_writable,
 )
-from newton_qd.cli.progress import Progress
+from newton_qd.cli.progress import ProgressCount
 from newton_qd.cli.runs import checked_starts, opened
 from newton_qd.qd.config import ConfigError, EvolveConfig
 
@@ -141,7 +142,10 @@ def _size(text: str) -> tuple[int, int]:
     Raises:
         argparse.ArgumentTypeError: The text is not two integers from 16 to 4096.
     """
-    size = integers(text, "x")
+    try:
+        size = integers(text, "x")
+    except argparse.ArgumentTypeError:
+        size = ()
     if len(size) != 2 or not all(16 <= each <= 4096 for each in size):
         given = f"got {text!r}; allowed: two integers from 16 to 4096, like 480x360"
         raise argparse.ArgumentTypeError(given)
@@ -215,7 +219,7 @@ def explore(arguments: argparse.Namespace, task_factory: TaskFactory = None) -> 
 
     options = {"starts": arguments.starts, "seed": seed}
     try:
-        with Progress("elites") as progress:
+        with ProgressCount("elites") as progress:
             write_explorer(runs, out, progress=progress, **options)
     except ValueError as error:
         return complain(arguments, error, BAD_ARGUMENTS)
@@ -252,7 +256,7 @@ def render(arguments: argparse.Namespace, task_factory: TaskFactory = None) -> i
     options = {"width": width, "height": height, "rate": arguments.rate or 20.0}
     try:
         trajectory, _ = _trajectory(arguments, task_factory)
-        with Progress("pictures") as progress:
+        with ProgressCount("pictures") as progress:
             write(trajectory, out, time=arguments.time, progress=progress, **options)
     except (LookupError, ValueError) as error:
         return complain(arguments, error, BAD_ARGUMENTS)
@@ -286,6 +290,7 @@ def _check_target(out: Path, *, given: bool) -> None:
     if given and not out.parent.is_dir():
         why = f"and {out.parent} is no folder"
         raise ConfigError(message("--out", str(out), "a file in a folder", why=why))
+    require_writable("--out", out)
 
 
 def _check_page(out: Path) -> None:

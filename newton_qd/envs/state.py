@@ -168,8 +168,8 @@ def _not_finite(part: Any, worlds: tuple[int, ...]) -> np.ndarray:
     """Returns which worlds have a value that is not finite, of the shape ``worlds``."""
     found = np.zeros(worlds, bool)
     for leaf in jax.tree.leaves(part):
-        finite = np.isfinite(np.asarray(leaf)).reshape((*worlds, -1))
-        found = found | ~finite.all(axis=-1)
+        finite = np.isfinite(np.asarray(leaf))
+        found = found | ~finite.all(axis=tuple(range(len(worlds), finite.ndim)))
     return found
 
 

@@ -10,6 +10,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
 
+import numpy as np
+
 from newton_qd import checks
 from newton_qd.checks import Fact, listed, message
 
@@ -102,8 +104,7 @@ class EvolveConfig:
             value = getattr(self, name)
             if isinstance(value, list):
                 object.__setattr__(self, name, tuple(value))
-        object.__setattr__(self, "options", _pairs("options", self.options))
-        for name in ("env_options", "randomize"):
+        for name in ("options", "env_options", "randomize"):
             frozen = tuple(
                 (key, plain_value(f"{name}: {key}", value))
                 for key, value in _pairs(name, getattr(self, name))
@@ -211,6 +212,8 @@ def plain_value(name: str, value: Any) -> Any:
     Raises:
         ConfigError: Files of settings cannot hold it.
     """
+    if isinstance(value, np.generic):
+        value = value.item()
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, list | tuple):

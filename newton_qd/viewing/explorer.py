@@ -282,7 +282,7 @@ def _motion_data(trajectory: Trajectory, every: int) -> dict[str, Any]:
     steps = np.arange(trajectory.steps)
     valid = steps < trajectory.lengths[:, None]
     rewards = np.where(valid, trajectory.rewards, 0.0)
-    feet = trajectory.feet[:, 1:] > 0
+    feet = trajectory.feet[:, :-1] > 0  # at the start of each step, as descriptors
     missing = (-trajectory.steps) % every
     rewards = np.pad(rewards, [(0, 0), (0, missing)])
     feet = np.pad(feet, [(0, 0), (0, missing), (0, 0)])
@@ -295,5 +295,5 @@ def _motion_data(trajectory: Trajectory, every: int) -> dict[str, Any]:
         "rewards": encode(summed[..., None], "int16"),
         "feet": encode(touched, "uint8"),
         "every": every,
-        "lengths": (trajectory.lengths // every).tolist(),
+        "lengths": (-(-trajectory.lengths // every)).clip(max=frames - 1).tolist(),
     }

@@ -36,8 +36,8 @@ from newton_qd.qd.emitters.restarts import RestartRule
 from newton_qd.qd.scoring.gradient_scores import (
     GradientsError,
     Scores,
-    check_genotypes,
     finite_scores,
+    genotype_matrix,
     normalize,
     read_scores,
 )
@@ -158,7 +158,7 @@ class ArborescenceEmitter(Emitter, abc.ABC):
                 ``start`` has another shape than the genotypes.
         """
         del fitnesses, extra_scores
-        size, dtype = check_genotypes(genotypes).shape[1], genotypes.dtype
+        size, dtype = genotype_matrix(genotypes).shape[1], genotypes.dtype
         keys = jax.random.split(key, 5)
         points_key, score_key, sample_key, state_key, begin_key = keys
         if self._start is None:

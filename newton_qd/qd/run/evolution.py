@@ -121,6 +121,7 @@ def evolve(
     Raises:
         ConfigError: A setting is wrong, the folder is in use, or the run to resume has
             other settings.
+        UnknownEnvironment: No environment of this name is registered.
         ArchiveError: The archive in the folder ``start_from`` is damaged.
         CheckpointError: The checkpoint of the run to resume is damaged.
         MissingExtra: QDax, matplotlib or tensorboardX is not installed.

@@ -125,18 +125,22 @@ class Progress:
         if iteration > first:
             left = (self.total - iteration) * (now - since) / (iteration - first)
         head = f"{self._name} {fraction:4.0%}"
-        tail = (
-            f"{iteration}/{self.total}  QD score {row['qd_score']:,.0f}  "
-            f"coverage {row['coverage']:.1f}%  best {row['max_fitness']:.1f}  "
-            f"{_clock(now - self._begin)}<{_clock(left)}"
-        )
+        fields = [
+            f"{iteration}/{self.total}",
+            f"QD score {row['qd_score']:,.0f}",
+            f"coverage {row['coverage']:.1f}%",
+            f"best {row['max_fitness']:.1f}",
+            f"{_clock(now - self._begin)}<{_clock(left)}",
+        ]
         if not self._tty:
-            return f"{head}  {tail}"
+            return "  ".join([head, *fields])
         # One column stays free, because a full line would wrap on some terminals.
         columns = shutil.get_terminal_size().columns - 1
-        room = columns - len(head) - len(tail) - 3
-        bar = f" {self._bar(fraction, min(room, _BAR_WIDTH))}" if room > 0 else ""
-        return f"{head}{bar}  {tail}"[:columns]
+        while len(fields) > 2 and len("  ".join([head, *fields])) > columns:
+            del fields[-2]  # a number that is cut would be another number
+        room = columns - len("  ".join([head, *fields])) - 1
+        bar = f" {self._bar(fraction, min(room, _BAR_WIDTH))}" if room > 4 else ""
+        return "  ".join([f"{head}{bar}", *fields])[:columns]
 
     def _bar(self, fraction: float, width: int) -> str:
         filled = round(fraction * width)

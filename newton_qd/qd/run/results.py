@@ -95,9 +95,12 @@ def _metrics(path: Path) -> dict[str, np.ndarray]:
     """Reads ``metrics.csv``.
 
     Raises:
-        ConfigError: It has other columns, values that are not numbers, or a last line
-            without an end.
+        ConfigError: It does not exist, or has other columns, values that are not
+            numbers, or a last line without an end.
     """
+    if not path.is_file():
+        allowed = "a results folder with metrics.csv or checkpoint.bin"
+        raise ConfigError(message(str(path), Fact("no file"), allowed))
     text = path.read_text(encoding="utf-8")
     if text and not text.endswith("\n"):
         given = Fact("a last line without an end, whose last number may be cut")

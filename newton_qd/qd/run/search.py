@@ -223,7 +223,7 @@ class Search:
         """Returns the key of the start states of a generation."""
         if not self._config.new_starts:
             return self._key_reset
-        # the first of these keys is that of the re-evaluations
+        # 0 is the key of the first population, and 1 that of the re-evaluations
         return jax.random.fold_in(self._key_reset, iteration + 2)
 
     @functools.cached_property

@@ -10,6 +10,7 @@ import jax
 
 from newton_qd import memory
 from newton_qd.qd.config import ConfigError, EvolveConfig
+from newton_qd.qd.scoring.networks import policy_for
 from newton_qd.qd.scoring.task import Task
 from newton_qd.wrappers.vector import state_bytes
 
@@ -29,9 +30,7 @@ def check_memory(config: EvolveConfig, task: Task, device: Any) -> None:
     Raises:
         ConfigError: They cannot.
     """
-    widths = (task.env.observation_size, *config.hidden, task.env.action_size)
-    layers = itertools.pairwise(widths)
-    policy = _WEIGHT * sum((before + 1) * after for before, after in layers)
+    policy = _WEIGHT * _policy_size(config, task)
     cells = config.centroids or math.prod(config.grid or (1,))
     # parents, their children, and the children that the archive compares
     needed = (3 * config.batch_size + cells) * policy
@@ -41,3 +40,12 @@ def check_memory(config: EvolveConfig, task: Task, device: Any) -> None:
     given = (config.batch_size, config.hidden, cells)
     name, most = "batch_size, hidden, cells", memory.limit(where)
     memory.check(name, given, needed, most, ConfigError)
+
+
+def _policy_size(config: EvolveConfig, task: Task) -> int:
+    """Returns the number of weights of a policy."""
+    if task.network is not None:
+        return policy_for(task, config.hidden).size
+    # without making the network, which may be too large
+    widths = (task.env.observation_size, *config.hidden, task.env.action_size)
+    return sum((before + 1) * after for before, after in itertools.pairwise(widths))

@@ -74,7 +74,7 @@ def read_scores(
         GradientsError: The gradients are missing or have the wrong shape, or genotypes
             are not one array.
     """
-    count, size = check_genotypes(genotypes).shape
+    count, size = genotype_matrix(genotypes).shape
     expected = (count, size, 1 + descriptors.shape[-1])
     allowed = f"(N, size, 1 + D) = {expected}"
     if extra_scores is None or GRADIENTS not in extra_scores:
@@ -106,8 +106,8 @@ def read_scores(
     )
 
 
-def check_genotypes(genotypes: Genotype) -> jax.Array:
-    """Checks that genotypes are one array (N, size), and returns it.
+def genotype_matrix(genotypes: Genotype) -> jax.Array:
+    """Returns genotypes as one array (N, size).
 
     Raises:
         GradientsError: They are not one array.

@@ -17,8 +17,6 @@ from newton_qd.qd.scoring.scatter import Scatter, scatter_of
 from newton_qd.qd.scoring.task import Task
 from newton_qd.types import ExtraScores, Genotype, PyTree, RNGKey, ScoringFunction
 
-_KNOWN = ("transitions", "gradients", "normalized_grads", "faulty", "overflowed")
-
 
 def robust_scoring(
     score: ScoringFunction,
@@ -172,9 +170,8 @@ def _joined(
     """
     joined: dict[str, Any] = {}
     for name, value in extra.items():
-        if name not in _KNOWN:
-            allowed = f"{listed(_KNOWN)}"
-            raise ValueError(message("extra scores", name, allowed))
+        if name not in _PARTS:
+            raise ValueError(message("extra scores", name, listed(_PARTS)))
         joined[name] = jax.tree.map(_PARTS[name], value)
     if "gradients" in extra:
         mixed = jax.tree.map(lambda x: _mixed(weights, slopes, x), extra["gradients"])

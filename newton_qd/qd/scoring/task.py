@@ -75,10 +75,10 @@ def make_task(config: EvolveConfig) -> Task:
     name = config.env_name
     if name not in newton_qd.registered_envs():
         raise newton_qd.UnknownEnvironment(name, newton_qd.registered_envs())
-    tasks = sorted(newton_qd.tables.descriptor_extractor)
-    if name not in tasks:
+    described = sorted(newton_qd.tables.descriptor_extractor)
+    if name not in described:
         why = "which has no descriptor"
-        raise ConfigError(message("env_name", name, listed(tasks), why=why))
+        raise ConfigError(message("env_name", name, listed(described), why=why))
     if name not in newton_qd.tables.reward_offset:
         allowed = "names with one, so pass reward_offset to newton_qd.register"
         why = "which has no reward_offset"
@@ -145,7 +145,7 @@ def _environment(config: EvolveConfig) -> Any:
             auto_reset=False,
             **options,
         )
-    except (TypeError, ValueError) as error:
+    except (NotImplementedError, TypeError, ValueError) as error:
         if not options:
             raise
         raise ConfigError(f"env_options: {error}") from error

@@ -98,13 +98,13 @@
       const color = NQD.palette[f % NQD.palette.length];
       let touched = 0;
       made.pen.fillStyle = color;
-      for (let k = 1; k <= length; k++) {
+      for (let k = 0; k < length; k++) { // as a descriptor: not the last state
         // a frame may stand for several steps
         const share = this.data.feet.data[(w * frames + k) * nf + f] / most;
         if (!share) continue;
         touched += share;
         made.pen.globalAlpha = share;
-        const x = (k - 1) / total * made.width;
+        const x = k / total * made.width;
         made.pen.fillRect(
           x, f * HEIGHT.feet + 1, Math.max(1, made.width / total), HEIGHT.feet - 2);
       }

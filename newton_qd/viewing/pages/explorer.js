@@ -167,7 +167,7 @@
         r * (frames - 1));
       shown.feet.data.set(
         motion.feet.data.subarray(at * (own - 1) * nf, (at + 1) * (own - 1) * nf),
-        (r * frames + 1) * nf);
+        r * frames * nf);
     });
     player.load(shown);
     player.playing = true;
