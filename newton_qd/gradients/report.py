@@ -191,10 +191,6 @@ class GradientReport:
                 "cosine",
                 "worst",
                 "length",
-                "sd 1",
-                "sd 0",
-                "bias",
-                "alpha",
             ),
             [
                 (
@@ -206,6 +202,16 @@ class GradientReport:
                     f"{row.cosine:.6f}",
                     f"{row.worst_cosine:.6f}",
                     f"{row.length:.3g}",
+                )
+                for row in self.horizons
+            ],
+        )
+        lines += ["", "Samples of a first-order and of a zeroth-order gradient:", ""]
+        lines += _table(
+            ("steps", "1st order sd", "0th order sd", "bias", "alpha"),
+            [
+                (
+                    str(row.steps),
                     f"{row.first_deviation:.3g}",
                     f"{row.zeroth_deviation:.3g}",
                     f"{row.bias:.2f} +- {row.bias_error:.2f}",
