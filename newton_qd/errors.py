@@ -21,7 +21,8 @@ class UnknownEnvironment(NotImplementedError):  # noqa: N818 - a name, not an ev
     def __str__(self) -> str:
         return (
             f"This environment name does not exist! env_name is {self.name!r}; "
-            f"known names: {', '.join(self.known)}."
+            f"known names: {', '.join(self.known)}. The module of an environment of "
+            "your own must be imported first."
         )
 
 

@@ -7,12 +7,17 @@ import io
 import json
 import os
 import sys
+from pathlib import Path
 
+import jax
 import pytest
 
 import newton_qd
 from newton_qd import cli, tasks
+from newton_qd.cli import health
+from newton_qd.cli.arguments import require_writable
 from newton_qd.envs.pointmaze import PointMaze
+from newton_qd.qd.config import ConfigError
 
 
 def test_an_environment_is_described(capsys: pytest.CaptureFixture[str]) -> None:
@@ -125,3 +130,38 @@ def test_an_output_that_takes_nothing(
     full = number == errno.ENOSPC
     assert code == (cli.FAILED if full else cli.OK)
     assert ("output: [Errno 28] no" in errors.getvalue()) is full
+
+
+def test_a_place_that_cannot_be_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Before the slow part; a folder counts itself, and not what it lies in."""
+    own, other = tmp_path / "own", tmp_path / "other"
+    own.mkdir()
+    other.mkdir()
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) == own)
+    for good in (own, own / "new", own / "new" / "deep.gif"):
+        require_writable("--out", good)
+    for bad in (other, other / "new", tmp_path / "new", Path("/")):
+        with pytest.raises(
+            ConfigError, match=r"^--out: got .*, and .* cannot be writt"
+        ):
+            require_writable("--out", bad)
+    doctor = ["doctor", "gradients", "pointmaze", "--out", str(other / "new")]
+    assert cli.main(doctor) == cli.BAD_ARGUMENTS
+    assert "cannot be written; allowed: a place that can be" in capsys.readouterr().err
+
+
+def test_the_doctor_reports_a_machine_without_devices(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def missing() -> None:
+        raise RuntimeError("no device\nof that kind")
+
+    def refused() -> str:
+        raise OSError(errno.EROFS, "read-only", "/kernels")
+
+    monkeypatch.setattr(jax, "devices", missing)
+    monkeypatch.setattr("newton_qd.physics.cache.kernel_cache", refused)
+    assert health._devices() == ["none (no device)"]
+    assert health._kernel_cache() == {"folder": "/kernels", "writable": False}

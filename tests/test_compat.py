@@ -106,7 +106,9 @@ def test_a_search_leaves_the_imports_of_others_alone() -> None:
         assert finder._FINDER in sys.meta_path
     assert finder._FINDER not in sys.meta_path
     assert not set(CONTENTS) & set(sys.modules)
-    newton_qd.compat.install()
+    with newton_qd.compat.installed():
+        newton_qd.compat.install()  # of a user, who wants it to stay
+    assert finder._FINDER in sys.meta_path
 
 
 def test_functions_of_jumpy() -> None:

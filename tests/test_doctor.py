@@ -228,6 +228,37 @@ def test_a_wrong_gradient_is_found(factor: float) -> None:
         assert row.length < 1e-9 if factor == 0 else row.length == pytest.approx(2)
 
 
+@pytest.mark.parametrize("directions", [1, 3])
+def test_few_directions_are_enough(directions: int) -> None:
+    """One direction has a cosine of 1 or -1 at every distance."""
+    env: Any = Growing(3.0)
+    report = diagnose_gradients(
+        env, horizons=(4, 12), worlds=4, directions=directions, samples=4
+    )
+    assert report.exact_horizon == 12
+
+
+class Rounded(Growing):
+    """A reward that does not change, except for its last digits."""
+
+    def _state(self, x: jax.Array, steps: jax.Array) -> State:
+        reward = jnp.sin(x[0]) ** 2 + jnp.cos(x[0]) ** 2
+        return super()._state(x, steps).replace(reward=reward)
+
+
+class Flat(Growing):
+    """A reward whose slope is smaller than what differences can see."""
+
+    def _state(self, x: jax.Array, steps: jax.Array) -> State:
+        return super()._state(x, steps).replace(reward=jnp.tanh(20 + x[0]))
+
+
+@pytest.mark.parametrize("kind", [Rounded, Flat])
+def test_rounding_is_no_difference(kind: Any) -> None:
+    report = diagnose_gradients(kind(0.5), horizons=(1, 4), worlds=2, samples=4)
+    assert report.exact_horizon == 4
+
+
 class Still(Growing):
     """A reward that does not change."""
 

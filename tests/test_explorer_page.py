@@ -258,5 +258,11 @@ def test_the_feet_of_a_page_are_those_of_the_descriptor() -> None:
         data = _motion_data(shown, every)
         assert list(base64.b64decode(data["feet"]["data"])) == expected
         assert data["lengths"] == [4 // every]
-    shown.lengths = np.array([3])
-    assert _motion_data(shown, 2)["lengths"] == [2]
+    # it ends between two frames, so the last frame is its last state
+    shown.lengths, shown.q = np.array([3]), np.arange(5.0).reshape(1, 5, 1)
+    data = _motion_data(shown, 2)
+    assert data["lengths"] == [2] and data["steps"] == [3]
+    assert list(base64.b64decode(data["feet"]["data"])) == [2, 0]
+    numbers = np.frombuffer(base64.b64decode(data["q"]["data"]), "<i2")
+    scale, offset = data["q"]["scale"][0], data["q"]["offset"][0]
+    np.testing.assert_allclose(numbers * scale + offset, [0, 2, 3], atol=1e-3)

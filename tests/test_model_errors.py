@@ -252,11 +252,11 @@ BAD_ROWS = {
     "sphere end": (changed(contacts=(Contact("aux_1"),), feet=()), "needs a sphere"),
     "capsule end": (
         changed(contacts=(Contact("torso", 1),), feet=()),
-        "end of 'torso': got 1, .* needs a capsule collider, and the link has 0",
+        "end of 'torso': got 1, .* needs a capsule collider; the link has sphere",
     ),
     "collider": (
         changed(contacts=(Contact("foot_1", 1, "toe"),), feet=()),
-        "needs a capsule collider named 'toe', and the link has 0",
+        "needs a capsule collider named 'toe'; the link has capsule",
     ),
     "end": (changed(contacts=(Contact("foot_1", 2),), feet=()), "got 2; .* -1, 0, 1"),
     "rest in limits": (changed(rest_pose=()), "'ankle_1': got 0; allowed: 0.523"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any, ClassVar
 
 import jax
@@ -119,6 +120,50 @@ class OfQDax(nq.Wrapper):
         return state.replace(reward=state.reward + 1)
 
 
+class Scaled(nq.Wrapper):
+    """A ``step`` with options of its own, which stay as they are."""
+
+    def step(self, state: Any, action: Any, *, scale: float = 2.0) -> Any:  # type: ignore[override]
+        return self.env.step(state, scale * action)
+
+
+class Keyword(nq.Wrapper):
+    def step(self, state: Any, action: Any, *, params: Any = None) -> Any:  # type: ignore[override]
+        return self.env.step(state, action, params)
+
+
+class Compiled(nq.Wrapper):
+    @functools.partial(jax.jit, static_argnums=0)
+    def step(self, state: Any, action: Any) -> Any:  # type: ignore[override]
+        return self.env.step(state, action)
+
+
+def test_a_step_keeps_its_own_arguments() -> None:
+    hopper = newton_qd.create("hopper", episode_length=None, auto_reset=False)
+    state, action = hopper.reset(KEY), jnp.full(3, 0.3)
+    plain = hopper.step(state, action)
+    heavy = hopper.default_params.replace(gravity=20.0)
+    kinds: tuple[Any, ...] = (Scaled, Keyword, Compiled)
+    scaled, keyword, compiled = (kind(hopper) for kind in kinds)
+    found = scaled.step(state, action, scale=1.0)
+    np.testing.assert_array_equal(found.obs, plain.obs)
+    wanted = hopper.step(state, action, heavy)
+    for step in (
+        lambda: keyword.step(state, action, params=heavy),
+        lambda: newton_qd.wrappers.AutoResetWrapper(keyword).step(
+            newton_qd.wrappers.AutoResetWrapper(keyword).reset(KEY), action, heavy
+        ),
+    ):
+        np.testing.assert_array_equal(step().pipeline_state.q, wanted.pipeline_state.q)
+    outer = newton_qd.wrappers.EpisodeWrapper(compiled, 5, 1)
+    found = outer.step(outer.reset(KEY), action)
+    np.testing.assert_allclose(found.obs, plain.obs, rtol=1e-5, atol=1e-6)
+    with pytest.raises(
+        TypeError, match=r"params: .* step of Scaled does not take them"
+    ):
+        scaled.step(state, action, heavy)
+
+
 def test_a_step_of_two_arguments_works_inside_wrappers() -> None:
     point = newton_qd.create("pointmaze", episode_length=None, auto_reset=False)
     inside: Any = OfQDax(point)
@@ -128,5 +173,7 @@ def test_a_step_of_two_arguments_works_inside_wrappers() -> None:
     state, action = env.reset(KEY), jnp.zeros(2)
     plain = point.step(point.reset(KEY), action)
     assert env.step(state, action).reward == plain.reward + 1
-    with pytest.raises(TypeError, match="params: got parameters, and step of OfQDax"):
+    with pytest.raises(
+        TypeError, match="params: got parameters, and step of OfQDax does"
+    ):
         inside.step(inside.reset(KEY), action, 3)

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from urdf_text import row, write
+from urdf_text import joint, link, row, write
 
 from newton_qd import physics
-from newton_qd.physics import reference
+from newton_qd.envs.locomotion import Locomotion
+from newton_qd.physics import SoftWallWarning, load_system, reference
+from newton_qd.physics.model.xml_reader import RobotDescriptionWarning
 from newton_qd.physics.system import System
 from newton_qd.robots import Contact
+from newton_qd.scenes import Scene
 
 
 def loose(name: str, mass: float) -> str:
@@ -127,3 +131,58 @@ def test_a_ball_beside_the_robot_keeps_its_place(x64: None, tmp_path: Path) -> N
         np.testing.assert_array_equal(np.delete(moved, 2), np.delete(q, 2))
     only_b = system_of(tmp_path, {"a": 1.0, "b": 1.0}, contacts=contacts[1:])
     assert physics.grounding_coordinate(only_b) is None and only_b.rest_q[2] == 0
+
+
+def test_locomotion_is_that_of_the_torso(x64: None, tmp_path: Path) -> None:
+    """Wherever the file has the ball."""
+    leg = link("leg", mass=0.5) + joint(
+        "hip",
+        "revolute",
+        "a",
+        "leg",
+        '<axis xyz="0 1 0"/><limit lower="-1" upper="1"/>',
+    )
+    parts = {"a": loose("a", 1.0) + leg, "b": loose("b", 2.0)}
+    seen = {}
+    for order in ("ab", "ba"):
+        text = "".join(parts[name] for name in order)
+        path = tmp_path / order
+        path.mkdir()
+        text = f'<robot name="r"><link name="world"/>{text}</robot>'
+        spec = row(write(path, text), "a", actuators=(("hip", 1.0),), gravity=0.0)
+        env = Locomotion(spec, dtype="float64", reset_noise_scale=0.0)
+        assert env.system.body_names[0] == order[0]
+        state = env.fixed_state()
+        bodies = list(env.system.body_names)
+        start = int(env.system.v_start[bodies.index("a")])
+        v = state.pipeline_state.v.at[start : start + 3].set(jnp.array([2.0, 0, 0.5]))
+        moving = dataclasses.replace(state.pipeline_state, v=v)
+        after = jax.jit(env.step)(state.replace(pipeline_state=moving), jnp.zeros(1))
+        seen[order] = after
+        assert after.metrics["x_velocity"] == pytest.approx(2.0, rel=0.1)
+        assert after.obs[0] == pytest.approx(0.5 * env.dt, rel=0.2)
+    one, two = seen["ab"], seen["ba"]
+    np.testing.assert_allclose(one.reward, two.reward, rtol=1e-9)
+    np.testing.assert_allclose(one.obs[:5], two.obs[:5], atol=1e-9)
+    assert one.obs.shape == two.obs.shape
+
+
+def test_a_ball_does_not_hide_a_soft_wall(tmp_path: Path) -> None:
+    wall = (
+        '<robot name="w"><link name="world"/><link name="wall"><collision><origin '
+        'xyz="3 0 .5"/><geometry><box size=".01 4 1"/></geometry></collision></link>'
+        '<joint name="j" type="fixed"><parent link="world"/><child link="wall"/>'
+        "</joint></robot>"
+    )
+    (tmp_path / "wall.urdf").write_text(wall, encoding="utf-8")
+    large = loose("b", 1.0).replace('radius="0.1"', 'radius="3"')
+    text = f'<robot name="r"><link name="world"/>{loose("a", 1.0)}{large}</robot>'
+    contacts = (Contact("a"), Contact("b"))
+    robot = row(write(tmp_path, text), "a", contacts=contacts)
+    with pytest.warns(SoftWallWarning, match=r"test, with the link 'a', is held up to"):
+        load_system(robot, "float32", Scene("w", str(tmp_path / "wall.urdf")))
+    (tmp_path / "wall.urdf").write_text(
+        wall.replace("collision>", "visual>"), encoding="utf-8"
+    )
+    with pytest.warns(RobotDescriptionWarning, match="no link has a collider, so"):
+        load_system(robot, "float32", Scene("w", str(tmp_path / "wall.urdf")))

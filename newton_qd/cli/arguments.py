@@ -80,7 +80,8 @@ def require_writable(name: str, path: Path) -> None:
     Raises:
         ConfigError: Its folder cannot be written.
     """
-    folder = next(parent for parent in path.absolute().parents if parent.exists())
+    places = (path.absolute(), *path.absolute().parents)
+    folder = next(place for place in places if place.is_dir())
     if not os.access(folder, os.W_OK):
         why = f"and {folder} cannot be written"
         raise ConfigError(message(name, str(path), "a place that can be", why=why))

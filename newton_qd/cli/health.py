@@ -20,13 +20,10 @@ _ANT_HEIGHT = (0.1, 1.5)  # of the torso of an ant that stands or lies [m]
 
 def run(arguments: argparse.Namespace) -> int:
     """Prints what is installed and whether it works. Returns the exit code."""
-    # here, because the physics is slow to import
-    from newton_qd.physics.native.library import usable_cores
-
     machine = f"{platform.system()} {platform.machine()}"
     found = {
         "python": platform.python_version(),
-        "machine": f"{machine}, {usable_cores()} usable cores",
+        "machine": f"{machine}, {_cores()} usable cores",
         "packages": _packages(),
         "devices": _devices(),
         "kernel_cache": _kernel_cache(),
@@ -35,6 +32,16 @@ def run(arguments: argparse.Namespace) -> int:
     }
     print(json.dumps(found, indent=2) if arguments.json else _text(found))
     return OK if found["check"]["passed"] else FAILED
+
+
+def _cores() -> int:
+    """Returns the number of cores that this process may use.
+
+    The physics has this function, too, but its import fails without a kernel cache.
+    """
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def _packages() -> dict[str, str | None]:
@@ -51,7 +58,8 @@ def _devices() -> list[str]:
     try:
         devices = jax.devices()
     except (AssertionError, RuntimeError) as error:  # such as JAX_PLATFORMS=cuda
-        return [f"none: {type(error).__name__}: {error}".partition("\n")[0]]
+        text = str(error) or type(error).__name__
+        return [f"none ({text.splitlines()[0]})"]
     return [
         f"{device.platform}:{device.id}"
         + ("" if device.device_kind == device.platform else f" {device.device_kind}")

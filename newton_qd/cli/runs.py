@@ -91,12 +91,13 @@ def opened(folder: Path, task_factory: TaskFactory) -> Run:
         allowed = "a results folder, as newton-qd evolve writes it"
         raise ConfigError(message("DIR", str(folder), allowed, why=why))
     with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", UserWarning)
-        run = load_run(
-            folder, task_factory=make_task if task_factory is None else task_factory
-        )
-    for warning in caught:
-        say(f"warning: {warning.message}", sys.stderr)
+        try:
+            run = load_run(
+                folder, task_factory=make_task if task_factory is None else task_factory
+            )
+        finally:
+            for warning in caught:
+                say(f"warning: {warning.message}", sys.stderr)
     warn_of_changes(run.facts, "when the run began")
     return run
 

@@ -6,6 +6,7 @@ import contextlib
 import importlib
 import importlib.metadata
 import sys
+import threading
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from importlib.abc import Loader, MetaPathFinder
@@ -28,8 +29,10 @@ class _Finder(MetaPathFinder, Loader):
     Attributes:
         contents: The modules that it fills: ``CONTENTS``, and ``BRAX_V1`` if brax v1 is
             not installed.
+        kept: Whether it stays when ``installed`` ends.
     """
 
+    kept = False
     contents: Mapping[str, Contents] = CONTENTS
 
     def find_spec(
@@ -59,6 +62,7 @@ class _Finder(MetaPathFinder, Loader):
 
 
 _FINDER = _Finder()
+_CHANGING = threading.RLock()
 
 
 def install() -> None:
@@ -70,6 +74,18 @@ def install() -> None:
         MissingExtra: QDax is not installed.
         ImportError: The installed release of QDax is not in ``SUPPORTED``, or it is
             already imported with its own environments.
+    """
+    with _CHANGING:
+        _install()
+        _FINDER.kept = True
+
+
+def _install() -> None:
+    """Installs, if it is not installed.
+
+    Raises:
+        MissingExtra: QDax is not installed.
+        ImportError: As ``install``.
     """
     if _FINDER in sys.meta_path:
         return
@@ -103,27 +119,31 @@ def installed() -> Iterator[None]:
         MissingExtra: QDax is not installed.
         ImportError: The installed release of QDax is not in ``SUPPORTED``.
     """
-    own = any(name in sys.modules for name in CONTENTS)
-    if own or _FINDER in sys.meta_path:  # QDax has its environments, or ours
-        yield
-        return
-    install()
-    try:
-        yield
-    finally:
-        uninstall()
+    with _CHANGING:  # no other thread may end it, or begin it for good
+        own = any(name in sys.modules for name in CONTENTS)
+        if own or _FINDER in sys.meta_path:  # QDax has its environments, or ours
+            yield
+            return
+        _install()
+        _FINDER.kept = False
+        try:
+            yield
+        finally:
+            if not _FINDER.kept:
+                uninstall()
 
 
 def uninstall() -> None:
     """Reverts ``install``; imported modules of QDax do not change."""
-    if _FINDER not in sys.meta_path:
-        return
-    sys.meta_path.remove(_FINDER)
-    for name in _FINDER.contents:
-        module = sys.modules.pop(name, None)
-        parent, _, child = name.rpartition(".")
-        if module is not None and parent in sys.modules:
-            vars(sys.modules[parent]).pop(child, None)
+    with _CHANGING:
+        if _FINDER not in sys.meta_path:
+            return
+        sys.meta_path.remove(_FINDER)
+        for name in _FINDER.contents:
+            module = sys.modules.pop(name, None)
+            parent, _, child = name.rpartition(".")
+            if module is not None and parent in sys.modules:
+                vars(sys.modules[parent]).pop(child, None)
 
 
 def _has_brax_v1() -> bool:

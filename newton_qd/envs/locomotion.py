@@ -44,7 +44,7 @@ class Locomotion(PhysicsEnv):
         """Loads a robot.
 
         Args:
-            robot: Spec of the robot; its first joint is free.
+            robot: Spec of the robot; the root of its torso moves freely.
             forward_reward_weight: Weight of the velocity along x [s/m].
             ctrl_cost_weight: Cost of the sum of squared actions [-].
             healthy_reward: Bonus per step [-].
@@ -55,7 +55,7 @@ class Locomotion(PhysicsEnv):
             scene: Obstacles on the ground; ``None``: no obstacles.
 
         Raises:
-            ValueError: The robot's first joint is not free, or the range is empty.
+            ValueError: The torso has no free root, or the range is empty.
         """
         self._forward_reward_weight = forward_reward_weight
         self._ctrl_cost_weight = ctrl_cost_weight
@@ -64,8 +64,8 @@ class Locomotion(PhysicsEnv):
         super().__init__(
             robot, reset_noise_scale=reset_noise_scale, dtype=dtype, scene=scene
         )
-        kind = JointKind(self.system.joint_kind[0])
-        if kind != JointKind.FREE:
+        if self.system.free_root is None:
+            kind = JointKind(self.system.joint_kind[self.system.roots[0]])
             why = f"whose first joint is {kind.name.lower()}"
             allowed = "a robot whose root link moves freely"
             raise ValueError(message("robot", Fact(robot.name), allowed, why=why))
@@ -73,22 +73,38 @@ class Locomotion(PhysicsEnv):
     def observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
         """Returns the blocks of the observation."""
         del action
-        q, v = state.q, state.v
+        (root, q), (root_v, v) = self._split(state.q), self._split(state.v)
         return {
-            "root height [m]": q[2:3],
-            "root orientation w x y z": jnp.concatenate([q[6:7], q[3:6]]),
-            "joint angles [rad]": q[_ROOT_Q:],
-            "root velocity x y z [m/s]": v[:3],
-            "root angular velocity x y z [rad/s]": v[3:_ROOT_V],
-            "joint velocities [rad/s]": v[_ROOT_V:],
+            "root height [m]": root[2:3],
+            "root orientation w x y z": jnp.concatenate([root[6:7], root[3:6]]),
+            "joint angles [rad]": q,
+            "root velocity x y z [m/s]": root_v[:3],
+            "root angular velocity x y z [rad/s]": root_v[3:],
+            "joint velocities [rad/s]": v,
         }
+
+    def _split(self, values: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Returns the numbers of the root, of (nq,) or (nv,), and all others."""
+        system = self.system
+        starts, size = (
+            (system.q_start, _ROOT_Q)
+            if values.size == system.nq
+            else (system.v_start, _ROOT_V)
+        )
+        # the constructor checks that there is a root, after its first observation
+        start = int(starts[system.free_root or 0])
+        root = values[start : start + size]
+        if start == 0:
+            return root, values[size:]
+        return root, jnp.concatenate([values[:start], values[start + size :]])
 
     def outcome(
         self, before: PhysicsState, after: PhysicsState, action: Action
     ) -> tuple[jax.Array, jax.Array, Metrics]:
         """Returns reward, done and metrics of a step."""
-        x_velocity = (after.q[0] - before.q[0]) / self.dt
-        healthy = within(after.q[2], self._healthy_z_range, self.termination_width)
+        start, end = (self._split(s.q)[0] for s in (before, after))
+        x_velocity = (end[0] - start[0]) / self.dt
+        healthy = within(end[2], self._healthy_z_range, self.termination_width)
         forward = rounded(self._forward_reward_weight * x_velocity)
         bonus = jnp.full_like(forward, self._healthy_reward)
         control = rounded(self._ctrl_cost_weight * ordered_sum(jnp.square(action)))
@@ -96,8 +112,8 @@ class Locomotion(PhysicsEnv):
             "reward_forward": forward,
             "reward_survive": bonus,
             "reward_ctrl": -control,
-            "x_position": after.q[0],
-            "y_position": after.q[1],
+            "x_position": end[0],
+            "y_position": end[1],
             "x_velocity": x_velocity,
         }
         return forward + bonus - control, 1 - healthy, metrics

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import inspect
 import warnings
@@ -43,20 +44,25 @@ def accept_params(kind: type) -> None:
     Args:
         kind: A class that has just been made.
     """
-    step = vars(kind).get("step")
-    if not inspect.isfunction(step):
+    step = inspect.getattr_static(kind, "step", None)
+    if not callable(step) or isinstance(step, staticmethod | classmethod):
         return
-    arguments = inspect.signature(step).parameters.values()
-    several = any(x.kind is x.VAR_POSITIONAL for x in arguments)
-    if several or len([x for x in arguments if x.kind is not x.KEYWORD_ONLY]) != 3:
-        return
+    signature = inspect.signature(step)
+    with contextlib.suppress(TypeError):
+        signature.bind(None, None, None, None)
+        return  # it takes a third argument
+    named = [
+        x.name == "params" or x.kind is x.VAR_KEYWORD
+        for x in signature.parameters.values()
+    ]
 
     @functools.wraps(step)
-    def step_without_params(self: Any, state: Any, action: Any, params: Any = None):
-        if params is not None:
-            given = Fact("parameters")
-            why = f"and step of {kind.__name__} has no argument for them"
-            raise TypeError(message("params", given, "None", why=why))
-        return step(self, state, action)
+    def step_without_params(self: Any, *given: Any, **options: Any) -> Any:
+        if len(given) == 3:
+            *given, options["params"] = given  # type: ignore[assignment]
+        if not any(named) and options.pop("params", None) is not None:
+            allowed, why = "None", f"and step of {kind.__name__} does not take them"
+            raise TypeError(message("params", Fact("parameters"), allowed, why=why))
+        return step(self, *given, **options)
 
     kind.step = step_without_params  # type: ignore[attr-defined]

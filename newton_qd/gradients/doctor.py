@@ -18,6 +18,7 @@ from newton_qd.gradients.doctor_input import (
     refuse_faults,
 )
 from newton_qd.gradients.measurements import (
+    DISTANCES,
     Differences,
     Subject,
     normal_like,
@@ -28,7 +29,7 @@ from newton_qd.gradients.mixed import Mixture
 from newton_qd.gradients.report import ContactRow, GradientReport, HorizonRow
 from newton_qd.types import Genotype, Policy, RNGKey
 
-_ROUNDING = 1e-9  # central differences of a constant are below it
+_ROUNDING = 100  # of a return, in units of its last digit
 _BREAK = 0.1  # relative error above which the derivative of a step is broken
 
 
@@ -164,7 +165,7 @@ def _rows(
                 largest_norm=float(norms.max()),
                 cosine=float(np.median(cosines)),
                 worst_cosine=float(cosines.min()),
-                length=float(lengths[np.abs(np.log(lengths)).argmax()]),
+                length=float(_farthest(lengths)),
                 first_deviation=_root(mixed.first_variance, index),
                 zeroth_deviation=_root(mixed.zeroth_variance, index),
                 bias=float(apart[:, index].mean()),
@@ -179,29 +180,37 @@ def _root(variance: jax.Array, index: int) -> float:
     return float(np.sqrt(np.median(np.asarray(variance)[:, index])))
 
 
+def _farthest(lengths: np.ndarray) -> float:
+    """Returns the ratio that is farthest from 1."""
+    with np.errstate(divide="ignore"):  # the logarithm of 0 is the farthest
+        return lengths[np.abs(np.log(lengths)).argmax()]
+
+
 def _agreement(difference: Differences, step: int) -> tuple[np.ndarray, np.ndarray]:
-    """Compares exact and central derivatives, at the distance where they agree best.
+    """Compares exact and central derivatives, at the distance where they differ least.
 
     Returns:
-        Their cosine (worlds,), and the ratio of their lengths (worlds,). Both are 1 if
-        both derivatives are 0, and the smallest number if one alone is.
+        Their cosine (worlds,), and the length of the exact derivatives divided by that
+        of the others (worlds,). If both are 0 up to rounding, both numbers are 1. If
+        one is 0, the cosine is 0, and the ratio 0 or infinite.
     """
     exact = difference.exact[:, :, step]
     central = difference.central[:, :, :-1, step]
     own, other = np.linalg.norm(exact, axis=1), np.linalg.norm(central, axis=1)
-    # A derivative of 0 is right only if no difference is larger than its rounding.
-    still = (own == 0) & (other <= _ROUNDING).all(axis=1)
-    scale = own[:, None] * other
-    lost = scale == 0
-    inner = (exact[:, :, None] * central).sum(axis=1)
-    cosines = np.where(lost, 0.0, inner / np.where(lost, 1.0, scale))
-    tiny = np.finfo(np.float64).tiny
-    ratios = np.where(lost, tiny, own[:, None] / np.where(lost, 1.0, other))
-    best = cosines.argmax(axis=1)[:, None]
-    cosine, ratio = (
-        np.take_along_axis(x, best, axis=1)[:, 0] for x in (cosines, ratios)
+    size = np.maximum(1.0, difference.sizes[:, step])[:, None]
+    rounding = _ROUNDING * np.finfo(np.float64).eps * size / np.array(DISTANCES)
+    still = (own <= rounding.min(axis=1)) & (other <= rounding).all(axis=1)
+    apart = np.linalg.norm(exact[:, :, None] - central, axis=1)
+    best = apart.argmin(axis=1)
+    worlds = np.arange(len(best))
+    chosen, length = central[worlds, :, best], other[worlds, best]
+    lost = (own == 0) | (length == 0)
+    inner = (exact * chosen).sum(axis=1)
+    cosine = np.where(lost, 0.0, inner / np.where(lost, 1.0, own * length))
+    ratio = np.where(
+        length == 0, np.where(own == 0, 1.0, np.inf), own / np.maximum(length, 1e-300)
     )
-    return np.where(still, 1.0, cosine), np.where(still, 1.0, np.maximum(ratio, tiny))
+    return np.where(still, 1.0, cosine), np.where(still, 1.0, ratio)
 
 
 def _contacts(subject: Subject, difference: Differences) -> tuple[ContactRow, ...]:

@@ -94,6 +94,7 @@ class Differences:
         exact: (worlds, directions, steps) component of the gradient along a direction.
         central: (worlds, directions, distances, steps) central differences over
             ``DISTANCES``, then over ``REACH``.
+        sizes: (worlds, steps) sum of the absolute rewards up to each step.
         alive: (worlds, steps) whether the episode has not ended before each step.
         faulty: (worlds, steps) whether the world has a fault after each step.
         switched: (worlds, directions, steps, nb) whether a body has contact for one of
@@ -103,6 +104,7 @@ class Differences:
     norms: np.ndarray
     exact: np.ndarray
     central: np.ndarray
+    sizes: np.ndarray
     alive: np.ndarray
     faulty: np.ndarray
     switched: np.ndarray
@@ -134,6 +136,7 @@ def take_differences(
             "norms": jax.vmap(tree_norm)(gradients),
             "exact": components(gradients, along),
             "central": central,
+            "sizes": jnp.cumsum(jnp.abs(rewards[0, 0, 0])),
             "alive": alive[0, 0, 0],
             "faulty": faulty,
             "switched": touching[:, -1, 0] != touching[:, -1, 1],

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 AGREEMENT = 0.999
 """Smallest cosine with central differences of a correct gradient [-]."""
 LENGTH_ERROR = 0.05
-"""Largest error of the length of a correct gradient [-], as a logarithm."""
+"""Largest relative error of the length of a correct gradient [-]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,12 +53,12 @@ class HorizonRow:
     largest_norm: float
     cosine: float
     worst_cosine: float
-    length: float
     first_deviation: float
     zeroth_deviation: float
     bias: float
     bias_error: float
     order: float
+    length: float = 1.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,8 +115,7 @@ class GradientReport:
         """Longest horizon at which the gradient agrees with differences, or 0."""
         return self._last(
             lambda row: (
-                row.worst_cosine >= AGREEMENT
-                and abs(math.log(row.length)) <= LENGTH_ERROR
+                row.worst_cosine >= AGREEMENT and abs(row.length - 1) <= LENGTH_ERROR
             )
         )
 

@@ -189,6 +189,21 @@ class System:
         return self.joint_kind[self.torso] == JointKind.FREE
 
     @property
+    def roots(self) -> np.ndarray:
+        """(nb,) first body of the tree of links of each body."""
+        roots = np.arange(self.nb)
+        for body, parent in enumerate(self.parent):
+            if parent >= 0:
+                roots[body] = roots[parent]
+        return roots
+
+    @property
+    def free_root(self) -> int | None:
+        """Body at the root of the torso's tree; ``None`` if it does not move freely."""
+        root = int(self.roots[self.torso])
+        return root if self.joint_kind[root] == JointKind.FREE else None
+
+    @property
     def has_boxes(self) -> bool:
         """Whether an obstacle is a box. Boxes need another variant of the kernels."""
         return bool(np.any(self.obstacle_kind == ObstacleKind.BOX))

@@ -277,12 +277,15 @@ def _metrics(
 
 def _motion_data(trajectory: Trajectory, every: int) -> dict[str, Any]:
     """Returns the motion of elites as a JSON value, one frame for some steps."""
-    q = trajectory.q[:, ::every]
-    frames = q.shape[1]
+    frames = trajectory.steps // every + 1
+    # an episode may end between two frames: its last frame is its last state
+    at = np.minimum(np.arange(frames) * every, trajectory.lengths[:, None])
+    q = trajectory.q[np.arange(len(at))[:, None], at]
     steps = np.arange(trajectory.steps)
     valid = steps < trajectory.lengths[:, None]
     rewards = np.where(valid, trajectory.rewards, 0.0)
-    feet = trajectory.feet[:, :-1] > 0  # at the start of each step, as descriptors
+    # at the start of each step, as descriptors
+    feet = (trajectory.feet[:, :-1] > 0) & valid[..., None]
     missing = (-trajectory.steps) % every
     rewards = np.pad(rewards, [(0, 0), (0, missing)])
     feet = np.pad(feet, [(0, 0), (0, missing), (0, 0)])
@@ -296,4 +299,5 @@ def _motion_data(trajectory: Trajectory, every: int) -> dict[str, Any]:
         "feet": encode(touched, "uint8"),
         "every": every,
         "lengths": (-(-trajectory.lengths // every)).clip(max=frames - 1).tolist(),
+        "steps": trajectory.lengths.tolist(),
     }

@@ -68,9 +68,9 @@ class MazeWrapper(SceneTaskWrapper):
             checks.interval("heights", heights)
             self.heights = heights
         super().__init__(env, env_name)
-        self._target()  # its error comes before the first episode
+        self._target_place()  # its error comes before the first episode
 
-    def _target(self) -> np.ndarray:
+    def _target_place(self) -> np.ndarray:
         """Returns x and y (2,) of the target [m].
 
         Raises:
@@ -91,7 +91,7 @@ class MazeWrapper(SceneTaskWrapper):
             ValueError: It has no target.
         """
         changed: Any = super().with_base(change)
-        changed._target()
+        changed._target_place()
         return changed
 
     def _inside(self, env: Env, env_name: str) -> Env:
@@ -100,7 +100,7 @@ class MazeWrapper(SceneTaskWrapper):
     def _outcome(self, state: State) -> State:
         """Returns the state with the reward and the end of the task."""
         position = self._position(state)
-        away = position[:2] - np.asarray(self._target(), self.dtype)
+        away = position[:2] - np.asarray(self._target_place(), self.dtype)
         base = self.unwrapped
         assert isinstance(base, PhysicsEnv)
         safe = within(position[2], self.heights, base.termination_width)

@@ -129,7 +129,7 @@ def _batch(state: State) -> tuple[int]:
         require_state(state)
     batch = jnp.shape(state.done)
     if len(batch) != 1:
-        allowed = "(batch,), as after a reset of this environment"
+        allowed = "(batch,), as after a reset of this environment, without jax.vmap"
         raise ValueError(message("state: shape of done", batch, allowed))
     return batch
 

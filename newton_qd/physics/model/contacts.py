@@ -61,13 +61,18 @@ def _collider(robot: RobotSpec, contact: Contact, body: Body) -> Shape:
         found = _colliders(contact, body, ("box",))
     if len(found) != 1:
         named = "" if contact.collider is None else f" named {contact.collider!r}"
+        kinds = [
+            f"{each.kind} {each.name!r}" if each.name else each.kind
+            for each in body.shapes
+            if each.link == contact.link
+        ]
         raise refusal(
             robot,
             f"contacts: end of {contact.link!r}",
             contact.end,
             "exactly one, with end 0 for a sphere or a box, 1 or -1 for a capsule, and "
             "its name in the file where there are several",
-            why=f"which needs a {kind} collider{named}, and the link has {len(found)}",
+            why=f"which needs a {kind} collider{named}; the link has {listed(kinds)}",
         )
     return found[0]
 

@@ -239,7 +239,7 @@ def _check_floating(path: Path, joint: Joint, fixed: bool) -> None:
         given = Fact(
             "frame in a link that moves" if not fixed else joint.frame.tolist()
         )
-        allowed = "the origin of the world; rest_height and so on give the pose"
+        allowed = "the parent world, without an origin; reset_pose places the link"
         raise RobotDescriptionError(message(name, given, allowed))
 
 

@@ -66,11 +66,7 @@ def own_ground_contacts(system: System) -> np.ndarray:
     Returns:
         Their rows in the system's contact tables.
     """
-    roots = np.arange(len(system.parent))
-    for body, parent in enumerate(system.parent):
-        if parent >= 0:
-            roots[body] = roots[parent]
-    ground = system.ground_contacts
+    ground, roots = system.ground_contacts, system.roots
     return ground[roots[system.contact_body[ground]] == roots[system.torso]]
 
 
@@ -84,15 +80,14 @@ def rest_coordinates(system: System) -> np.ndarray:
     robot = system.robot
     q = np.array(system.rest_q)
     free = system.q_start[system.joint_kind == JointKind.FREE]
-    free_root = _free_root(system)
-    if free_root is None and any(robot.rest_rotation):
+    if system.free_root is None and any(robot.rest_rotation):
         why = "and the torso has no free root"
         raise refusal(robot, "rest_rotation", robot.rest_rotation, "zeros", why=why)
     for start in free:
         q[start + 6] = 1.0
-    if free_root is not None:
-        turned = reference.rpy_quaternion(*robot.rest_rotation)
-        q[free_root + 3 : free_root + 7] = turned
+    if system.free_root is not None:
+        start = system.q_start[system.free_root]
+        q[start + 3 : start + 7] = reference.rpy_quaternion(*robot.rest_rotation)
     for joint, angle in robot.rest_pose:
         q[system.q_start[index_of(robot, "rest_pose", joint, system.joint_names)]] = (
             angle
@@ -118,12 +113,3 @@ def rest_coordinates(system: System) -> np.ndarray:
     elif len(contacts := own_ground_contacts(posed)):
         q[coordinate] -= sign * reference.lowest_contact(posed, q, contacts)
     return q
-
-
-def _free_root(system: System) -> int | None:
-    """Returns the first coordinate of the torso's free root; ``None``: it has none."""
-    body = system.torso
-    while system.parent[body] >= 0:
-        body = int(system.parent[body])
-    free = system.joint_kind[body] == JointKind.FREE
-    return int(system.q_start[body]) if free else None

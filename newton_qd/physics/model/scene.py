@@ -102,6 +102,9 @@ def read_scene(scene: Scene) -> tuple[SceneLink, ...]:
                 given = Fact(shape.kind)
                 raise reader.refused(elements[name], "collider", given, listed(_KINDS))
     frames = _link_frames(reader, links)
+    if not any(link.shapes for link in links.values()):
+        text = f"{reader.path}: no link has a collider, so nothing touches the scene"
+        warnings.warn(text, RobotDescriptionWarning, stacklevel=2)
     return tuple(
         SceneLink(name, frames[name], _placed(links[name], frames[name]))
         for name in links

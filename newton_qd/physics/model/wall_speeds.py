@@ -37,8 +37,9 @@ class SoftWallWarning(UserWarning):
 def soft_walls(system: System) -> tuple[str, ...]:
     """Returns a text about each wall that does not hold the robot at 10 m/s.
 
-    The speed is that of the link which the wall holds best: the other links stay with
-    this one.
+    The speed is that of the link which the wall holds best: the other links of its tree
+    stay with this one. Of several trees, such as a robot and a ball, the one that is
+    held worst counts.
 
     Args:
         system: The system.
@@ -46,11 +47,21 @@ def soft_walls(system: System) -> tuple[str, ...]:
     if system.scene is None or system.scene.links == ():  # it touches nothing
         return ()
     speeds, texts = wall_speeds(system), []
+    trees = system.roots[system.contact_body]
     for wall in range(1, len(system.obstacle_kind)):
-        speed = speeds[system.contact_obstacle == wall].max(initial=0.0)
+        own = system.contact_obstacle == wall
+        held = {
+            int(tree): speeds[own & (trees == tree)].max()
+            for tree in np.unique(trees[own])
+        }
+        tree = min(held, key=lambda tree: held[tree], default=None)
+        speed = 0.0 if tree is None else held[tree]
         if speed < _EXPECTED:
             name = f"scene {system.scene.name!r}, wall {wall}"
-            given = Fact(f"{system.robot.name} is held up to {speed:.2g} m/s")
+            moving = system.robot.name
+            if len(held) > 1 and tree is not None:
+                moving += f", with the link {system.body_names[tree]!r},"
+            given = Fact(f"{moving} is held up to {speed:.2g} m/s")
             allowed = (
                 f"{_EXPECTED:g} m/s, with a thicker wall or a smaller "
                 "Material.static_penetration; a faster robot passes through "

@@ -12,7 +12,10 @@
     const steps = data.rewards.shape[1];
     const every = data.feet_most || 1; // a frame has the sum of several steps
     const reward = [];
-    for (let k = 0; k < length; k++) reward.push(data.rewards.data[w * steps + k] / every);
+    for (let k = 0; k < length; k++) {
+      const within = data.steps ? Math.min(every, data.steps[w] - k * every) : every;
+      reward.push(data.rewards.data[w * steps + k] / within);
+    }
     this.chart("reward of a step", [reward], 1, total, ["reward"]);
     const nf = data.feet.shape[2];
     if (nf) this.feetChart(w, nf, length, total);
@@ -94,6 +97,7 @@
       + "Beside the name: share of the steps");
     const names = this.view.drawing.feet;
     const frames = this.data.feet.shape[1], most = this.data.feet_most || 1;
+    const steps = this.data.steps ? this.data.steps[w] : length;
     for (let f = 0; f < nf; f++) {
       const color = NQD.palette[f % NQD.palette.length];
       let touched = 0;
@@ -109,7 +113,7 @@
           x, f * HEIGHT.feet + 1, Math.max(1, made.width / total), HEIGHT.feet - 2);
       }
       made.pen.globalAlpha = 1;
-      key(made.names, names[f] + " " + Math.round(100 * touched / Math.max(1, length))
+      key(made.names, names[f] + " " + Math.round(100 * touched * most / Math.max(1, steps))
         + " %", color);
     }
   };

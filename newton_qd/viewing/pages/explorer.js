@@ -154,11 +154,13 @@
       feet: { shape: [count, frames, nf], data: new Uint8Array(count * frames * nf) },
       feet_most: runs[0].motion.every,
       lengths: [],
+      steps: [],
     };
     runs.forEach((run, r) => {
       const motion = run.motion, own = motion.q.shape[1];
       const row = run.row[chosen[r]];
       shown.lengths.push(row < 0 ? 0 : motion.lengths[row]);
+      shown.steps.push(row < 0 ? 0 : motion.steps[row]);
       const at = Math.max(row, 0);
       shown.q.data.set(
         motion.q.data.subarray(at * own * nq, (at + 1) * own * nq), r * frames * nq);
