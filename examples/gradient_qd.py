@@ -31,9 +31,9 @@ def main() -> None:
 
     config = EvolveConfig(env_name=options.env, episode_length=options.episode_length)
     task = make_task(config)
-    if task.env.state_descriptor_name == "feet_contact":  # its gradient is 0 without
-        env = with_smooth_descriptor(task.env, 0.1, straight_through=True)
-        task = dataclasses.replace(task, env=env)
+    # without this, the gradient of feet on the ground is 0
+    env = with_smooth_descriptor(task.env, 0.1, straight_through=True)
+    task = dataclasses.replace(task, env=env)
     policy = make_policy(task.env, (32,))
     start, key = jax.random.key(0), jax.random.key(1)
     # The loop evaluates all offspring without gradients, the emitter four points with.

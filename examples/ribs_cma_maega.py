@@ -11,14 +11,8 @@ from ribs.archives import GridArchive
 from ribs.emitters import GradientArborescenceEmitter
 from ribs.schedulers import Scheduler
 
+from newton_qd import qd
 from newton_qd.gradients import GradientOptions, with_smooth_descriptor
-from newton_qd.qd import (
-    EvolveConfig,
-    episode_of,
-    make_policy,
-    make_ribs_evaluation,
-    make_task,
-)
 
 
 def main() -> None:
@@ -29,19 +23,21 @@ def main() -> None:
     parser.add_argument("--episode-length", type=int, default=100)
     options = parser.parse_args()
 
-    config = EvolveConfig(env_name=options.env, episode_length=options.episode_length)
-    task = make_task(config)
-    if task.env.state_descriptor_name == "feet_contact":  # its gradient is 0 without
-        env = with_smooth_descriptor(task.env, 0.1, straight_through=True)
-        task = dataclasses.replace(task, env=env)
-    policy = make_policy(task.env, (16,))
+    config = qd.EvolveConfig(
+        env_name=options.env, episode_length=options.episode_length
+    )
+    task = qd.make_task(config)
+    # without this, the gradient of feet on the ground is 0
+    env = with_smooth_descriptor(task.env, 0.1, straight_through=True)
+    task = dataclasses.replace(task, env=env)
+    policy = qd.make_policy(task.env, (16,))
     worst = -task.reward_offset * config.episode_length
     common = {"key": jax.random.key(1), "limits": task.limits, "worst": worst}
-    episode = episode_of(
+    episode = qd.episode_of(
         task, policy, config.episode_length, options=GradientOptions(clip=10.0)
     )
-    evaluate = make_ribs_evaluation(episode.scoring(), **common)
-    differentiate = make_ribs_evaluation(
+    evaluate = qd.make_ribs_evaluation(episode.scoring(), **common)
+    differentiate = qd.make_ribs_evaluation(
         episode.scoring(episode.gradient), jacobian=True, **common
     )
 

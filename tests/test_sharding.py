@@ -184,6 +184,7 @@ def test_xla_splits_a_batch_on_automatic_axes(devices: Devices) -> None:
     code = """
 import newton_qd
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from newton_qd.physics.native import all_plans
 env = newton_qd.create("hopper_uni", auto_reset=False)
 split = NamedSharding(Mesh(np.array(jax.devices()), ("x",)), PartitionSpec("x"))
 states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 16))
@@ -200,14 +201,20 @@ def rolled(states, actions):
     plan = jnp.stack([actions, -actions], axis=1)
     return jax.vmap(env.rollout)(states, plan).reward
 
+def counted(function, *given):
+    # the worlds of all plans: each of four devices must not run all of them
+    before = sum(plan.worlds for plan in all_plans())
+    found = jax.block_until_ready(function(*given))
+    return found, sum(plan.worlds for plan in all_plans()) - before
+
 answer = []
 for function in (both, rolled):
-    given = jax.device_put((states, actions), split)
-    gathers = function.lower(*given).compile().as_text().count("all-gather(")
-    pairs = zip(*map(jax.tree.leaves, (function(states, actions), function(*given))))
-    answer += [gathers, all(np.array_equal(a, b) for a, b in pairs)]
+    alone = counted(function, states, actions)
+    shared = counted(function, *jax.device_put((states, actions), split))
+    pairs = zip(*map(jax.tree.leaves, (alone[0], shared[0])))
+    answer += [all(np.array_equal(a, b) for a, b in pairs), alone[1] == shared[1] > 0]
 """
-    assert devices.answer(code) == [0, True] * 2
+    assert devices.answer(code) == [True] * 4
 
 
 EVOLVE = """
