@@ -6,16 +6,19 @@
 - ``RobotSpec``, ``Contact``, ``Material``: data of a robot beside its URDF file
 - ``Scene``: obstacles from a URDF file
 - ``DescriptorWrapper``: the base class for descriptors; ``FeetContactWrapper`` and
-  ``XYPositionWrapper``: descriptors of the suite; ``Wrapper``: any other change
+  ``XYPositionWrapper``: descriptors of the suite; ``NoForwardRewardWrapper``: no reward
+  for running forward; ``Wrapper``: any other change
 - ``WrapperSpec``: a wrapper with its options
 - ``checked_options``, ``RolloutOrder``: checks of the options of a class, and how
   ``rollout`` may run its steps
 - ``get_feet_contact_proportion``, ``get_final_xy_position``,
   ``get_mean_state_descriptor``: descriptors of episodes
-- ``register``, ``create``: add an environment by name, and build it
+- ``register``, ``create``: add an environment by name, and build it; ``create_fn``:
+  build it later; ``registered_envs``: all names; ``check``: a state without faults
 - ``length``, ``ordered_sum``, ``wrapped``: arithmetic with finite gradients and with
   results that do not depend on the batch size
-- ``Env``, ``QDEnv``, ``State``, ``PhysicsState``, ``Kinematics``: the types
+- ``Env``, ``QDEnv``, ``State``, ``PhysicsState``, ``Kinematics``, ``Action``,
+  ``Metrics``, ``Observation``, ``Params``, ``RNGKey``: the types
 
 ``docs/own_environment.md`` shows how to use them together.
 """

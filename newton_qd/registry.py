@@ -11,12 +11,21 @@ import jax
 
 from newton_qd import brax_views as brax
 from newton_qd import checks, tasks
-from newton_qd.checks import Fact, listed, message, shown
-from newton_qd.envs.base import Env, PhysicsEnv
+from newton_qd.checks import Fact, listed, message
+from newton_qd.envs.base import Env
 from newton_qd.envs.methods import check_methods, random_key
 from newton_qd.envs.shown import REGISTERED
 from newton_qd.errors import UnknownEnvironment
 from newton_qd.moved import moved_name
+from newton_qd.registration import (
+    ENVIRONMENT,
+    check_class,
+    check_made,
+    check_names,
+    check_wrappers,
+    descriptor_specs,
+    takes_robot,
+)
 from newton_qd.robots import Material, RobotSpec
 from newton_qd.tasks import EnvironmentSpec, WrapperSpec
 from newton_qd.types import DescriptorExtractor
@@ -90,9 +99,9 @@ def register(
         ValueError: The name is in use, a name is not text, is empty or has characters
             that are not allowed, or ``reward_offset`` is not finite.
     """
-    _check_names(env_name, base_name)
+    check_names(env_name, base_name)
     checks.function("base", base, "a class or a function")
-    _check_class(base)
+    check_class(base)
     allowed = "a function of (data, mask)"
     checks.function(
         "descriptor_extractor", descriptor_extractor, allowed, optional=True
@@ -100,17 +109,17 @@ def register(
     allowed = "a newton_qd.robots.RobotSpec"
     checks.instance("robot", robot, RobotSpec, allowed, optional=True)
     checks.number("reward_offset", reward_offset, optional=True)
-    _check_wrappers(wrappers)
-    described = _descriptor_specs(descriptor)
+    check_wrappers(wrappers)
+    described = descriptor_specs(descriptor)
     if descriptor_extractor is None and described:
         descriptor_extractor = getattr(
             described[0].wrapper, "descriptor_extractor", None
         )
-    if robot is not None and _takes_robot(base):
+    if robot is not None and takes_robot(base):
         options = {"robot": robot, **options}
     if options:
         _require_keywords(env_name, base, options)
-    _check_made(base, options)
+    check_made(base, options)
     tasks.ENVIRONMENTS[env_name] = EnvironmentSpec(
         functools.partial(base, **options) if options else base,
         env_name if base_name is None else base_name,
@@ -119,121 +128,6 @@ def register(
         reward_offset,
         robot=robot,
     )
-
-
-def _check_names(env_name: object, base_name: object) -> None:
-    """Checks the names of ``register``.
-
-    Raises:
-        ValueError: A name is not text, is empty, is in use, or has characters that are
-            not allowed.
-    """
-    # A results folder has the name of the environment, so it must not be a path.
-    checks.identifier("env_name", env_name)
-    if env_name in tasks.ENVIRONMENTS:
-        allowed = f"any name but {listed(registered_envs())}"
-        raise ValueError(message("env_name", env_name, allowed, why="which is taken"))
-    # Every table reads every spec, so one wrong spec would break all tables.
-    checks.identifier("base_name", base_name, optional=True)
-
-
-_ENVIRONMENT = "a subclass of newton_qd's Env, or a function that makes an environment"
-
-
-def _check_class(base: Callable[..., Env]) -> None:
-    """Checks that a class is one of environments.
-
-    Raises:
-        TypeError: It is not.
-    """
-    kind: object = base
-    while isinstance(kind, functools.partial):
-        kind = kind.func
-    if isinstance(kind, type) and not issubclass(kind, Env):
-        raise TypeError(message("base", base, _ENVIRONMENT))
-
-
-def _check_made(base: Callable[..., Env], options: Mapping[str, Any]) -> None:
-    """Checks that a function makes an environment, if it needs no other arguments.
-
-    Raises:
-        TypeError: It does not.
-    """
-    if isinstance(base, type):
-        return
-    try:
-        inspect.signature(base).bind(**options)
-    except TypeError:  # arguments are missing, which ``create`` may give
-        return
-    made = base(**options)
-    if not isinstance(made, Env):
-        why = f"which makes {shown(made)}"
-        raise TypeError(message("base", base, _ENVIRONMENT, why=why))
-
-
-def _descriptor_specs(
-    descriptor: WrapperSpec | Callable[..., Env] | None,
-) -> tuple[WrapperSpec, ...]:
-    """Returns the descriptor wrapper, if there is one.
-
-    Raises:
-        TypeError: It is not a wrapper.
-    """
-    if descriptor is None:
-        return ()
-    if not isinstance(descriptor, WrapperSpec):
-        allowed = "None, a class such as FeetContactWrapper, or a WrapperSpec of one"
-        checks.function("descriptor", descriptor, allowed)
-        _refuse_robot("descriptor", descriptor)
-        descriptor = WrapperSpec(descriptor)
-    _check_wrapper("descriptor", descriptor)
-    return (descriptor,)
-
-
-def _refuse_robot(name: str, wrapper: object) -> None:
-    """Checks that a wrapper is no class of robots.
-
-    Raises:
-        TypeError: It is one.
-    """
-    if isinstance(wrapper, type) and issubclass(wrapper, PhysicsEnv):
-        raise TypeError(message(name, wrapper, "wrappers, such as FeetContactWrapper"))
-
-
-def _takes_robot(base: Callable[..., Env]) -> bool:
-    """Returns whether ``base`` has an argument ``robot`` without a value."""
-    parameter = inspect.signature(base).parameters.get("robot")
-    return parameter is not None and parameter.default is parameter.empty
-
-
-def _check_wrappers(wrappers: object) -> None:
-    """Checks the ``wrappers`` of ``register``.
-
-    Raises:
-        TypeError: They are not a sequence of ``WrapperSpec``, one is a class of robots,
-            or a wrapper does not take one of its options.
-    """
-    if not isinstance(wrappers, Sequence) or isinstance(wrappers, str):
-        allowed = "a tuple or list of WrapperSpec, such as "
-        allowed += "(WrapperSpec(FeetContactWrapper),)"
-        raise TypeError(message("wrappers", wrappers, allowed))
-    for index, spec in enumerate(wrappers):
-        allowed = "a WrapperSpec, such as WrapperSpec(FeetContactWrapper)"
-        checks.instance(f"wrappers[{index}]", spec, WrapperSpec, allowed)
-        _check_wrapper(f"wrappers[{index}]", spec)
-
-
-def _check_wrapper(name: str, spec: WrapperSpec) -> None:
-    """Checks a wrapper and its options.
-
-    Raises:
-        TypeError: It is a class of robots, or does not take one of its options.
-    """
-    checks.function(f"{name}.wrapper", spec.wrapper, "a class or a function")
-    _refuse_robot(f"{name}.wrapper", spec.wrapper)
-    allowed = "a mapping of keyword arguments"
-    checks.instance(f"{name}.options", spec.options, Mapping, allowed)
-    spec.check_options(f"{name}.options", spec.options)
 
 
 def create(
@@ -346,14 +240,14 @@ def _base(
     allowed = "newton_qd.robots.Material"
     checks.instance("material", material, Material, allowed, optional=True)
     _require_keywords(env_name, spec.base, options)
-    if "robot" not in options and _takes_robot(spec.base):
+    if "robot" not in options and takes_robot(spec.base):
         why = f"and {getattr(spec.base, '__name__', 'base')} needs a robot"
         allowed = "a newton_qd.robots.RobotSpec, as robot=... of register or of create"
         raise TypeError(message("robot", None, allowed, why=why))
     env = spec.base(**options)
     if not isinstance(env, Env):
         why = f"which {env_name!r} makes"
-        raise TypeError(message("base", env, _ENVIRONMENT, why=why))
+        raise TypeError(message("base", env, ENVIRONMENT, why=why))
     check_methods(env)
     return env if material is None else env.with_material(material)
 

@@ -38,6 +38,7 @@ LAYERS = (
     "brax_views",
     "tasks",
     "tables",
+    "registration",
     "registry",
     "authoring",
     "gradients",

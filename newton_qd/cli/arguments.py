@@ -111,6 +111,22 @@ def integers(text: str, separator: str) -> tuple[int, ...]:
         raise argparse.ArgumentTypeError(given) from error
 
 
+def picture_size(text: str) -> tuple[int, int]:
+    """Parses a width and a height.
+
+    Raises:
+        argparse.ArgumentTypeError: The text is not two integers from 16 to 4096.
+    """
+    try:
+        size = integers(text, "x")
+    except argparse.ArgumentTypeError:
+        size = ()
+    if len(size) != 2 or not all(16 <= each <= 4096 for each in size):
+        given = f"got {text!r}; allowed: two integers from 16 to 4096, like 480x360"
+        raise argparse.ArgumentTypeError(given)
+    return size[0], size[1]
+
+
 def numbers(text: str) -> tuple[float, ...]:
     """Parses numbers with commas between them.
 

@@ -16,7 +16,7 @@ from newton_qd.cli.arguments import (
     Commands,
     add_elite_choice,
     complain,
-    integers,
+    picture_size,
     require_writable,
 )
 from newton_qd.cli.progress import ProgressCount
@@ -119,7 +119,7 @@ def _add_render(commands: Commands) -> None:
     )
     parser.add_argument(
         "--size",
-        type=_size,
+        type=picture_size,
         default=(480, 360),
         metavar="WxH",
         help="size of the picture of one world [px] (default: 480x360)",
@@ -134,22 +134,6 @@ def _add_render(commands: Commands) -> None:
         help="pictures per second of a GIF or video (default: 20)",
     )
     parser.set_defaults(run=render)
-
-
-def _size(text: str) -> tuple[int, int]:
-    """Parses a width and a height.
-
-    Raises:
-        argparse.ArgumentTypeError: The text is not two integers from 16 to 4096.
-    """
-    try:
-        size = integers(text, "x")
-    except argparse.ArgumentTypeError:
-        size = ()
-    if len(size) != 2 or not all(16 <= each <= 4096 for each in size):
-        given = f"got {text!r}; allowed: two integers from 16 to 4096, like 480x360"
-        raise argparse.ArgumentTypeError(given)
-    return size[0], size[1]
 
 
 def _add_choice(parser: argparse.ArgumentParser) -> None:
