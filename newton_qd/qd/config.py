@@ -299,7 +299,7 @@ def read_config(
     """Reads a ``config.json``, or settings in a TOML file.
 
     Args:
-        path: File to read. A ``.toml`` file has settings as ``name = value``, and a
+        path: File to read. A ``.toml`` file has settings as ``name = value``, and the
             tables ``options`` and ``env_options``.
         env_name: Environment, if the file does not name one.
 
