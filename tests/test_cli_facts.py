@@ -147,6 +147,10 @@ def test_a_place_that_cannot_be_written(
             ConfigError, match=r"^--out: got .*, and .* cannot be writt"
         ):
             require_writable("--out", bad)
+    (own / "file").touch()
+    require_writable("--out", own / "file")
+    with pytest.raises(ConfigError, match=r"file cannot be written"):
+        require_writable("--out", own / "file" / "new")
     doctor = ["doctor", "gradients", "pointmaze", "--out", str(other / "new")]
     assert cli.main(doctor) == cli.BAD_ARGUMENTS
     assert "cannot be written; allowed: a place that can be" in capsys.readouterr().err

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import concurrent.futures
 import importlib
 import subprocess
 import sys
@@ -106,6 +107,18 @@ def test_a_search_leaves_the_imports_of_others_alone() -> None:
         assert finder._FINDER in sys.meta_path
     assert finder._FINDER not in sys.meta_path
     assert not set(CONTENTS) & set(sys.modules)
+    with (
+        newton_qd.compat.installed(),
+        concurrent.futures.ThreadPoolExecutor(4) as pool,
+    ):
+
+        def borrow(_: int) -> bool:
+            with newton_qd.compat.installed():
+                importlib.import_module("qdax.environments")
+            return finder._FINDER in sys.meta_path
+
+        assert all(pool.map(borrow, range(20)))  # they wait for nobody
+    assert finder._FINDER not in sys.meta_path and finder._FINDER.users == 0
     with newton_qd.compat.installed():
         newton_qd.compat.install()  # of a user, who wants it to stay
     assert finder._FINDER in sys.meta_path

@@ -164,6 +164,27 @@ def test_a_step_keeps_its_own_arguments() -> None:
         scaled.step(state, action, heavy)
 
 
+def test_what_is_inherited_stays_inherited(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Between(OfQDax):
+        """Has no ``step`` of its own."""
+
+    class More(OfQDax):
+        def step(self, state: Any, action: Any) -> Any:
+            state = super().step(state, action)
+            return state.replace(reward=state.reward + 10)
+
+    class Both(Between, More):
+        """Python asks ``More`` before ``OfQDax``."""
+
+    point = newton_qd.create("pointmaze", episode_length=None, auto_reset=False)
+    state, action = point.reset(KEY), jnp.zeros(2)
+    plain = point.step(state, action).reward
+    assert "step" not in vars(Between) and "step" not in vars(Both)
+    assert Both(point).step(state, action).reward == pytest.approx(plain + 11)
+    monkeypatch.setattr(OfQDax, "step", lambda self, *given: "patched")
+    assert Between(point).step(state, action) == "patched"
+
+
 def test_a_step_of_two_arguments_works_inside_wrappers() -> None:
     point = newton_qd.create("pointmaze", episode_length=None, auto_reset=False)
     inside: Any = OfQDax(point)

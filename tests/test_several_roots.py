@@ -179,7 +179,7 @@ def test_a_ball_does_not_hide_a_soft_wall(tmp_path: Path) -> None:
     text = f'<robot name="r"><link name="world"/>{loose("a", 1.0)}{large}</robot>'
     contacts = (Contact("a"), Contact("b"))
     robot = row(write(tmp_path, text), "a", contacts=contacts)
-    with pytest.warns(SoftWallWarning, match=r"test, with the link 'a', is held up to"):
+    with pytest.warns(SoftWallWarning, match=r"test, the body on 'a', is held up to"):
         load_system(robot, "float32", Scene("w", str(tmp_path / "wall.urdf")))
     (tmp_path / "wall.urdf").write_text(
         wall.replace("collision>", "visual>"), encoding="utf-8"

@@ -81,9 +81,11 @@ def require_writable(name: str, path: Path) -> None:
         ConfigError: Its folder cannot be written.
     """
     places = (path.absolute(), *path.absolute().parents)
-    folder = next(place for place in places if place.is_dir())
-    if not os.access(folder, os.W_OK):
-        why = f"and {folder} cannot be written"
+    found = next(place for place in places if os.path.lexists(place))
+    if found == places[0] and not found.is_dir():
+        found = found.parent  # a file is replaced by another one of its folder
+    if not found.is_dir() or not os.access(found, os.W_OK | os.X_OK):
+        why = f"and {found} cannot be written"
         raise ConfigError(message(name, str(path), "a place that can be", why=why))
 
 

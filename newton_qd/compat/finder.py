@@ -30,9 +30,11 @@ class _Finder(MetaPathFinder, Loader):
         contents: The modules that it fills: ``CONTENTS``, and ``BRAX_V1`` if brax v1 is
             not installed.
         kept: Whether it stays when ``installed`` ends.
+        users: Blocks of ``installed`` that have not ended.
     """
 
     kept = False
+    users = 0
     contents: Mapping[str, Contents] = CONTENTS
 
     def find_spec(
@@ -119,17 +121,21 @@ def installed() -> Iterator[None]:
         MissingExtra: QDax is not installed.
         ImportError: The installed release of QDax is not in ``SUPPORTED``.
     """
-    with _CHANGING:  # no other thread may end it, or begin it for good
-        own = any(name in sys.modules for name in CONTENTS)
-        if own or _FINDER in sys.meta_path:  # QDax has its environments, or ours
-            yield
-            return
-        _install()
-        _FINDER.kept = False
-        try:
-            yield
-        finally:
-            if not _FINDER.kept:
+    with _CHANGING:
+        inside = _FINDER in sys.meta_path
+        if not inside and any(name in sys.modules for name in CONTENTS):
+            borrowed = False  # QDax has its own environments
+        else:
+            _install()
+            borrowed = True
+            _FINDER.kept = _FINDER.kept if inside else False
+            _FINDER.users += 1
+    try:
+        yield
+    finally:
+        with _CHANGING:
+            _FINDER.users -= borrowed
+            if borrowed and not _FINDER.users and not _FINDER.kept:
                 uninstall()
 
 

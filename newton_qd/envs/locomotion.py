@@ -65,7 +65,8 @@ class Locomotion(PhysicsEnv):
             robot, reset_noise_scale=reset_noise_scale, dtype=dtype, scene=scene
         )
         if self.system.free_root is None:
-            kind = JointKind(self.system.joint_kind[self.system.roots[0]])
+            root = self.system.roots[self.system.torso]
+            kind = JointKind(self.system.joint_kind[root])
             why = f"whose first joint is {kind.name.lower()}"
             allowed = "a robot whose root link moves freely"
             raise ValueError(message("robot", Fact(robot.name), allowed, why=why))

@@ -45,24 +45,25 @@ def accept_params(kind: type) -> None:
         kind: A class that has just been made.
     """
     step = inspect.getattr_static(kind, "step", None)
+    # what is inherited is ready; what is no method of an instance stays as it is
+    if getattr(step, "accepts_params", False) or not hasattr(step, "__get__"):
+        return
     if not callable(step) or isinstance(step, staticmethod | classmethod):
         return
     signature = inspect.signature(step)
     with contextlib.suppress(TypeError):
         signature.bind(None, None, None, None)
         return  # it takes a third argument
-    named = [
-        x.name == "params" or x.kind is x.VAR_KEYWORD
-        for x in signature.parameters.values()
-    ]
+    named = "params" in signature.parameters
 
     @functools.wraps(step)
     def step_without_params(self: Any, *given: Any, **options: Any) -> Any:
-        if len(given) == 3:
+        if len(given) == 3 and "params" not in options:
             *given, options["params"] = given  # type: ignore[assignment]
-        if not any(named) and options.pop("params", None) is not None:
+        if not named and options.pop("params", None) is not None:
             allowed, why = "None", f"and step of {kind.__name__} does not take them"
             raise TypeError(message("params", Fact("parameters"), allowed, why=why))
         return step(self, *given, **options)
 
+    step_without_params.accepts_params = True  # type: ignore[attr-defined]
     kind.step = step_without_params  # type: ignore[attr-defined]

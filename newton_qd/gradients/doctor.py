@@ -207,9 +207,8 @@ def _agreement(difference: Differences, step: int) -> tuple[np.ndarray, np.ndarr
     lost = (own == 0) | (length == 0)
     inner = (exact * chosen).sum(axis=1)
     cosine = np.where(lost, 0.0, inner / np.where(lost, 1.0, own * length))
-    ratio = np.where(
-        length == 0, np.where(own == 0, 1.0, np.inf), own / np.maximum(length, 1e-300)
-    )
+    with np.errstate(divide="ignore", invalid="ignore"):  # 0 / 0 is not taken
+        ratio = np.where(own == 0, 0.0, own / length)
     return np.where(still, 1.0, cosine), np.where(still, 1.0, ratio)
 
 

@@ -60,7 +60,7 @@ def soft_walls(system: System) -> tuple[str, ...]:
             name = f"scene {system.scene.name!r}, wall {wall}"
             moving = system.robot.name
             if len(held) > 1 and tree is not None:
-                moving += f", with the link {system.body_names[tree]!r},"
+                moving += f", the body on {system.body_names[tree]!r},"
             given = Fact(f"{moving} is held up to {speed:.2g} m/s")
             allowed = (
                 f"{_EXPECTED:g} m/s, with a thicker wall or a smaller "

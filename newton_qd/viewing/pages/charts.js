@@ -104,16 +104,17 @@
       made.pen.fillStyle = color;
       for (let k = 0; k < length; k++) { // as a descriptor: not the last state
         // a frame may stand for several steps
-        const share = this.data.feet.data[(w * frames + k) * nf + f] / most;
-        if (!share) continue;
-        touched += share;
+        const seen = this.data.feet.data[(w * frames + k) * nf + f];
+        if (!seen) continue;
+        touched += seen;
+        const share = seen / Math.min(most, steps - k * most);
         made.pen.globalAlpha = share;
         const x = k / total * made.width;
         made.pen.fillRect(
           x, f * HEIGHT.feet + 1, Math.max(1, made.width / total), HEIGHT.feet - 2);
       }
       made.pen.globalAlpha = 1;
-      key(made.names, names[f] + " " + Math.round(100 * touched * most / Math.max(1, steps))
+      key(made.names, names[f] + " " + Math.round(100 * touched / Math.max(1, steps))
         + " %", color);
     }
   };
