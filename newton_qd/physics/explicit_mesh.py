@@ -94,13 +94,15 @@ def rows_of(array: jax.Array, rows: np.ndarray, columns: slice) -> jax.Array:
 
 
 def over_devices(
-    call: Callable[..., tuple[jax.Array, ...]],
+    call: Callable[..., tuple[jax.Array, ...]], *, splits: bool = False
 ) -> Callable[..., tuple[jax.Array, ...]]:
     """Returns a function of one world's rows that takes split arrays under ``vmap``.
 
     Args:
         call: A :class:`~newton_qd.physics.row_calls.RowCall`. Under ``vmap`` the worlds
             share one launch.
+        splits: Whether XLA itself may split the call, on a mesh whose axes are not
+            explicit.
     """
 
     @functools.partial(jax.jit, static_argnames="output_dims", inline=True)
@@ -110,15 +112,17 @@ def over_devices(
 
     @functools.cache
     def batched(output_dims: int) -> Callable[..., jax.Array]:
-        return _with_batch_rule(lambda *rows: call(*rows, output_dims=output_dims)[0])
+        return _with_batch_rule(
+            lambda *rows: call(*rows, output_dims=output_dims)[0], splits
+        )
 
     return run
 
 
-def _with_batch_rule(call: Rows) -> Rows:
+def _with_batch_rule(call: Rows, splits: bool) -> Rows:
     @custom_vmap
     def run(*rows: jax.Array) -> jax.Array:
-        return _split(call, rows)
+        return _split(call, rows, splits)
 
     @run.def_vmap
     def run_batch(
@@ -133,11 +137,12 @@ def _with_batch_rule(call: Rows) -> Rows:
     return run
 
 
-def _split(call: Rows, rows: tuple[jax.Array, ...]) -> jax.Array:
+def _split(call: Rows, rows: tuple[jax.Array, ...], splits: bool) -> jax.Array:
     """Calls a function of rows on arrays (..., size), on each device for its worlds."""
     for _ in range(rows[0].ndim - 1):
         call = jax.vmap(call)
-    call = _marked(call, rows[0].ndim - 1)
+    if splits:
+        call = _marked(call, rows[0].ndim - 1)
     found = [sharding for row in rows if (sharding := _explicit(row)) is not None]
     if not found:
         return call(*rows)
@@ -147,10 +152,7 @@ def _split(call: Rows, rows: tuple[jax.Array, ...]) -> jax.Array:
 
 
 def _marked(call: Rows, axes: int) -> Rows:
-    """Returns a call that XLA may split along its first axes, which are worlds.
-
-    XLA splits it on a mesh whose axes are not explicit.
-    """
+    """Returns a call that XLA may split along its first axes, which are worlds."""
 
     def marked(*rows: jax.Array) -> jax.Array:
         with set_xla_metadata(num_batch_dims=str(axes)):

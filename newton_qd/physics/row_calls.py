@@ -182,7 +182,8 @@ def native_row_call(plan: Plan, target: str = "newton_qd_rows") -> RowCall:
         run = jax.ffi.ffi_call(target, row, vmap_method="broadcast_all")
         return (run(*rows, plan=np.int64(plan.key)),)
 
-    return over_devices(jax.jit(call, static_argnames="output_dims", inline=True))
+    traced = jax.jit(call, static_argnames="output_dims", inline=True)
+    return over_devices(traced, splits=True)
 
 
 def differentiable(
