@@ -6,6 +6,7 @@ import errno
 import io
 import json
 import os
+import subprocess
 import sys
 from pathlib import Path
 
@@ -169,3 +170,21 @@ def test_the_doctor_reports_a_machine_without_devices(
     monkeypatch.setattr("newton_qd.physics.cache.kernel_cache", refused)
     assert health._devices() == ["none (no device)"]
     assert health._kernel_cache() == {"folder": "/kernels", "writable": False}
+
+
+def test_the_doctor_reports_a_cache_that_cannot_be_made(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    folder = str(tmp_path / "file" / "kernels")
+    done = subprocess.run(
+        [sys.executable, "-m", "newton_qd", "doctor", "--json"],
+        env={**os.environ, "WARP_CACHE_PATH": folder},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=100,
+    )
+    found = json.loads(done.stdout)
+    assert found["kernel_cache"]["writable"] is False
+    assert (
+        done.returncode == cli.FAILED and "NotADirectory" in found["check"]["problem"]
+    )

@@ -69,13 +69,11 @@ def _devices() -> list[str]:
 
 def _kernel_cache() -> dict[str, Any]:
     """Returns the folder of compiled kernels, and whether it can be written."""
-    from newton_qd.physics.cache import kernel_cache
-    from newton_qd.physics.precision import quiet
-
     try:
-        quiet()
+        from newton_qd.physics.cache import kernel_cache
+
         folder = Path(kernel_cache())
-    except OSError as error:  # Warp cannot make it
+    except OSError as error:  # Warp cannot make it, already at the import
         return {"folder": error.filename, "writable": False}
     return {"folder": str(folder), "writable": os.access(folder, os.W_OK)}
 

@@ -24,6 +24,9 @@ class Locomotion(PhysicsEnv):
     Reward: weighted velocity of the root along x, plus a bonus for being healthy, minus
     a cost of control. Done when the height of the root is not healthy. For other
     rewards, override ``outcome`` in a subclass.
+
+    Where the robot has other free bodies, such as a ball, their coordinates are among
+    those of the joints in the observation.
     """
 
     forward_reward_name = "reward_forward"

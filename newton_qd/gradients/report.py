@@ -35,8 +35,6 @@ class HorizonRow:
         largest_norm: Norm of the gradient, maximum over the worlds.
         cosine: Cosine with central differences along random directions, median [-].
         worst_cosine: The same cosine, minimum over the worlds [-].
-        length: Length of the gradient along these directions divided by that of the
-            central differences [-], of the world where it is farthest from 1.
         first_deviation: Standard deviation of a first-order sample, over the whole
             genotype, median; infinite if a sample was not finite.
         zeroth_deviation: Standard deviation of a zeroth-order sample, in the same way.
@@ -44,6 +42,8 @@ class HorizonRow:
             zeroth order does not confirm, mean over the worlds [-].
         bias_error: Standard error of ``bias`` [-].
         order: Weight of the first order by inverse variances, median [-].
+        length: Length of the gradient along these directions divided by that of the
+            central differences [-], of the world where it is farthest from 1.
     """
 
     steps: int
@@ -58,7 +58,7 @@ class HorizonRow:
     bias: float
     bias_error: float
     order: float
-    length: float = 1.0
+    length: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,7 +121,10 @@ class GradientReport:
 
     @property
     def useful_horizon(self) -> int:
-        """Longest horizon at which first orders vary less than zeroth orders, or 0."""
+        """Longest horizon at which first orders vary less than zeroth orders, or 0.
+
+        A gradient of 0 does not count: it does not vary, and says nothing.
+        """
         return self._last(lambda row: row.order > 0.5 and row.norm > 0)
 
     def _last(self, good: Callable[[HorizonRow], bool]) -> int:

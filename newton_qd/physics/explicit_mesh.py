@@ -4,6 +4,8 @@ The axes of :func:`jax.make_mesh` are explicit by default. Then an array's type 
 how it is split, and JAX needs a rule for each operation:
 
 - A call of a kernel has no such rule. Each device runs the worlds that it holds.
+- Without explicit axes, XLA splits the batch, and with it calls of a CPU that are
+  marked. It gives all worlds to every device for other calls.
 - Under ``vmap`` the type of a constant does not tell how the worlds are split. JAX then
   refuses to join a constant with values of the worlds.
 """
