@@ -15,8 +15,10 @@ import jax
 import numpy as np
 import processes
 import pytest
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from test_algorithms import CRITIC
 
+import newton_qd
 from newton_qd.qd.config import ConfigError, EvolveConfig
 from newton_qd.qd.run.evolution import evolve
 from newton_qd.qd.scoring.sharding import device_mesh
@@ -311,6 +313,32 @@ def test_gpus_share_the_worlds() -> None:
     if len(jax.devices("gpu")) < 2:
         pytest.skip("needs two GPUs")
     check_devices()
+
+
+@pytest.mark.gpu
+def test_gpus_split_a_batch_on_automatic_axes() -> None:
+    """A call that XLA cannot split would gather the worlds of all GPUs on each."""
+    devices = jax.devices("gpu")[:2]
+    if len(devices) < 2:
+        pytest.skip("needs two GPUs")
+    env = newton_qd.create("hopper_uni", auto_reset=False)
+    states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 16))
+    actions = jax.random.uniform(jax.random.key(1), (16, 3))
+    rows = NamedSharding(Mesh(np.array(devices), ("x",)), PartitionSpec("x"))
+    split = jax.device_put((states, actions), rows)
+
+    def slope(states: newton_qd.State, actions: jax.Array) -> jax.Array:
+        step = jax.vmap(env.step)
+        return jax.grad(lambda a: step(states, a).reward.sum())(actions)
+
+    step = jax.jit(jax.vmap(env.step))
+    for function in (step, jax.jit(slope)):
+        text = function.lower(*split).compile().as_text()
+        assert text is not None and "all-gather" not in text
+    pairs = zip(
+        *map(jax.tree.leaves, (step(states, actions), step(*split))), strict=True
+    )
+    assert all(np.array_equal(one, two) for one, two in pairs)
 
 
 @pytest.mark.slow

@@ -96,15 +96,14 @@ def rows_of(array: jax.Array, rows: np.ndarray, columns: slice) -> jax.Array:
 
 
 def over_devices(
-    call: Callable[..., tuple[jax.Array, ...]], *, splits: bool = False
+    call: Callable[..., tuple[jax.Array, ...]],
 ) -> Callable[..., tuple[jax.Array, ...]]:
     """Returns a function of one world's rows that takes split arrays under ``vmap``.
 
     Args:
         call: A :class:`~newton_qd.physics.row_calls.RowCall`. Under ``vmap`` the worlds
-            share one launch.
-        splits: Whether XLA itself may split the call, on a mesh whose axes are not
-            explicit.
+            share one launch. It calls an FFI target that is registered as partitionable
+            along a batch: on a mesh with automatic axes, XLA itself splits the call.
     """
 
     @functools.partial(jax.jit, static_argnames="output_dims", inline=True)
@@ -114,17 +113,15 @@ def over_devices(
 
     @functools.cache
     def batched(output_dims: int) -> Callable[..., jax.Array]:
-        return _with_batch_rule(
-            lambda *rows: call(*rows, output_dims=output_dims)[0], splits
-        )
+        return _with_batch_rule(lambda *rows: call(*rows, output_dims=output_dims)[0])
 
     return run
 
 
-def _with_batch_rule(call: Rows, splits: bool) -> Rows:
+def _with_batch_rule(call: Rows) -> Rows:
     @custom_vmap
     def run(*rows: jax.Array) -> jax.Array:
-        return _split(call, rows, splits)
+        return _split(call, rows)
 
     @run.def_vmap
     def run_batch(
@@ -139,12 +136,11 @@ def _with_batch_rule(call: Rows, splits: bool) -> Rows:
     return run
 
 
-def _split(call: Rows, rows: tuple[jax.Array, ...], splits: bool) -> jax.Array:
+def _split(call: Rows, rows: tuple[jax.Array, ...]) -> jax.Array:
     """Calls a function of rows on arrays (..., size), on each device for its worlds."""
     for _ in range(rows[0].ndim - 1):
         call = jax.vmap(call)
-    if splits:
-        call = _marked(call, rows[0].ndim - 1)
+    call = _marked(call, rows[0].ndim - 1)
     found = [sharding for row in rows if (sharding := _explicit(row)) is not None]
     if not found:
         return call(*rows)

@@ -137,6 +137,7 @@ def row_call(
         vmap_method="broadcast_all",
         graph_mode=wp.JaxCallableGraphMode.NONE,
     )
+    jax.ffi.register_ffi_target_as_batch_partitionable(call.name)
     # Warp gives each traced call a number and keeps it, and XLA compiles each number.
     # jit traces once. Without jit, every eager call would be traced and compiled.
     traced = jax.jit(call, static_argnames="output_dims", inline=True)
@@ -183,7 +184,7 @@ def native_row_call(plan: Plan, target: str = "newton_qd_rows") -> RowCall:
         return (run(*rows, plan=np.int64(plan.key)),)
 
     traced = jax.jit(call, static_argnames="output_dims", inline=True)
-    return over_devices(traced, splits=True)
+    return over_devices(traced)
 
 
 def differentiable(
