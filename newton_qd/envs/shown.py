@@ -1,4 +1,4 @@
-"""The text of an environment: its name, its sizes, its wrappers and their options."""
+"""The text of an environment: its name, sizes, wrappers, options and descriptor."""
 
 from __future__ import annotations
 
@@ -31,6 +31,22 @@ def described(env: Any) -> str:
     sizes.append(f"{env.dt:g} s")
     parts = ", ".join(_layer(layer) for layer in reversed(layers))
     return f"<{name}: {', '.join(sizes)}; {parts}>"
+
+
+def component_names(env: Any, length: int) -> tuple[str, ...]:
+    """Returns names of the components of the state descriptor, with their units.
+
+    Args:
+        env: Environment; it may have no state descriptor.
+        length: Number of components.
+    """
+    name = getattr(env, "state_descriptor_name", "descriptor")
+    robot = getattr(env.unwrapped, "robot", None)
+    if name == "feet_contact" and robot is not None and length == len(robot.feet):
+        return tuple(f"{foot} contact" for foot in robot.feet)
+    if name == "xy_position" and length == 2:
+        return ("x", "y") if robot is None else ("x [m]", "y [m]")
+    return tuple(f"{name} {index + 1}" for index in range(length))
 
 
 def _layer(layer: Any) -> str:

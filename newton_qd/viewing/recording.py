@@ -16,6 +16,7 @@ from newton_qd import checks, memory, physics
 from newton_qd.checks import Fact, message
 from newton_qd.envs.base import Env, PhysicsEnv
 from newton_qd.envs.inputs import require_key
+from newton_qd.envs.shown import component_names
 from newton_qd.types import Action, Observation, Params, PyTree, RNGKey
 from newton_qd.viewing.drawing import Drawing, drawing_of
 from newton_qd.viewing.trajectory import Contacts, Trajectory
@@ -283,7 +284,7 @@ def _trajectory(
         dt=float(env.dt),
         rewards=later["reward"],
         descriptors=frames("descriptor"),
-        descriptor_names=_descriptor_names(env, first["descriptor"].shape[-1]),
+        descriptor_names=component_names(env, first["descriptor"].shape[-1]),
         feet=frames("feet"),
         labels=tuple(labels),
         contacts=found,
@@ -299,14 +300,3 @@ def _resets_itself(env: Any) -> bool:
             return True
         env = env.env
     return False
-
-
-def _descriptor_names(env: Any, length: int) -> tuple[str, ...]:
-    """Returns names for the components of the state descriptor."""
-    name = getattr(env, "state_descriptor_name", "descriptor") if length else ""
-    if name == "feet_contact" and length == len(env.unwrapped.robot.feet):
-        return tuple(f"{foot} contact" for foot in env.unwrapped.robot.feet)
-    if name == "xy_position" and length == 2:
-        unit = " [m]" if isinstance(env.unwrapped, PhysicsEnv) else ""
-        return (f"x{unit}", f"y{unit}")
-    return tuple(f"{name} {index + 1}" for index in range(length))

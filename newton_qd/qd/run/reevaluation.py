@@ -68,12 +68,11 @@ def reevaluate(
     best = corrected_fitnesses(archive, score, key, reevaluations, stop)
     if best is None:
         return None
-    kept = best[np.isfinite(best)]
     return Reevaluated(
         reevaluations=reevaluations,
-        qd_score=float(np.sum(kept + offset)),
-        coverage=100.0 * len(kept) / len(best),
-        max_fitness=float(best.max()),
+        qd_score=float(quality.offset_qd_score(best, offset)),
+        coverage=float(quality.coverage(best)),
+        max_fitness=float(quality.best(best)),
         mean_fitness=float(quality.mean_fitness(best)),
         qd_gain=None if untrained is None else float(quality.qd_gain(best, untrained)),
     )

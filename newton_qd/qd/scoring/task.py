@@ -12,6 +12,8 @@ import numpy as np
 
 from newton_qd import checks, tasks
 from newton_qd.checks import Fact, listed, message
+from newton_qd.envs.shown import component_names
+from newton_qd.extractors import get_final_xy_position
 from newton_qd.qd.config import ConfigError, EvolveConfig
 from newton_qd.robots import ROBOTS, Material
 from newton_qd.scenes import SCENES, Scene
@@ -92,11 +94,12 @@ def make_task(config: EvolveConfig) -> Task:
         allowed = "finite numbers, such as minval and maxval of XYPositionWrapper"
         given = (low.tolist(), high.tolist())
         raise ConfigError(message(f"descriptor limits of {name!r}", given, allowed))
+    extractor = newton_qd.tables.descriptor_extractor[name]
     return Task(
         env=env,
-        descriptor_extractor=newton_qd.tables.descriptor_extractor[name],
+        descriptor_extractor=extractor,
         limits=(low, high),
-        labels=_labels(env, len(low)),
+        labels=_labels(env, extractor, len(low)),
         reward_offset=float(newton_qd.tables.reward_offset[name]),
     )
 
@@ -226,10 +229,8 @@ def _declared_length(name: str) -> int | None:
     return None  # wrong limits have an error of their own
 
 
-def _labels(env: Any, length: int) -> tuple[str, ...]:
-    if env.state_descriptor_name == "feet_contact":
-        return tuple(f"{foot} contact" for foot in env.unwrapped.robot.feet)
-    if env.state_descriptor_name == "xy_position" and length == 2:
-        unit = "m" if hasattr(env.unwrapped, "robot") else "-"
-        return (f"final x [{unit}]", f"final y [{unit}]")
-    return tuple(f"descriptor {index + 1}" for index in range(length))
+def _labels(env: Any, extractor: Any, length: int) -> tuple[str, ...]:
+    """Returns names of the components of an episode's descriptor."""
+    names = component_names(env, length)
+    final = extractor is get_final_xy_position
+    return tuple(f"final {name}" if final else name for name in names)
