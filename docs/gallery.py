@@ -57,12 +57,13 @@ DESCRIPTORS = {
 """What the extractors of the suite compute."""
 
 CHANGES = {
-    "NoForwardRewardWrapper": "Here, velocity has no reward.",
     "TrapWrapper": "Here, a trap of three walls is ahead.",
-    "MazeWrapper": "Here, it is in a maze, and the reward is minus the distance to a "
-    "target.",
+    "MazeWrapper": "It is in a maze, and the reward is minus the distance to a target.",
 }
 """What wrappers change of a task, beside its descriptor."""
+
+OTHER_REWARD = {"MazeWrapper", "NoForwardRewardWrapper"}
+"""Wrappers that do not reward what the robot is rewarded for."""
 
 
 def actions(env: Any, steps: int) -> jax.Array:
@@ -133,7 +134,10 @@ def page() -> str:
         if options.get("scene") == HURDLES:
             summary += " Here, five hurdles are ahead."
         wrappers = [getattr(one.wrapper, "__name__", "") for one in spec.wrappers]
-        summary += "".join(f" {CHANGES[one]}" for one in wrappers if one in CHANGES)
+        changes = [CHANGES[one] for one in wrappers if one in CHANGES]
+        if OTHER_REWARD & set(wrappers):
+            summary = summary.partition(", rewarded")[0].removesuffix(".") + "."
+        summary = " ".join([summary, *changes])
         extractor = getattr(spec.descriptor_extractor, "__name__", None)
         if extractor is not None:
             summary += f" Descriptor: {DESCRIPTORS[extractor]}."

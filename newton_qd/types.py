@@ -115,7 +115,7 @@ INFO_KEYS: Mapping[str, str] = types.MappingProxyType(
         "steps": "() control steps since the episode began",
         "truncation": "() 1 where the episode ended by its length alone, else 0",
         "state_descriptor": "(nd,) descriptor of the state that this step reached",
-        "xy_position": "(2,) x and y of the torso [m], also beyond the limits",
+        "xy_position": "(2,) x and y of the torso or tip, also beyond the limits",
         "rng": "data of the key from which the next place of a target is drawn",
         "first_pipeline_state": "physics state to which an auto-reset returns",
         "first_obs": "(no,) observation to which an auto-reset returns",

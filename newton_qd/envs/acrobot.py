@@ -16,9 +16,9 @@ from newton_qd.types import Action, Metrics
 class Acrobot(PhysicsEnv):
     """Two poles that hang from a mount. The joint between them is driven.
 
-    The task is to swing them upright. Observation: ``observation_layout``. Reward: 10,
-    minus the squared joint angles, minus a penalty for the joint velocities. The angles
-    are 0 when the poles stand. Never done.
+    The task is to swing them upright. Reward: 10, minus the squared joint angles, minus
+    a penalty for the joint velocities. The angles are 0 when the poles stand. Never
+    done.
 
     Metrics:
         dist_penalty: Sum of the squared joint angles [rad^2].

@@ -23,8 +23,8 @@ _ROOT_Q, _ROOT_V = 7, 6  # a free root has 7 coordinates and 6 velocities
 class Ant(PhysicsEnv):
     """A torso on four legs of two joints, rewarded for velocity along x.
 
-    Observation: ``observation_layout``. Reward: velocity along x, plus a bonus for
-    being healthy, minus costs of control and of contact. Done when unhealthy.
+    Reward: velocity along x, plus a bonus for being healthy, minus costs of control and
+    of contact. Done when unhealthy.
 
     Metrics:
         reward_forward: Velocity of the torso along x [m/s].

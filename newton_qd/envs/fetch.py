@@ -20,11 +20,10 @@ _LEGS = ("front_right", "front_left", "back_right", "back_left")
 class Fetch(Pursuit):
     """A dog of boxes, driven by torques, that runs to one target after another.
 
-    Observation: ``observation_layout``. Reward: a tenth of the way of the torso towards
-    the target, small rewards for a torso that is upright and high, and a reward within
-    2 m of the target: the cosine between the torso's x axis and the direction of the
-    target. The target then moves to a random place. Never done. Only the lower legs
-    touch the ground.
+    Reward: a tenth of the way of the torso towards the target, small rewards for a
+    torso that is upright and high, and a reward within 2 m of the target: the cosine
+    between the torso's x axis and the direction of the target. The target then moves to
+    a random place. Never done. Only the lower legs touch the ground.
 
     Metrics:
         hits: 1 if the target was reached, else 0.

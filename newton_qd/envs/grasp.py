@@ -42,12 +42,11 @@ class Grasp(Servos, MovingTarget):
     15 % of the way to it, but never more than 0.3 m. Actions beyond -1 and 1 are
     clipped.
 
-    Observation: ``observation_layout``. Reward: 1.5 times the way of the object towards
-    the target, and 5 when the object is within 1.1 m of the target. There are three
-    small rewards: for a hand that moves to the object, for a palm above it, and for the
-    tip of finger 1 that touches it. A target that was reached moves to a random place.
-    The first target is next to the object, so the first step reaches it, as in the
-    original. Never done.
+    Reward: 1.5 times the way of the object towards the target, and 5 when the object is
+    within 1.1 m of the target. There are three small rewards: for a hand that moves to
+    the object, for a palm above it, and for the tip of finger 1 that touches it. A
+    target that was reached moves to a random place. The first target is next to the
+    object, so the first step reaches it, as in the original. Never done.
 
     Metrics:
         hits: 1 if the target was reached, else 0.

@@ -17,8 +17,7 @@ from newton_qd.types import Action, Metrics
 class HalfCheetah(PhysicsEnv):
     """A trunk on two legs of three joints, rewarded for velocity along x.
 
-    Observation: ``observation_layout``. Reward: velocity along x minus a cost of
-    control. Never done.
+    Reward: velocity along x minus a cost of control. Never done.
 
     Metrics:
         x_position: x of the trunk [m].

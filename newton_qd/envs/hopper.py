@@ -17,8 +17,8 @@ from newton_qd.types import Action, Metrics
 class Hopper(PhysicsEnv):
     """A torso on one leg of three joints, rewarded for velocity along x.
 
-    Observation: ``observation_layout``. Reward: velocity along x, plus a bonus for
-    being healthy, minus a cost of control. Done when unhealthy.
+    Reward: velocity along x, plus a bonus for being healthy, minus a cost of control.
+    Done when unhealthy.
 
     Metrics:
         reward_forward: Velocity of the torso along x times its weight.

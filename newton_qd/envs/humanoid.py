@@ -30,9 +30,9 @@ _OBSERVED = (
 class Humanoid(PhysicsEnv):
     """A trunk with arms on two legs, rewarded for velocity along x.
 
-    Observation: ``observation_layout``. Reward: velocity of the centre of mass along
-    x, plus a bonus for being healthy, minus a cost of control. Done when unhealthy.
-    Only the shins touch the ground. Other bodies pass through it, as in the original.
+    Reward: velocity of the centre of mass along x, plus a bonus for being healthy,
+    minus a cost of control. Done when unhealthy. Only the shins touch the ground. Other
+    bodies pass through it, as in the original.
 
     Metrics:
         forward_reward: Velocity of the centre of mass along x times its weight.

@@ -16,11 +16,10 @@ from newton_qd.types import Action, Metrics
 
 
 class HumanoidTrap(Humanoid):
-    """The humanoid with contacts in the observation and a lower cost of control.
+    """The humanoid in front of a trap of three walls, with a lower cost of control.
 
-    The robot is the humanoid, in front of a trap. Its shins touch the walls. The
-    observation ends with the contact velocity changes of every body, of the ground and
-    of the walls. They are not clipped.
+    Its shins touch the walls. The observation ends with the contact velocity changes of
+    every body, of the ground and of the walls. They are not clipped.
 
     Metrics:
         reward_linvel: Velocity of the centre of mass along x times its weight.

@@ -26,8 +26,7 @@ _WEIGHTS = (0.01, 1.0, 1e-3, 5e-3)
 class InvertedPendulum(PhysicsEnv):
     """A pole on a cart. The action pushes the cart along x. Each step is rewarded.
 
-    Observation: ``observation_layout``. Reward: 1. Done when the pole leans more than
-    0.2 rad.
+    Reward: 1. Done when the pole leans more than 0.2 rad.
     """
 
     @checked_options
@@ -72,9 +71,9 @@ class InvertedPendulum(PhysicsEnv):
 class InvertedDoublePendulum(PhysicsEnv):
     """Two poles, one on the other, on a cart. The action pushes the cart along x.
 
-    Observation: ``observation_layout``. Reward: 10, minus penalties for the position of
-    the upper pole's tip and for the joint velocities. Done when the tip is at a height
-    of 1 m or less. Its height is 1.3 m when the poles are upright.
+    Reward: 10, minus penalties for the position of the upper pole's tip and for the
+    joint velocities. Done when the tip is at a height of 1 m or less. Its height is 1.3
+    m when the poles are upright.
     """
 
     @checked_options

@@ -23,10 +23,9 @@ _NEAR, _CONTROL = 0.5, 0.1  # weights of the hand's distance [1/m] and of contro
 class Pusher(PhysicsEnv):
     """An arm with seven hinges that pushes an object over a table, driven by torques.
 
-    Observation: ``observation_layout``. Reward: minus the distance of the object from
-    its goal, minus half of its distance from the hand, minus a cost of control. Both
-    distances are those at the start of the step. Never done. There is no friction, so
-    a pushed object keeps sliding.
+    Reward: minus the distance of the object from its goal, minus half of its distance
+    from the hand, minus a cost of control. Both distances are those at the start of the
+    step. Never done. There is no friction, so a pushed object keeps sliding.
 
     Metrics:
         reward_dist: Minus the distance of the object from its goal [m].

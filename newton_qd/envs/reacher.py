@@ -25,9 +25,8 @@ _FARTHEST = 0.2  # largest distance of a target from the shoulder [m]
 class Reacher(PhysicsEnv):
     """An arm of two links over the ground, driven by torques.
 
-    Observation: ``observation_layout``. Reward: minus the distance of the tip from the
-    target, minus the sum of squared actions. Never done. The target is a body of the
-    simulation that does not move.
+    Reward: minus the distance of the tip from the target, minus the sum of squared
+    actions. Never done. The target is a body of the simulation that does not move.
 
     Metrics:
         reward_dist: Minus the distance of the tip from the target [m].

@@ -28,7 +28,8 @@ class State:
     Attributes:
         pipeline_state: State of the simulation: a ``PhysicsState``.
         obs: (no,) observation.
-        reward: () reward of the step that led here; 0 after a reset.
+        reward: () reward of the step that led here; 0 after a reset, except in mazes
+            and with ``OffsetRewardWrapper``.
         done: () 1 if the episode has ended, else 0.
         metrics: Terms of the reward and other () quantities by name, 0 after a reset.
         info: Data of the wrappers; ``newton_qd.types.INFO_KEYS`` lists the keys.

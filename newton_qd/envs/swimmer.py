@@ -34,10 +34,10 @@ _QUADRATIC = 0.5 * _DENSITY * _SIDES.prod() / _SIDES[:2]
 class Swimmer(PhysicsEnv):
     """Three links in a row that float in water, rewarded for velocity along x.
 
-    Observation: ``observation_layout``. Reward: velocity of the centre of mass along x,
-    minus a cost of control. Never done. The drag of the water acts at the centre of
-    mass of each link, against its velocity. It is larger across the link than along it.
-    It is computed once per step, from the state at the start.
+    Reward: velocity of the centre of mass along x, minus a cost of control. Never done.
+    The drag of the water acts at the centre of mass of each link, against its velocity.
+    It is larger across the link than along it. It is computed once per step, from the
+    state at the start.
 
     Metrics:
         reward_fwd: Velocity of the centre of mass along x times its weight.

@@ -10,9 +10,9 @@ from newton_qd.robots import UR5E
 class Ur5e(Pursuit):
     """An arm of six hinges, driven by torques, that touches one target after another.
 
-    Observation: ``observation_layout``. Reward: a tenth of the way of ``wrist_3_link``
-    towards the target, and 1 when it is within 2 cm of the target. The target then
-    moves to a random place. Never done. Nothing touches.
+    Reward: a tenth of the way of ``wrist_3_link`` towards the target, and 1 when it is
+    within 2 cm of the target. The target then moves to a random place. Never done.
+    Nothing touches.
 
     Metrics:
         hits: 1 if the target was reached, else 0.

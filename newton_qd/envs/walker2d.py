@@ -16,8 +16,8 @@ from newton_qd.types import Action, Metrics
 class Walker2d(PhysicsEnv):
     """A torso on two legs of three joints each, rewarded for velocity along x.
 
-    Observation: ``observation_layout``. Reward: velocity along x, plus a bonus for
-    being healthy, minus a cost of control. Done when unhealthy.
+    Reward: velocity along x, plus a bonus for being healthy, minus a cost of control.
+    Done when unhealthy.
 
     Metrics:
         reward_forward: Velocity of the torso along x times its weight.

@@ -16,6 +16,7 @@ _PACKAGES = (
     "numpy",
     "qdax",
     "flax",
+    "optax",
 )
 
 

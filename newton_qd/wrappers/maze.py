@@ -21,11 +21,12 @@ from newton_qd.wrappers.scene_task import Corners, SceneTaskWrapper
 class MazeWrapper(SceneTaskWrapper):
     """A maze with walls and a target.
 
-    By default, it is 45 m by 45 m, with borders and three walls inside. The observation
-    begins with x and y of the torso, scaled so that they are -1 and 1 at the borders:
-    by default, (x - 17.5, y - 17.5) / 22.5. The reward is minus the horizontal distance
-    of the torso from the target [m], also at a reset. Done when the torso is below 0.2
-    m or above 5 m, by default. An episode does not end at the target.
+    The observation begins with x and y of the torso, scaled so that they are -1 and 1
+    at the borders of ``area``. The reward is minus the horizontal distance of the torso
+    from the target [m], also at a reset. Done when the height of the torso is not
+    within ``heights``. An episode does not end at the target. Options of the robot for
+    its reward and its end have no effect. The defaults are those of ``antmaze``: 45 m
+    by 45 m with three walls inside, and heights of 0.2 to 5 m.
     """
 
     scene: Scene = MAZE

@@ -31,14 +31,14 @@ from newton_qd.types import (
 
 @dataclasses.dataclass(frozen=True)
 class Policy:
-    """A multilayer perceptron whose weights are one vector.
+    """A network whose weights are one vector: a multilayer perceptron or your own.
 
     Attributes:
         size: Number of weights.
         init: Maps a key to weights (size,).
         unravel: Maps weights (size,) to the parameters that ``apply`` takes.
-        apply: Maps parameters and an observation (O,) to an action (A,) inside
-            [-1, 1].
+        apply: Maps parameters and an observation (O,) to an action (A,); a multilayer
+            perceptron gives values inside [-1, 1].
         ravel: Maps parameters to weights (size,); the inverse of ``unravel``.
         network: The Flax module that ``apply`` calls.
     """
