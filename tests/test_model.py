@@ -12,12 +12,13 @@ import newton
 import numpy as np
 import pytest
 import warp as wp
-from urdf_text import joint, link, row, sphere, write
+from urdf_text import built, joint, link, robot_text, row, sphere, write
 
 from newton_qd.assets import find_urdf
 from newton_qd.physics import reference
 from newton_qd.physics.model import build, build_system, load_system
 from newton_qd.physics.model.description import read_description
+from newton_qd.physics.model.rest import raising_coordinate
 from newton_qd.physics.model.verify import ModelMismatchError
 from newton_qd.physics.model.xml_reader import RobotDescriptionError
 from newton_qd.physics.system import JointKind, ObstacleKind, System
@@ -395,3 +396,16 @@ def test_an_edited_file_is_another_robot(tmp_path: Path) -> None:
     path.write_text(text.replace(mass[0], '<mass value="9"/>'), encoding="utf-8")
     after = load_system(robot)
     assert 9.0 in after.mass and 9.0 not in before.mass
+
+
+def test_the_root_is_raised_and_not_a_lift(tmp_path: Path) -> None:
+    """The torso is on a vertical slide, and its base is free."""
+    lift = '<origin xyz="0 0 0.5"/><axis xyz="0 0 1"/><limit lower="0" upper="0.1"/>'
+    text = robot_text(
+        link("base", sphere(0.2)),
+        joint("lift", "prismatic", "base", "head", lift),
+        link("head"),
+    )
+    system = built(tmp_path, text, "head", contacts=(Contact("base"),))
+    assert np.asarray(system.rest_q)[[2, 7]].tolist() == [0.2, 0.0]
+    assert raising_coordinate(system) == (2, 1.0)

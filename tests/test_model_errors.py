@@ -8,7 +8,16 @@ import re
 from pathlib import Path
 
 import pytest
-from urdf_text import joint, link, row, write
+from urdf_text import (
+    built,
+    joint,
+    link,
+    refusal,
+    robot_text,
+    row,
+    sphere,
+    write,
+)
 
 from newton_qd.assets import AssetNotFoundError, find_urdf
 from newton_qd.physics.model import RobotDescriptionError, build_system, load_system
@@ -378,3 +387,43 @@ def test_missing_file(tmp_path: Path) -> None:
         find_urdf(tmp_path)
     with pytest.raises(AssetNotFoundError):
         find_urdf("")
+
+
+def test_a_height_beyond_the_limits_of_its_slide(tmp_path: Path) -> None:
+    limits = '<axis xyz="0 0 1"/><limit lower="0" upper="0.5"/>'
+    text = robot_text(
+        '<link name="world"/>',
+        joint("z", "prismatic", "world", "body", limits),
+        link("body", sphere(0.7)),
+    )
+    for changes in ({"rest_height": 3.0}, {"contacts": (Contact("body"),)}):
+        allowed = (
+            r"rest_height: got .*'z' must be at .*; allowed: .* limits, 0 to 0.5 m"
+        )
+        with pytest.raises(RobotDescriptionError, match=allowed):
+            built(tmp_path, text, "body", **changes)
+
+
+def test_a_quaternion_in_an_origin(tmp_path: Path) -> None:
+    turned = '<origin xyz="0 0 0" quat_xyzw="0 0 0 1"/><axis xyz="0 0 1"/>'
+    text = robot_text(
+        link("base"), joint("j", "continuous", "base", "tip", turned), link("tip")
+    )
+    assert 'rpy="roll pitch yaw"' in refusal(tmp_path, text, "base")
+
+
+def test_a_pair_given_twice(tmp_path: Path) -> None:
+    named = sphere(0.2).replace("<collision>", '<collision name="c">')
+    text = robot_text(
+        '<link name="world"/>',
+        joint("first", "floating", "world", "a"),
+        joint("second", "floating", "world", "b"),
+        link("a", named),
+        link("b", sphere(0.2)),
+    )
+    pairs = (
+        (Contact("a"), Contact("b")),
+        (Contact("b"), Contact("a", collider="c")),
+    )
+    with pytest.raises(RobotDescriptionError, match=r"pairs: got .* twice"):
+        built(tmp_path, text, "a", pairs=pairs)

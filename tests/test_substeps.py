@@ -7,6 +7,8 @@ import warnings
 from pathlib import Path
 
 import energy_helpers as energies
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hexapod import GEAR, hexapod
@@ -21,6 +23,7 @@ from newton_qd.physics.model.substeps import (
     LARGEST_PHASE,
     LARGEST_TURN,
     contact_masses,
+    iterates,
     joint_speeds,
     needed_substeps,
 )
@@ -200,3 +203,33 @@ def test_fast_hexapod_has_enough(tmp_path: Path, x64: None, damping: float) -> N
     found = energies.judge(energies.driven(one, "bang-bang", 64, 100))
     report(f"damping {damping}: gain of a substep", found)
     assert found.substeps == 0.0 and found.faults == 0.0
+
+
+STICK = """<robot name="stick"><link name="stick"><inertial><mass value="1"/>
+  <inertia ixx="4e-4" iyy="{y}" izz="{z}" ixy="0" ixz="0" iyz="0"/></inertial>
+  <collision><geometry><sphere radius="0.05"/></geometry></collision></link></robot>"""
+
+
+def test_a_body_that_tumbles_keeps_its_energy(tmp_path: Path, x64: None) -> None:
+    """With velocity products of the start of a substep, the factor is 650."""
+    path = write(tmp_path, STICK.format(y=0.03, z=0.03))
+    robot = row(path, "stick", contacts=(Contact("stick"),), gravity=0.0)
+    system = build_system(robot, "float64")
+    q = jnp.asarray(system.rest_q).at[2].set(50.0)
+    v = jnp.array([0.0, 0.0, 0.0, 15.0, 10.0, 3.0])
+    state = physics.initial_state(system, q, v)
+    step = jax.jit(lambda state: physics.step(system, state, jnp.zeros(0))[0])
+
+    def energy(state: physics.PhysicsState) -> float:
+        return float(state.v @ physics.mass_matrix(system, state.q) @ state.v) / 2
+
+    first = energy(state)
+    for _ in range(60):
+        state = step(state)
+    assert 0.9 < energy(state) / first < 1.01
+
+
+def test_a_ball_does_not_tumble(tmp_path: Path) -> None:
+    path = write(tmp_path, STICK.format(y=4e-4, z=4e-4))
+    robot = row(path, "stick", contacts=(Contact("stick"),))
+    assert not iterates(build_system(robot, "float32"))

@@ -202,6 +202,7 @@ def test_other_joints_need_no_bounds(kind: str, limit: str, tmp_path: Path) -> N
 SLIPS = {
     '<dynamics dampng="0.5"/>': "<dynamics>: attribute: got dampng, .*: damping, fric",
     '<orgin xyz="1 0 0"/>': "<orgin>: element: got <orgin>, .*: <origin>, <parent>",
+    '<AXIS xyz="0 0 1"/>': "<AXIS>: element: got <AXIS>, .*: .*<axis>",
     '<origin xzy="1 0 0"/>': "<origin>: attribute: got xzy, .*allowed: xyz, rpy",
 }
 

@@ -98,8 +98,10 @@ def _pair_sides(
     robot: RobotSpec, bodies: list[Body]
 ) -> Iterator[tuple[ContactRow, ContactRow]]:
     """Yields both sides of each pair of the robot, the shorter side first."""
+    # A side may name its collider or leave the name out. Both can mean the same one.
+    seen: set[frozenset[int]] = set()
     for pair in robot.pairs:
-        sides = []
+        sides, shapes = [], []
         for contact in pair:
             body = body_of(robot, "pairs", contact.link, bodies)
             found = _colliders(contact, bodies[body], TOUCHING)
@@ -110,11 +112,16 @@ def _pair_sides(
                 why = f"{count} of {listed(TOUCHING)}"
                 raise refusal(robot, "pairs", contact.link, allowed, why=why)
             sides.append(whole_collider(body, -1, found[0]))
+            shapes.append(id(found[0]))
         first, second = sides
         if first.body == second.body:
             given = Fact(f"{pair[0].link!r} and {pair[1].link!r}")
             allowed = "links with a joint between them"
             raise refusal(robot, "pairs", given, allowed, why="which move as one body")
+        if frozenset(shapes) in seen:
+            given = Fact(f"{pair[0].link!r} and {pair[1].link!r} twice")
+            raise refusal(robot, "pairs", given, "each once")
+        seen.add(frozenset(shapes))
         # The nearest point of a segment to a sphere is exact. The shorter side is
         # therefore first.
         swap = np.linalg.norm(first.segment) > np.linalg.norm(second.segment)

@@ -16,6 +16,8 @@ from newton_qd.physics.system import JointKind, System, takes_system
 def raising_coordinate(system: System) -> tuple[int, float] | None:
     """Finds the coordinate that moves the torso up without rotating it.
 
+    Of several, it is the one that is nearest to the root: it moves most of the robot.
+
     Args:
         system: The robot, in the pose ``rest_q``.
 
@@ -25,6 +27,7 @@ def raising_coordinate(system: System) -> tuple[int, float] | None:
     """
     frames = reference.body_frames(system, system.rest_q)
     body = system.torso
+    found = None
     while body >= 0:
         start = int(system.q_start[body])
         if system.joint_kind[body] == JointKind.FREE:
@@ -33,9 +36,9 @@ def raising_coordinate(system: System) -> tuple[int, float] | None:
         axis = reference.rotation_matrix(side[3:]) @ system.joint_axis[body]
         vertical = system.joint_kind[body] == JointKind.PRISMATIC
         if vertical and abs(axis[2]) > 1 - 1e-9:
-            return start, float(np.sign(axis[2]))
+            found = start, float(np.sign(axis[2]))
         body = int(system.parent[body])
-    return None
+    return found
 
 
 @takes_system
@@ -112,4 +115,24 @@ def rest_coordinates(system: System) -> np.ndarray:
         q[coordinate] += sign * (robot.rest_height - torso)
     elif len(contacts := own_ground_contacts(posed)):
         q[coordinate] -= sign * reference.lowest_contact(posed, q, contacts)
+    _check_raised(posed, coordinate, float(q[coordinate]))
     return q
+
+
+def _check_raised(system: System, coordinate: int, value: float) -> None:
+    """Checks that the slide which raises the torso is within its limits.
+
+    Raises:
+        RobotDescriptionError: It is not.
+    """
+    body = int(np.searchsorted(system.q_start, coordinate, side="right")) - 1
+    if system.joint_kind[body] == JointKind.FREE:
+        return
+    dof = system.v_start[body]
+    lower, upper = system.limit_lower[dof], system.limit_upper[dof]
+    if not lower - 1e-9 <= value <= upper + 1e-9:
+        given = system.robot.rest_height
+        name = f"joint {system.joint_names[body]!r}"
+        why = f"so that {name} must be at {value:g} m"
+        allowed = f"a height at which it is within its limits, {lower:g} to {upper:g} m"
+        raise refusal(system.robot, "rest_height", given, allowed, why=why)

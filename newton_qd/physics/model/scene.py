@@ -205,12 +205,18 @@ def wall_contacts(
             the body frame.
 
     Raises:
-        RobotDescriptionError: A link is not a link of the robot, or it has no collider,
-            or one of a kind that may not touch.
+        RobotDescriptionError: ``links`` is ``None``, and the robot has no ground
+            contact. Or a link is not a link of the robot, or it has no collider, or one
+            of a kind that may not touch.
     """
     names = scene.links
     if names is None:
         names = tuple(dict.fromkeys(contact.link for contact in robot.contacts))
+    if scene.links is None and not names and obstacles > 1:
+        field = f"scene {scene.name!r}, links"
+        why = f"and robot {robot.name!r} has no contact with the ground"
+        allowed = f"links that touch the walls, of {listed(colliders)}"
+        raise RobotDescriptionError(message(field, scene.links, allowed, why=why))
     for name in names:
         if name not in colliders:
             field, why = f"scene {scene.name!r}, links", f"which is not in {robot.urdf}"

@@ -87,7 +87,8 @@ def _inside(reader: XmlReader, element: ElementTree.Element) -> Iterator[str]:
 def _almost(name: str, known: tuple[str, ...]) -> bool:
     """Returns whether a name is not known, but almost."""
     return name not in known and any(
-        _slips(name, other) <= (1 if len(other) < _SHORT else 2) for other in known
+        _slips(name.lower(), other) <= (1 if len(other) < _SHORT else 2)
+        for other in known
     )
 
 

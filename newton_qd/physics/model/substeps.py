@@ -12,6 +12,8 @@ from newton_qd.physics.system import JointKind, System, takes_system
 
 FAST_TURN = 0.25
 """Turn of a joint in a substep from which velocity products change within it [rad]."""
+UNEQUAL = 1e-3
+"""Share of the moments of a free body by which they differ, from which it tumbles."""
 LARGEST_TURN = 0.42
 """Largest turn of a joint in a substep that is recommended [rad].
 
@@ -66,13 +68,30 @@ def fastest_turns(system: System) -> np.ndarray:
     return system.h * inner_torques(system) / np.maximum(system.damping, 1e-12)
 
 
+def tumbles(system: System) -> bool:
+    """Returns whether a free body without joints is no ball with equal moments.
+
+    Nothing damps its rotation, and its gyroscopic moment changes within a substep.
+    """
+    for body in np.flatnonzero(system.joint_kind == JointKind.FREE):
+        if np.any(np.asarray(system.parent) == body):
+            continue
+        moments = np.linalg.eigvalsh(system.inertia[body])
+        offset = system.mass[body] * float(np.sum(system.com[body] ** 2))
+        if max(moments[-1] - moments[0], offset) > UNEQUAL * moments[-1]:
+            return True
+    return False
+
+
 def iterates(system: System) -> bool:
     """Returns whether substeps update velocity products in several iterations.
 
-    So do robots without contacts, and those with a joint that can turn fast.
+    So do robots without contacts, those with a joint that can turn fast, and systems
+    with a free body that tumbles.
     """
     free = not len(system.contact_body)
-    return free or bool(fastest_turns(system).max(initial=0.0) > FAST_TURN)
+    fast = bool(fastest_turns(system).max(initial=0.0) > FAST_TURN)
+    return free or fast or tumbles(system)
 
 
 def joint_speeds(system: System) -> np.ndarray:

@@ -203,11 +203,15 @@ class XmlReader:
         """Returns the frame (7,) of the element's ``<origin>``.
 
         Raises:
-            RobotDescriptionError: The numbers of ``<origin>`` are malformed.
+            RobotDescriptionError: The numbers of ``<origin>`` are malformed, or it has
+                a quaternion.
         """
         origin = element.find("origin")
         if origin is None:
             return IDENTITY
+        if (quaternion := origin.get("quat_xyzw")) is not None:
+            allowed = 'rpy="roll pitch yaw" in place of a quaternion'
+            raise self.refused(origin, "quat_xyzw", quaternion, allowed)
         position = self.numbers(origin, "xyz", 3, "0 0 0")
         roll, pitch, yaw = self.numbers(origin, "rpy", 3, "0 0 0")
         return np.concatenate([position, rpy_quaternion(roll, pitch, yaw)])
