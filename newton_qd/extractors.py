@@ -8,9 +8,17 @@ from typing import Protocol, Self
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from newton_qd.checks import Fact, listed, message
-from newton_qd.types import Descriptor, Mask, Observation, PyTree, StateDescriptors
+from newton_qd.types import (
+    Descriptor,
+    DescriptorExtractor,
+    Mask,
+    Observation,
+    PyTree,
+    StateDescriptors,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -150,6 +158,29 @@ def check_extractor(env: object, extractor: object) -> None:
     allowed = listed([*fitting, get_mean_state_descriptor.__name__, "your own"])
     given = Fact(getattr(extractor, "__name__", repr(extractor)))
     raise ValueError(message("descriptor_extractor", given, allowed, why=why))
+
+
+def reads_last(extractor: DescriptorExtractor, length: int) -> bool:
+    """Returns whether the descriptor of an episode depends on its end alone.
+
+    For an extractor of others, the gradient with respect to the state descriptors of an
+    episode tells it.
+
+    Args:
+        extractor: Computes descriptors of episodes.
+        length: Number of components of a state descriptor.
+    """
+    if any(extractor is one for one in (*_READS, get_mean_state_descriptor)):
+        return extractor is get_final_xy_position
+
+    def total(values: jax.Array) -> jax.Array:
+        found = extractor(Trajectories(values), jnp.zeros((1, 4), values.dtype))
+        return jnp.sum(found.astype(values.dtype))
+
+    with jax.ensure_compile_time_eval():
+        values = jax.random.uniform(jax.random.key(0), (1, 4, length))
+        read = np.any(np.asarray(jax.grad(total)(values)) != 0, axis=(0, 2))
+    return bool(read[-1]) and not read[:-1].any()
 
 
 class Encoder(Protocol):

@@ -369,6 +369,25 @@ def test_limits_of_descriptors(limits: Any, page: dict[str, Any]) -> None:
         kind(page["Crawler"](page["ROBOT"]), "crawler")
 
 
+def test_an_extractor_of_another_length(page: dict[str, Any]) -> None:
+    """And names of components, which pictures show."""
+    first = staticmethod(lambda data, mask: data.state_desc[:, 0, :1])
+    own = {"descriptor_extractor": first}
+    wrong = type("Wrong", (page["ArmAngles"],), own)
+    length = len(wrong.limits[0])
+    robot = {"robot": page["ROBOT"], "reward_offset": 1.0}
+    nq.register("wrong", page["Crawler"], descriptor=wrong, **robot)
+    allowed = rf"shape for one episode: got \(1, 1\); allowed: \(1, {length}\), as"
+    with pytest.raises(ConfigError, match=allowed):
+        make_task(EvolveConfig(env_name="wrong"))
+    named = type("Named", (page["ArmAngles"],), {"descriptor_labels": ("a", "b")})
+    nq.register("named", page["Crawler"], descriptor=named, **robot)
+    assert make_task(EvolveConfig(env_name="named")).labels == ("a", "b")
+    odd = type("Odd", (page["ArmAngles"],), {"descriptor_labels": ("a",) * 7})
+    with pytest.raises(ValueError, match=r"Odd.descriptor_labels: got .*; allowed: "):
+        odd(page["Crawler"](page["ROBOT"]), "crawler")
+
+
 def test_descriptors_around_a_batch(page: dict[str, Any]) -> None:
     inside = nq.create("crawler", batch_size=3)
     env = page["ArmAngles"](inside, "crawler")

@@ -23,6 +23,7 @@ from newton_qd.extractors import (
     get_feet_contact_proportion,
     get_final_xy_position,
     get_mean_state_descriptor,
+    reads_last,
 )
 from newton_qd.physics import row_calls
 from newton_qd.physics.episodes import _episode_reduction
@@ -327,3 +328,25 @@ def test_proportions_of_flags(kind: type) -> None:
     for proportion in (get_feet_contact_proportion, get_mean_state_descriptor):
         found = jax.jit(proportion)(data, jnp.zeros((1, 300)))
         assert found.dtype == np.float32 and found == pytest.approx(1 / 3)
+
+
+def test_which_extractors_read_the_end_alone() -> None:
+    """An own one too: it tells actors what to follow."""
+
+    def last(data: Any, mask: Any) -> jax.Array:
+        return get_final_xy_position(data, mask)
+
+    def highest(data: Any, mask: Any) -> jax.Array:
+        return jnp.max(jnp.where(mask[..., None] == 0, data.state_desc, 0), axis=1)
+
+    def sides(data: Any, mask: Any) -> jax.Array:
+        return jnp.sign(get_mean_state_descriptor(data, mask))
+
+    assert reads_last(get_final_xy_position, 2) and reads_last(last, 3)
+    for extractor in (
+        get_feet_contact_proportion,
+        get_mean_state_descriptor,
+        highest,
+        sides,
+    ):
+        assert not reads_last(extractor, 2)

@@ -56,6 +56,22 @@ def test_a_run_goes_on_beyond_its_end(reference: Path, tmp_path: Path) -> None:
         run(SHORT, out=out, resume=True)
 
 
+def test_a_stopped_run_may_end_earlier(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It ends as a run that was started with so many generations."""
+    out = tmp_path / "run"
+    run(SHORT, out=tmp_path / "whole")
+    with monkeypatch.context() as patch:
+        interrupt_after(patch, 3)
+        assert run(SMALL, out=out).interrupted
+    with pytest.raises(ConfigError, match="got 2; allowed: 3 or more, as the run"):
+        run(SMALL.replace(iterations=2), out=out, resume=True)
+    result = run(SHORT, out=out, resume=True)
+    assert result.iteration == SHORT.iterations and not result.interrupted
+    assert_same_results(out, tmp_path / "whole")
+
+
 def test_a_checkpoint_that_does_not_fit_changes_nothing(
     reference: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

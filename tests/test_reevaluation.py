@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -70,3 +71,32 @@ def test_sound_evaluations_count_with_their_medians() -> None:
     rows = [[(1.0, 0.1), (3.0, 0.9), (2.0, 0.4)], [(7.0, 0.1), (7.0, 0.1), (8.0, 0.9)]]
     found = corrected_fitnesses(archive(2), scoring(rows), jax.random.key(0), 3)
     np.testing.assert_array_equal(found, [7, 2, EMPTY, EMPTY])
+
+
+@pytest.mark.parametrize("shape", [(4,), (4, 1)])
+def test_repertoires_of_qdax_are_archives(shape: tuple[int, ...]) -> None:
+    """Their fitnesses are columns, and their genotypes may be a pytree."""
+    own = archive(1)
+
+    @dataclasses.dataclass
+    class Repertoire:
+        genotypes: Any
+        fitnesses: np.ndarray
+        centroids: np.ndarray
+
+    genotypes = {"weights": own.genotypes}
+    given = Repertoire(genotypes, own.fitnesses.reshape(shape), CENTROIDS)
+    key, calls = jax.random.key(0), len(SOUND)
+    found = reevaluate(given, scoring([SOUND]), key, reevaluations=calls, offset=1.0)
+    same = reevaluate(own, scoring([SOUND]), key, reevaluations=calls, offset=1.0)
+    assert found == same and found is not None and found.qd_score == 5.0
+
+
+def test_what_is_no_archive_is_refused() -> None:
+    key = jax.random.key(0)
+    with pytest.raises(TypeError, match=r"archive: got .*; allowed: an Archive, or a"):
+        reevaluate(np.zeros(4), scoring([SOUND]), key, offset=0.0)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="archive: got no elites; allowed: one"):
+        reevaluate(archive(0), scoring([SOUND]), key, offset=0.0)
+    with pytest.raises(ValueError, match="reevaluations: got 0; allowed: integers"):
+        reevaluate(archive(1), scoring([SOUND]), key, offset=0.0, reevaluations=0)

@@ -40,6 +40,9 @@ def component_names(env: Any, length: int) -> tuple[str, ...]:
         env: Environment; it may have no state descriptor.
         length: Number of components.
     """
+    own = getattr(env, "descriptor_labels", ())
+    if own and len(own) == length:
+        return tuple(own)
     name = getattr(env, "state_descriptor_name", "descriptor")
     robot = getattr(env.unwrapped, "robot", None)
     if name == "feet_contact" and robot is not None and length == len(robot.feet):

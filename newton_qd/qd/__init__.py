@@ -14,6 +14,7 @@
   ``episode.scoring(episode.gradient)`` has gradients
   (``make_gradient_scoring_function`` is deprecated)
 - ``robust_scoring(score, starts=4)``: each individual from several start states
+- ``reevaluate(archive, score, key, offset=...)``: the corrected QD score of any archive
 - ``device_mesh``, ``shard_scoring``: evaluation on several devices
 - ``make_ribs_evaluation``, ``to_ribs``, ``from_ribs``: pyribs with these tasks
 
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from newton_qd.qd.run.evolution import EvolveResult, evolve
     from newton_qd.qd.run.opened import Elite, Evaluation, Run, load_run
     from newton_qd.qd.run.plot import plot_archive
+    from newton_qd.qd.run.reevaluation import Reevaluated, reevaluate
     from newton_qd.qd.run.search import SearchError
     from newton_qd.qd.scoring.gradient_scoring import make_gradient_scoring_function
     from newton_qd.qd.scoring.networks import policy_of
@@ -70,6 +72,7 @@ __all__ = [
     "EvolveResult",
     "Options",
     "Policy",
+    "Reevaluated",
     "Run",
     "Scatter",
     "SearchError",
@@ -87,6 +90,7 @@ __all__ = [
     "make_task",
     "plot_archive",
     "policy_of",
+    "reevaluate",
     "register_algorithm",
     "robust_scoring",
     "shard_scoring",
@@ -108,6 +112,7 @@ _HOME = {
     "EvolveResult": "run.evolution",
     "Options": "algorithms.options",
     "Policy": "scoring.rollout",
+    "Reevaluated": "run.reevaluation",
     "Run": "run.opened",
     "Scatter": "scoring.scatter",
     "SearchError": "run.search",
@@ -125,6 +130,7 @@ _HOME = {
     "make_task": "scoring.task",
     "plot_archive": "run.plot",
     "policy_of": "scoring.networks",
+    "reevaluate": "run.reevaluation",
     "register_algorithm": "algorithms",
     "robust_scoring": "scoring.robust",
     "shard_scoring": "scoring.sharding",

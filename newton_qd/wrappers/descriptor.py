@@ -34,6 +34,8 @@ class DescriptorWrapper(Wrapper, QDEnv):
     limits: ClassVar[tuple[Sequence[float], Sequence[float]]]
     """Lowest and highest value of each of the nd components. Values beyond these limits
     are in the outermost cells of an archive."""
+    descriptor_labels: ClassVar[Sequence[str]] = ()
+    """Names of the nd components, with their units, for pictures and pages."""
     descriptor_extractor: DescriptorExtractor = staticmethod(get_mean_state_descriptor)
     """Computes descriptors of episodes from state descriptors; by default the mean."""
 
@@ -136,10 +138,11 @@ class DescriptorWrapper(Wrapper, QDEnv):
 
 
 def _check_limits(kind: type[DescriptorWrapper]) -> None:
-    """Checks the limits of a class.
+    """Checks the limits of a class, and its labels.
 
     Raises:
-        ValueError: They are missing, or not two rows of numbers, lowest first.
+        ValueError: The limits are missing, or not two rows of numbers, lowest first. Or
+            there are labels, and their number is another one.
     """
     limits = getattr(kind, "limits", None)
     pair = real_numbers(limits)
@@ -151,3 +154,7 @@ def _check_limits(kind: type[DescriptorWrapper]) -> None:
     ):
         allowed = "lowest and highest values, such as ((0.0, 0.0), (1.0, 1.0))"
         raise ValueError(message(f"{kind.__name__}.limits", limits, allowed))
+    labels, length = kind.descriptor_labels, len(pair[0])
+    if labels and len(labels) != length:
+        name = f"{kind.__name__}.descriptor_labels"
+        raise ValueError(message(name, labels, f"{length} names, as the limits have"))

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import optax
 
 from newton_qd.envs.state import select
-from newton_qd.extractors import get_final_xy_position
+from newton_qd.extractors import reads_last
 from newton_qd.gradients.flow import passed_back
 from newton_qd.qd.emitters.actor_critic_settings import ActorCriticSettings
 from newton_qd.qd.emitters.whitening import Whitening
@@ -322,8 +322,11 @@ class ActorCritic:
 
 
 def averages(task: Task) -> bool:
-    """Returns whether a task's descriptor is a mean over the episode."""
-    return task.descriptor_extractor is not get_final_xy_position
+    """Returns whether a task's descriptor is a mean over the episode.
+
+    An own one that does not depend on the end alone counts as a mean.
+    """
+    return not reads_last(task.descriptor_extractor, task.descriptor_length)
 
 
 def measure_of(task: Task) -> Callable[[StateLike, StateLike], jax.Array]:

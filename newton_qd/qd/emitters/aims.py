@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from newton_qd.extractors import get_final_xy_position
+from newton_qd.extractors import reads_last
 from newton_qd.qd.scoring.rollout import Policy
 from newton_qd.qd.scoring.task import Task
 from newton_qd.types import Action, PyTree, RNGKey, StateLike
@@ -101,10 +101,10 @@ class AimedEnv:
         low, high = self.task.limits
         return (low + high) / 2, (high - low) / 2
 
-    @property
+    @functools.cached_property
     def _final(self) -> bool:
-        """Whether the descriptor is the final position."""
-        return self.task.descriptor_extractor is get_final_xy_position
+        """Whether the descriptor depends on the end of the episode alone."""
+        return reads_last(self.task.descriptor_extractor, self.task.descriptor_length)
 
     def scaled(self, descriptors: jax.Array) -> jax.Array:
         """Returns descriptors (..., D) in units of targets."""

@@ -185,12 +185,15 @@ class RunFolder:
             raise CheckpointError(f"{path} is damaged: {error}") from error
 
     def compare(self, config: EvolveConfig) -> tuple[EvolveConfig, dict[str, object]]:
-        """Checks that settings are those of the run here, or have more generations.
+        """Checks that settings are those of the run here, or other generations.
+
+        There may be more of them, or fewer if the run has not made them yet.
 
         Returns:
             The settings of the run, and the facts of the machine that began it.
 
         Raises:
+            CheckpointError: The checkpoint is damaged.
             ConfigError: A setting differs from the run's, or its algorithm does not go
                 on beyond the end of a run.
         """
@@ -204,12 +207,23 @@ class RunFolder:
             if name != "iterations":
                 raise self._other_run(name, repr(old), new)
             if config.iterations < stored.iterations:
-                more = " or more" if goes_on else ""
-                raise self._other_run(name, f"{old!r}{more}", new)
+                least = self._reached() if goes_on else stored.iterations
+                if config.iterations < least:
+                    more = " or more" if goes_on else ""
+                    raise self._other_run(name, f"{least!r}{more}", new)
             if not goes_on:
                 why = f"but {config.algorithm!r} cannot go on beyond the end of a run"
                 raise self._other_run(name, repr(old), new, why)
         return stored, facts
+
+    def _reached(self) -> int:
+        """Returns how many generations the run here has made and saved.
+
+        Raises:
+            CheckpointError: The checkpoint is damaged.
+        """
+        path = self.path / CHECKPOINT
+        return self._checkpoint(path).iteration if path.exists() else 0
 
     def compare_environment(self, env_name: str) -> None:
         """Checks that the run here, if there is one, is of this environment.
@@ -238,8 +252,8 @@ class RunFolder:
         It changes no file; see ``go_on``.
 
         Args:
-            config: Settings that the run is expected to have. It may have more
-                generations.
+            config: Settings that the run is expected to have. It may have other
+                generations, if the run has not made more.
             facts: Facts of this machine.
 
         Returns:

@@ -4,14 +4,35 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from newton_qd import checks
+from newton_qd.checks import Fact, message
 from newton_qd.qd.run import quality
-from newton_qd.qd.run.archive import Archive
 from newton_qd.types import ScoringFunction
+
+
+class Elites(Protocol):
+    """An archive of this package, or a repertoire of QDax."""
+
+    @property
+    def genotypes(self) -> Any:
+        """Pytree, leaves (cells, ...)."""
+        ...
+
+    @property
+    def fitnesses(self) -> Any:
+        """(cells,) or (cells, 1), ``-inf`` in empty cells."""
+        ...
+
+    @property
+    def centroids(self) -> Any:
+        """(cells, D) centres of the cells."""
+        ...
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,29 +63,38 @@ class Reevaluated:
 
 
 def reevaluate(
-    archive: Archive,
+    archive: Elites,
     score: ScoringFunction,
     key: jax.Array,
     *,
-    reevaluations: int,
+    reevaluations: int = 32,
     offset: float,
     untrained: float | None = None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Reevaluated | None:
-    """Evaluates the elites of an archive again.
+    """Evaluates the elites of an archive again: the corrected QD score.
 
     Args:
-        archive: Archive with at least one elite.
-        score: Compiled scoring function; all elites share a start state in each call.
+        archive: :class:`Archive`, or a repertoire of QDax, such as :func:`from_ribs`
+            makes from an archive of pyribs. It has at least one elite.
+        score: Scoring function, best under ``jax.jit``; all elites share a start state
+            in each call.
         key: Key that is split into one key for each call.
-        reevaluations: Number of calls.
-        offset: Added to each elite's fitness in the QD score.
+        reevaluations: Number of calls, from 1.
+        offset: Added to each elite's fitness in the QD score: the reward offset of the
+            task times the episode length.
         untrained: Fitness of an untrained policy, for the QD score without offset.
         stop: Called before each call of ``score``; true ends the re-evaluation.
 
     Returns:
         The metrics; ``None`` if ``stop`` returned true.
+
+    Raises:
+        TypeError: ``archive`` is no archive.
+        ValueError: It has no elite, or several fitnesses for each; or ``reevaluations``
+            is no integer from 1.
     """
+    checks.integer("reevaluations", reevaluations)
     best = corrected_fitnesses(archive, score, key, reevaluations, stop)
     if best is None:
         return None
@@ -79,7 +109,7 @@ def reevaluate(
 
 
 def corrected_fitnesses(
-    archive: Archive,
+    archive: Elites,
     score: ScoringFunction,
     key: jax.Array,
     reevaluations: int,
@@ -99,8 +129,13 @@ def corrected_fitnesses(
 
     Returns:
         ``-inf`` in empty cells; ``None`` if ``stop`` returned true.
+
+    Raises:
+        TypeError: ``archive`` is no archive.
+        ValueError: It has no elite, or several fitnesses for each.
     """
-    genotypes = jnp.asarray(archive.genotypes[archive.filled])
+    filled = _filled(archive)
+    genotypes = jax.tree.map(lambda leaf: jnp.asarray(leaf[filled]), archive.genotypes)
     fitnesses, descriptors = [], []
     for call_key in jax.random.split(key, reevaluations):
         if stop():
@@ -114,6 +149,28 @@ def corrected_fitnesses(
     best = np.full(len(archive.centroids), -np.inf)
     np.maximum.at(best, cells[known], fitness[known])
     return best
+
+
+def _filled(archive: Elites) -> np.ndarray:
+    """Returns whether a cell holds an individual, (cells,).
+
+    Raises:
+        TypeError: ``archive`` is no archive.
+        ValueError: It has no elite, or several fitnesses for each.
+    """
+    if not all(
+        hasattr(archive, name) for name in ("genotypes", "fitnesses", "centroids")
+    ):
+        allowed = "an Archive, or a repertoire of QDax; from_ribs makes one"
+        raise TypeError(message("archive", archive, allowed))
+    fitnesses = np.asarray(archive.fitnesses)
+    if fitnesses.size != len(fitnesses):
+        allowed = "one fitness for each cell"
+        raise ValueError(message("archive.fitnesses", fitnesses, allowed))
+    filled = np.isfinite(fitnesses.reshape(-1))
+    if not filled.any():
+        raise ValueError(message("archive", Fact("no elites"), "one or more"))
+    return filled
 
 
 def _middle(

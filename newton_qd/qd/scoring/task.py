@@ -13,10 +13,11 @@ import numpy as np
 from newton_qd import checks, tasks
 from newton_qd.checks import Fact, listed, message
 from newton_qd.envs.shown import component_names
-from newton_qd.extractors import get_final_xy_position
+from newton_qd.extractors import Trajectories, get_final_xy_position
 from newton_qd.qd.config import ConfigError, EvolveConfig
 from newton_qd.robots import ROBOTS, Material
 from newton_qd.scenes import SCENES, Scene
+from newton_qd.types import DescriptorExtractor
 
 _OWN = (
     *("auto_reset", "batch_size", "brax_views", "env_name", "episode_length"),
@@ -95,6 +96,7 @@ def make_task(config: EvolveConfig) -> Task:
         given = (low.tolist(), high.tolist())
         raise ConfigError(message(f"descriptor limits of {name!r}", given, allowed))
     extractor = newton_qd.tables.descriptor_extractor[name]
+    _require_length(extractor, len(low))
     return Task(
         env=env,
         descriptor_extractor=extractor,
@@ -227,6 +229,23 @@ def _declared_length(name: str) -> int | None:
         case (tuple() | list() as lowest, _):
             return len(lowest)
     return None  # wrong limits have an error of their own
+
+
+def _require_length(extractor: DescriptorExtractor, length: int) -> None:
+    """Checks that descriptors are as long as the limits.
+
+    Raises:
+        ConfigError: They are not.
+    """
+    steps = jax.ShapeDtypeStruct((1, 2, length), np.float32)
+    mask = jax.ShapeDtypeStruct((1, 2), np.float32)
+    found = jax.eval_shape(
+        lambda values, mask: extractor(Trajectories(values), mask), steps, mask
+    ).shape
+    if found != (1, length):
+        name = "descriptor_extractor: shape for one episode"
+        allowed = f"{(1, length)}, as the limits have"
+        raise ConfigError(message(name, found, allowed))
 
 
 def _labels(env: Any, extractor: Any, length: int) -> tuple[str, ...]:
