@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import atexit
+import gc
 import io
 import os
 import sys
@@ -59,6 +61,8 @@ def main(
     runs.add_parsers(commands)
     viewing.add_parsers(commands)
     _repair_streams()
+    # Python would look through all objects of JAX and Warp before it ends
+    atexit.register(gc.freeze)
     code = OK
     try:
         arguments = _parsed(parser, argv)

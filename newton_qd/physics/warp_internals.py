@@ -116,11 +116,11 @@ def tape_is_recording() -> bool:
 
 
 def load_native(source: Path, target: Path) -> Callable[[str], int]:
-    """Compile a C++ file with Warp's compiler, and load it into this process.
+    """Load a C++ file into this process. Warp's compiler compiles it first.
 
     Args:
         source: File without headers.
-        target: Object file to write. It is not needed later.
+        target: Object file. It is written if it does not exist, and not needed later.
 
     Returns:
         Function that returns the address of an exported name.
@@ -133,7 +133,8 @@ def load_native(source: Path, target: Path) -> Callable[[str], int]:
     for part in ("wp_load_obj", "wp_lookup"):
         if not _has(context, f"runtime.llvm.{part}"):
             raise _unsupported(f"runtime.llvm.{part}", (context.__name__,))
-    _module_with("build_cpu", _BUILD).build_cpu(str(target), str(source))
+    if not target.exists():
+        _module_with("build_cpu", _BUILD).build_cpu(str(target), str(source))
     native, name = context.runtime.llvm, f"newton_qd_{source.stem}".encode()
     if native.wp_load_obj(str(target).encode(), name, False) != 0:
         raise _unsupported("working wp_load_obj", (context.__name__,))

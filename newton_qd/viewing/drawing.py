@@ -7,9 +7,11 @@ tree is that of the ``System``. So a picture shows what the physics computes.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,6 +24,7 @@ from newton_qd.physics.kinds import JointKind
 from newton_qd.physics.model import newton_builder
 from newton_qd.physics.model.description import read_description
 from newton_qd.physics.system import System
+from newton_qd.viewing.kept_shapes import kept_or_read
 
 if TYPE_CHECKING:
     import newton
@@ -279,55 +282,38 @@ def system_builder(system: System) -> tuple[newton.ModelBuilder, ...]:
         RobotDescriptionError: A URDF file is malformed.
         OSError: A URDF file cannot be read.
     """
+    return tuple(_builder(system, path, floats) for path, floats in _files(system))
+
+
+def _files(system: System) -> list[tuple[str, bool]]:
+    """Returns the URDF files of a system, and whether their root links float."""
     robot = system.robot
     read = read_description(find_urdf(robot.urdf), robot.fixed_base)
     files = [(robot.urdf, read.floating)]
     if system.scene is not None:
         files.append((system.scene.urdf, False))
-    return tuple(
-        newton_builder(str(find_urdf(urdf)), floats, robot.gravity)
-        for urdf, floats in files
-    )
+    return [(str(find_urdf(urdf)), floats) for urdf, floats in files]
+
+
+def _builder(system: System, path: str, floats: bool) -> newton.ModelBuilder:
+    return newton_builder(path, floats, system.robot.gravity)
 
 
 def _shapes(system: System) -> Iterator[DrawnShape]:
     """Yields the shapes of the robot, then those of the scene."""
-    from newton import GeoType, ShapeFlags
-
-    kinds = {
-        GeoType.SPHERE: "sphere",
-        GeoType.CAPSULE: "capsule",
-        GeoType.CYLINDER: "cylinder",
-        GeoType.BOX: "box",
-        GeoType.MESH: "mesh",
-        GeoType.CONVEX_MESH: "mesh",
-    }
-    for builder in system_builder(system):
-        seen = {
-            builder.shape_body[index]
-            for index in range(builder.shape_count)
-            if builder.shape_flags[index] & ShapeFlags.VISIBLE
-        }
-        for index in range(builder.shape_count):
-            kind = kinds.get(GeoType(builder.shape_type[index]))
-            if kind is None:
-                continue
-            mesh: Any = builder.shape_source[index] if kind == "mesh" else None
-            points: dict[str, Any] = {}
-            if mesh is not None:
-                points["vertices"] = np.asarray(mesh.vertices, float).reshape(-1, 3)
-                points["faces"] = np.asarray(mesh.indices, np.int32).reshape(-1, 3)
-            red, green, blue = (float(part) for part in builder.shape_color[index])
+    for path, floats in _files(system):
+        build = functools.partial(_builder, system, path, floats)
+        for row in kept_or_read(Path(path), floats, build):
+            body, kind, frame, size, color, visual, *points = row
+            mesh = dict(zip(("vertices", "faces"), points, strict=False))
             yield DrawnShape(
-                body=int(builder.shape_body[index]),
+                body=body,
                 kind=kind,
-                frame=np.array(list(builder.shape_transform[index]), np.float64),
-                size=np.array(list(builder.shape_scale[index]), np.float64),
-                color=(red, green, blue, float(builder.shape_opacity[index])),
-                # Newton hides the colliders of a robot if one link has a visual
-                visual=bool(builder.shape_flags[index] & ShapeFlags.VISIBLE)
-                or builder.shape_body[index] not in seen,
-                **points,
+                frame=np.array(frame, np.float64),
+                size=np.array(size, np.float64),
+                color=tuple(color),
+                visual=visual,
+                **mesh,
             )
 
 

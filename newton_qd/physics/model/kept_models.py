@@ -18,8 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from newton_qd.files import write_atomically
-from newton_qd.physics.cache import kernel_cache
+from newton_qd.physics.cache import keep, kept, kernel_cache
 from newton_qd.physics.model.description import Description
 from newton_qd.physics.model.elements import Shape
 from newton_qd.physics.model.newton_input import NewtonInput
@@ -27,7 +26,6 @@ from newton_qd.physics.model.verify import BuiltModel, ModelMismatchError, verif
 
 _FOLDER = "newton_qd_models"
 _PACKAGES = ("newton", "warp-lang")
-_DIGEST = hashlib.sha256().digest_size  # [bytes], before what it is of
 _NAMES = ("body_names", "joint_names")
 _ARRAYS = (
     *("parent", "joint_kind", "q_start", "v_start", "parent_frame", "child_frame"),
@@ -76,21 +74,17 @@ def _path(description: Description, gravity: float) -> Path | None:
 
 def _read(path: Path) -> BuiltModel | None:
     """Returns a model that was kept; ``None`` without a complete one."""
-    try:
-        content = path.read_bytes()
-    except OSError:
+    if (content := kept(path)) is None:
         return None
-    if hashlib.sha256(content[_DIGEST:]).digest() != content[:_DIGEST]:
-        return None
-    with np.load(io.BytesIO(content[_DIGEST:]), allow_pickle=False) as file:
-        kept = {name: file[name] for name in file.files}
-    shapes: list[list[Shape]] = [[] for _ in kept["mass"]]
-    columns = [kept[f"shape_{name}"] for name in ("body", "kind", "frame", "size")]
+    with np.load(io.BytesIO(content), allow_pickle=False) as file:
+        arrays = {name: file[name] for name in file.files}
+    shapes: list[list[Shape]] = [[] for _ in arrays["mass"]]
+    columns = [arrays[f"shape_{name}"] for name in ("body", "kind", "frame", "size")]
     for body, kind, frame, size in zip(*columns, strict=True):
         shapes[body].append(Shape("", str(kind), frame, size))
     return BuiltModel(
-        **{name: tuple(kept[name].tolist()) for name in _NAMES},
-        **{name: kept[name] for name in _ARRAYS},
+        **{name: tuple(arrays[name].tolist()) for name in _NAMES},
+        **{name: arrays[name] for name in _ARRAYS},
         shapes=tuple(map(tuple, shapes)),
     )
 
@@ -108,10 +102,4 @@ def _write(path: Path, model: BuiltModel) -> None:
         **{name: np.array(getattr(model, name), dtype=np.str_) for name in _NAMES},
         **{name: getattr(model, name) for name in _ARRAYS},
     )
-    content = file.getvalue()
-    content = hashlib.sha256(content).digest() + content
-    with contextlib.suppress(OSError):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        # Another process may write the same model now, under the same temporary name.
-        # It writes the same bytes, and who reads a part of them sees it by the digest.
-        write_atomically(path, content)
+    keep(path, file.getvalue())

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import hashlib
 import os
+import platform
 import tempfile
 import threading
 from pathlib import Path
 
+import warp as wp
+
+from newton_qd.physics.cache import keep, kept, kernel_cache
 from newton_qd.physics.warp_internals import load_native
 
 _SOURCE = Path(__file__).with_name("handler.cpp")
@@ -47,13 +52,20 @@ class Library:
     """
 
     def __init__(self) -> None:
-        """Compiles the source, which takes some hundredths of a second.
+        """Loads the source. It is compiled once, which takes 0.3 s.
 
         Raises:
             UnsupportedWarpError: The installed Warp cannot compile it.
         """
+        place = _place()
         with tempfile.TemporaryDirectory() as folder:
-            find = load_native(_SOURCE, Path(folder) / "handler.o")
+            target = Path(folder) / "handler.o"
+            found = kept(place)
+            if found is not None:
+                target.write_bytes(found)
+            find = load_native(_SOURCE, target)
+            if found is None:
+                keep(place, target.read_bytes())
         self.handlers = {
             name: find(name) for name in ("newton_qd_rows", "newton_qd_rollout")
         }
@@ -99,6 +111,13 @@ class Library:
     def stopped(self) -> int:
         """Returns the number of calls from XLA that ended with this error."""
         return self._stopped()
+
+
+def _place() -> Path:
+    """Returns where the compiled source is kept: next to the compiled kernels."""
+    given = (platform.system(), platform.machine(), wp.__version__)
+    digest = hashlib.sha256(repr(given).encode() + _SOURCE.read_bytes()).hexdigest()
+    return Path(kernel_cache()) / "newton_qd_native" / f"{digest[:32]}.handler"
 
 
 def _threading_functions() -> tuple[list[int | None], list[int | None]]:
