@@ -183,6 +183,15 @@ def test_new_episodes_begin_in_new_states_and_repeat_with_the_seed() -> None:
 
 @pytest.mark.slow
 @pytest.mark.optimized
+def test_a_reset_in_a_step_has_no_reward() -> None:
+    """A state of a maze has one after a reset, too."""
+    worlds = make_gymnasium_vector("antmaze", 2, episode_length=1)
+    worlds.reset(seed=0)
+    actions = np.zeros((2, 8), np.float32)
+    assert (worlds.step(actions)[1] < 0).all()
+    assert (worlds.step(actions)[1] == 0).all()
+
+
 def test_the_numbers_are_those_of_env_step() -> None:
     env = newton_qd.create("ant_uni", episode_length=6, auto_reset=False)
     step, reset = jax.jit(env.step), jax.jit(env.reset)

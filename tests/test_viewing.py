@@ -373,3 +373,11 @@ def test_a_video_that_is_not_complete_leaves_the_old_one(
         with pytest.raises(OSError, match=rf"one\.mp4 is not written: ffmpeg .*{why}"):
             render(walk.world(0), target, width=32, height=32, rate=5)
         assert target.read_bytes() == b"old" and len(list(tmp_path.iterdir())) == 1
+
+
+def test_contacts_with_physical_parameters_are_refused() -> None:
+    """They would be those of the robot's own parameters."""
+    env = newton_qd.create("ant_uni", episode_length=2, auto_reset=False)
+    plan, key = np.zeros((2, 8), np.float32), jax.random.key(0)
+    with pytest.raises(ValueError, match=r"contacts: got True, and .*; allowed: False"):
+        record(env, plan, key, contacts=True, params=env.default_params)

@@ -187,6 +187,8 @@ class GymnasiumVectorEnv(Pickled, gymnasium.vector.VectorEnv):
         terminated, truncated = ends_of(state)
         ended = terminated | truncated
         reward, info = np.array(state.reward), info_of(state)
+        if self._mode is AutoresetMode.NEXT_STEP:
+            reward[begins] = 0  # some tasks have a reward after a reset
         if self._mode is AutoresetMode.SAME_STEP and ended.any():
             final = {"final_obs": np.array(state.obs), "final_info": info}
             self.state = self._begun(state, ended)

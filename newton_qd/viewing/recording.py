@@ -200,9 +200,13 @@ def _run(
     """Runs one world; returns what is seen after the reset, and after each step.
 
     Raises:
-        ValueError: The environment has a batch.
+        ValueError: The environment has a batch; or contacts are recorded, and the world
+            has physical parameters.
     """
     first = env.reset(key)
+    if contacts and (params is not None or "params" in first.info):
+        why = "and contacts are computed without physical parameters"
+        raise ValueError(message("contacts", contacts, "False", why=why))
     if jnp.ndim(first.done):
         given = Fact(f"an environment of {jnp.shape(first.done)[0]} worlds")
         allowed = "environments of one world, and worlds=N for more"
