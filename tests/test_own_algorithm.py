@@ -96,23 +96,39 @@ def test_scores_that_are_never_finite(task: Task) -> None:
         one.advance(one.empty())
 
 
-def test_an_emitter_that_proposes_fewer_is_refused(task: Task) -> None:
+@pytest.mark.parametrize(
+    ("changed", "error", "text"),
+    [
+        (
+            lambda genotypes, extra: (genotypes[:3], extra),
+            ConfigError,
+            r"'own': got genotypes of shape \(3, \d+\)",
+        ),
+        (
+            lambda genotypes, extra: genotypes,
+            TypeError,
+            r"Changed.emit: got .*; allowed: genotypes and a dictionary",
+        ),
+    ],
+)
+def test_an_emitter_that_proposes_otherwise_is_refused(
+    changed: Any, error: type[Exception], text: str, task: Task
+) -> None:
     def make(context: Any, options: Any) -> Any:
         emitter = ME.make(context, options)
 
-        class Fewer(type(emitter)):
+        class Changed(type(emitter)):
             def emit(self, *arguments: Any) -> Any:
-                genotypes, extra = emitter.emit(*arguments)
-                return genotypes[:3], extra
+                return changed(*emitter.emit(*arguments))
 
-        made = object.__new__(Fewer)
+        made = object.__new__(Changed)
         made.__dict__.update(vars(emitter))
         return made
 
     algorithms.register_algorithm(dataclasses.replace(ME, name="own", make=make))
     one = Search(SETTINGS, task)
     state = one.advance(one.empty())
-    with pytest.raises(ConfigError, match=r"'own': got genotypes of shape \(3, \d+\)"):
+    with pytest.raises(error, match=text):
         one.advance(state)
 
 

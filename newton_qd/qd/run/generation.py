@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from newton_qd.checks import Fact, message
 from newton_qd.qd.run import quality
 from newton_qd.types import ExtraScores, Genotype, PyTree, Repertoire
 
@@ -32,9 +33,20 @@ class Generation:
     def propose(
         self, repertoire: Repertoire, emitter: PyTree, key: jax.Array
     ) -> PyTree:
-        """Returns the next genotypes (N, size), and the emitter's data about them."""
+        """Returns the next genotypes (N, size), and the emitter's data about them.
+
+        Raises:
+            TypeError: The emitter returns something else.
+        """
         _, key = jax.random.split(key)
-        genotypes, remembered = self.emitter.emit(repertoire, emitter, key)
+        found = self.emitter.emit(repertoire, emitter, key)
+        if not isinstance(found, tuple) or len(found) != 2:
+            allowed = "genotypes and a dictionary, as an emitter of QDax returns them"
+            kind = Fact(type(found).__name__)
+            raise TypeError(
+                message(f"{type(self.emitter).__name__}.emit", kind, allowed)
+            )
+        genotypes, remembered = found
         # With JAX x64, QDax draws its noise in double precision.
         return genotypes.astype(jnp.float32), remembered
 
