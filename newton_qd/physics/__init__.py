@@ -17,6 +17,7 @@ from newton_qd.physics.inspection import (
 )
 from newton_qd.physics.messages import quiet
 from newton_qd.physics.model import load_system
+from newton_qd.physics.model.limit_loads import SoftLimitWarning
 from newton_qd.physics.model.rest import grounding_coordinate, raising_coordinate
 from newton_qd.physics.model.substeps import FewSubstepsWarning, recommended_substeps
 from newton_qd.physics.model.wall_speeds import SoftWallWarning, wall_speeds
@@ -31,6 +32,7 @@ __all__ = [
     "Kinematics",
     "PhysicsParams",
     "PhysicsState",
+    "SoftLimitWarning",
     "SoftWallWarning",
     "System",
     "bias_forces",

@@ -29,6 +29,7 @@ from newton_qd.physics.model.description import (
 from newton_qd.physics.model.elements import UNLIMITED, Shape
 from newton_qd.physics.model.inertia import check_inertia
 from newton_qd.physics.model.kept_models import kept_or_built
+from newton_qd.physics.model.limit_loads import SoftLimitWarning, soft_limits
 from newton_qd.physics.model.named_links import feet_bodies, torso_body
 from newton_qd.physics.model.newton_input import NewtonInput, merge_fixed_bodies
 from newton_qd.physics.model.rest import rest_coordinates
@@ -320,7 +321,10 @@ def _cached_system(
 
 @functools.cache
 def _cached_warnings(system: System) -> tuple[tuple[str, type[UserWarning]], ...]:
-    found = [(text, SoftWallWarning) for text in soft_walls(system)]
+    found: list[tuple[str, type[UserWarning]]] = [
+        (text, SoftWallWarning) for text in soft_walls(system)
+    ]
+    found += [(text, SoftLimitWarning) for text in soft_limits(system)]
     return *found, *((text, FewSubstepsWarning) for text in few_substeps(system))
 
 

@@ -1,0 +1,53 @@
+"""The weight on the limits of joints, and the warning about limits that give way."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+from urdf_text import joint, robot_text, row, write
+
+from newton_qd.physics import SoftLimitWarning, load_system
+from newton_qd.physics.model.limit_loads import limit_loads
+from newton_qd.robots import RobotSpec
+
+ARM = """<link name="arm"><inertial><origin xyz="0.5 0 0"/><mass value="30"/>
+  <inertia ixx="0.1" iyy="2.5" izz="2.5" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
+WEIGHT = 30 * 9.81  # [N]
+
+
+def held(folder: Path, kind: str, axis: str, **changes: object) -> RobotSpec:
+    """A heavy arm that lies, on a joint of the world."""
+    inside = f'<axis xyz="{axis}"/><limit lower="-0.5" upper="0.5"/>'
+    text = robot_text(
+        '<link name="world"/>', joint("held", kind, "world", "arm", inside), ARM
+    )
+    return row(write(folder, text), "arm", gravity=9.81, substeps=None, **changes)
+
+
+@pytest.mark.parametrize(
+    ("kind", "axis", "load"),
+    [
+        ("revolute", "0 1 0", WEIGHT * 0.5 * math.cos(0.5)),
+        ("revolute", "0 0 1", 0.0),
+        ("prismatic", "0 0 1", WEIGHT),
+        ("prismatic", "1 0 0", 0.0),
+    ],
+)
+def test_weight_on_a_limit(tmp_path: Path, kind: str, axis: str, load: float) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SoftLimitWarning)
+        system = load_system(held(tmp_path, kind, axis))
+    np.testing.assert_allclose(limit_loads(system), load, atol=1e-9)
+
+
+def test_limits_that_give_way_are_named(tmp_path: Path) -> None:
+    """Without a motor, the gear counts as 1 N m; one of 200 N m is enough."""
+    with pytest.warns(SoftLimitWarning, match="limits of 'held': got a weight of 129"):
+        load_system(held(tmp_path, "revolute", "0 1 0"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", SoftLimitWarning)
+        load_system(held(tmp_path, "revolute", "0 1 0", actuators=(("held", 200.0),)))
