@@ -369,6 +369,12 @@ def test_limits_of_descriptors(limits: Any, page: dict[str, Any]) -> None:
         kind(page["Crawler"](page["ROBOT"]), "crawler")
 
 
+def in_windows(data: Any, mask: Any) -> jax.Array:
+    """Needs a number of steps that 10 divides."""
+    rows, _, length = data.state_desc.shape
+    return data.state_desc.reshape(rows, -1, 10, length).mean(axis=(1, 2))
+
+
 def test_an_extractor_of_another_length(page: dict[str, Any]) -> None:
     """And names of components, which pictures show."""
     first = staticmethod(lambda data, mask: data.state_desc[:, 0, :1])
@@ -380,6 +386,10 @@ def test_an_extractor_of_another_length(page: dict[str, Any]) -> None:
     allowed = rf"shape for one episode: got \(1, 1\); allowed: \(1, {length}\), as"
     with pytest.raises(ConfigError, match=allowed):
         make_task(EvolveConfig(env_name="wrong"))
+    own = {"descriptor_extractor": staticmethod(in_windows)}
+    windows = type("Windows", (page["ArmAngles"],), own)
+    nq.register("windows", page["Crawler"], descriptor=windows, **robot)
+    make_task(EvolveConfig(env_name="windows", episode_length=20))
     named = type("Named", (page["ArmAngles"],), {"descriptor_labels": ("a", "b")})
     nq.register("named", page["Crawler"], descriptor=named, **robot)
     assert make_task(EvolveConfig(env_name="named")).labels == ("a", "b")

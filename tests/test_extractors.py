@@ -342,11 +342,23 @@ def test_which_extractors_read_the_end_alone() -> None:
     def sides(data: Any, mask: Any) -> jax.Array:
         return jnp.sign(get_mean_state_descriptor(data, mask))
 
+    def way(data: Any, mask: Any) -> jax.Array:
+        return last(data, mask) - data.state_desc[:, 0]
+
+    def windows(data: Any, mask: Any) -> jax.Array:
+        return data.state_desc.reshape(len(mask), -1, 10, 2).mean(axis=(1, 2))
+
+    def two_sides(data: Any, mask: Any) -> jax.Array:
+        return jax.nn.softmax(last(data, mask))
+
     assert reads_last(get_final_xy_position, 2) and reads_last(last, 3)
+    assert reads_last(two_sides, 2)
     for extractor in (
         get_feet_contact_proportion,
         get_mean_state_descriptor,
         highest,
         sides,
+        way,
+        windows,
     ):
         assert not reads_last(extractor, 2)

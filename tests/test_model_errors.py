@@ -398,7 +398,7 @@ def test_a_height_beyond_the_limits_of_its_slide(tmp_path: Path) -> None:
     )
     for changes in ({"rest_height": 3.0}, {"contacts": (Contact("body"),)}):
         allowed = (
-            r"rest_height: got .*'z' must be at .*; allowed: .* limits, 0 to 0.5 m"
+            r"rest_height: got .*'z' must be at .*; allowed: .* torso of 0 to 0.5 m"
         )
         with pytest.raises(RobotDescriptionError, match=allowed):
             built(tmp_path, text, "body", **changes)

@@ -41,7 +41,7 @@ def component_names(env: Any, length: int) -> tuple[str, ...]:
         length: Number of components.
     """
     own = getattr(env, "descriptor_labels", ())
-    if own and len(own) == length:
+    if len(own) == length > 0:
         return tuple(own)
     name = getattr(env, "state_descriptor_name", "descriptor")
     robot = getattr(env.unwrapped, "robot", None)

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 _FOLDER = "newton_qd_shapes"
 _PACKAGES = ("newton", "warp-lang")
 _OTHER_FILES = (b"mesh", b"texture")
+_FIELDS = 6  # of a row without points
 
 Row = list[Any]
 """Body, kind, frame, size, colour and visibility; of a mesh also vertices and faces."""
@@ -51,7 +52,8 @@ def kept_or_read(
     if place is not None and (text := kept(place)) is not None:
         return json.loads(text)
     rows = list(map(list, _rows(build())))
-    if place is not None:
+    points = any(len(row) > _FIELDS for row in rows)
+    if place is not None and not points:
         keep(place, json.dumps(rows).encode())
     return rows
 

@@ -155,6 +155,7 @@ def _check_limits(kind: type[DescriptorWrapper]) -> None:
         allowed = "lowest and highest values, such as ((0.0, 0.0), (1.0, 1.0))"
         raise ValueError(message(f"{kind.__name__}.limits", limits, allowed))
     labels, length = kind.descriptor_labels, len(pair[0])
-    if labels and len(labels) != length:
+    names = [isinstance(label, str) for label in labels]
+    if names and (isinstance(labels, str) or not all(names) or len(names) != length):
         name = f"{kind.__name__}.descriptor_labels"
         raise ValueError(message(name, labels, f"{length} names, as the limits have"))

@@ -8,7 +8,6 @@ from newton_qd.checks import Fact, message
 from newton_qd.physics import reference
 from newton_qd.physics.system import JointKind, System
 
-
 # More gets a warning, as a share of what is held. The suite has at most 0.25.
 _EXPECTED = 2.0
 
@@ -101,9 +100,10 @@ def soft_limits(system: System) -> tuple[str, ...]:
         past = system.robot.material.limit_overshoot * loads[dof] / held[dof]
         name = f"robot {system.robot.name!r}, limits of {system.joint_names[body]!r}"
         weight = Fact(f"a weight of {loads[dof]:.3g} {unit}")
+        most = _EXPECTED * held[dof]
         allowed = (
-            f"up to {_EXPECTED * held[dof]:.3g} {unit}, twice the gear of its motor or, "
-            f"without one, the largest gear of the robot; it goes about {past:.2g} {length} past its "
+            f"up to {most:.3g} {unit}, twice the gear of its motor or, without one, of "
+            f"the robot's largest; it goes about {past:.2g} {length} past its "
             "limit. A smaller Material.limit_overshoot makes limits stiffer"
         )
         texts.append(message(name, weight, allowed))

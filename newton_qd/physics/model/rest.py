@@ -16,7 +16,7 @@ from newton_qd.physics.system import JointKind, System, takes_system
 def raising_coordinate(system: System) -> tuple[int, float] | None:
     """Finds the coordinate that moves the torso up without rotating it.
 
-    Of several, it is the one that is nearest to the root: it moves most of the robot.
+    It is that of a free root, or else of the first vertical slide before the torso.
 
     Args:
         system: The robot, in the pose ``rest_q``.
@@ -36,7 +36,7 @@ def raising_coordinate(system: System) -> tuple[int, float] | None:
         axis = reference.rotation_matrix(side[3:]) @ system.joint_axis[body]
         vertical = system.joint_kind[body] == JointKind.PRISMATIC
         if vertical and abs(axis[2]) > 1 - 1e-9:
-            found = start, float(np.sign(axis[2]))
+            found = found or (start, float(np.sign(axis[2])))
         body = int(system.parent[body])
     return found
 
@@ -115,11 +115,11 @@ def rest_coordinates(system: System) -> np.ndarray:
         q[coordinate] += sign * (robot.rest_height - torso)
     elif len(contacts := own_ground_contacts(posed)):
         q[coordinate] -= sign * reference.lowest_contact(posed, q, contacts)
-    _check_raised(posed, coordinate, float(q[coordinate]))
+    _check_raised(posed, q, coordinate, sign)
     return q
 
 
-def _check_raised(system: System, coordinate: int, value: float) -> None:
+def _check_raised(system: System, q: np.ndarray, coordinate: int, sign: float) -> None:
     """Checks that the slide which raises the torso is within its limits.
 
     Raises:
@@ -128,11 +128,13 @@ def _check_raised(system: System, coordinate: int, value: float) -> None:
     body = int(np.searchsorted(system.q_start, coordinate, side="right")) - 1
     if system.joint_kind[body] == JointKind.FREE:
         return
-    dof = system.v_start[body]
+    dof, value = system.v_start[body], float(q[coordinate])
     lower, upper = system.limit_lower[dof], system.limit_upper[dof]
     if not lower - 1e-9 <= value <= upper + 1e-9:
         given = system.robot.rest_height
         name = f"joint {system.joint_names[body]!r}"
-        why = f"so that {name} must be at {value:g} m"
-        allowed = f"a height at which it is within its limits, {lower:g} to {upper:g} m"
+        why = f"so that {name} must be at {value:g} m, outside {lower:g} to {upper:g} m"
+        torso = reference.body_frames(system, q)[system.torso, 2]
+        low, high = sorted(torso + sign * (np.array([lower, upper]) - value))
+        allowed = f"a height of the torso of {low:g} to {high:g} m"
         raise refusal(system.robot, "rest_height", given, allowed, why=why)

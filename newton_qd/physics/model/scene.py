@@ -215,7 +215,7 @@ def wall_contacts(
     if scene.links is None and not names and obstacles > 1:
         field = f"scene {scene.name!r}, links"
         why = f"and robot {robot.name!r} has no contact with the ground"
-        allowed = f"links that touch the walls, of {listed(colliders)}"
+        allowed = f"links that touch the walls, of {listed(colliders)}; or (): none"
         raise RobotDescriptionError(message(field, scene.links, allowed, why=why))
     for name in names:
         if name not in colliders:

@@ -40,7 +40,7 @@ class Generation:
         """
         _, key = jax.random.split(key)
         found = self.emitter.emit(repertoire, emitter, key)
-        if not isinstance(found, tuple) or len(found) != 2:
+        if not isinstance(found, (tuple, list)) or len(found) != 2:
             allowed = "genotypes and a dictionary, as an emitter of QDax returns them"
             kind = Fact(type(found).__name__)
             raise TypeError(

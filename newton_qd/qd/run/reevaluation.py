@@ -91,10 +91,11 @@ def reevaluate(
 
     Raises:
         TypeError: ``archive`` is no archive.
-        ValueError: It has no elite, or several fitnesses for each; or ``reevaluations``
-            is no integer from 1.
+        ValueError: It has no elite, or several fitnesses for each; ``reevaluations`` is
+            no integer from 1; or ``offset`` is no finite number.
     """
     checks.integer("reevaluations", reevaluations)
+    checks.number("offset", offset)
     best = corrected_fitnesses(archive, score, key, reevaluations, stop)
     if best is None:
         return None
@@ -141,7 +142,7 @@ def corrected_fitnesses(
         if stop():
             return None
         fitness, descriptor, _ = score(genotypes, call_key)
-        fitnesses.append(np.asarray(fitness, np.float64))
+        fitnesses.append(np.asarray(fitness, np.float64).reshape(len(descriptor)))
         descriptors.append(np.asarray(descriptor, np.float64))
     fitness = np.median(fitnesses, axis=0)
     middle, known = _middle(np.stack(fitnesses), np.stack(descriptors))
