@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import errno
 import io
 import os
@@ -26,6 +27,7 @@ from newton_qd import cli, files
 from newton_qd.qd.config import read_config
 from newton_qd.qd.run.archive import Archive, ArchiveError, archive_bytes, load_archive
 from newton_qd.qd.run.checkpoint import CheckpointError, load_checkpoint
+from newton_qd.qd.run.search import Search
 
 __all__ = ["compile_once", "reference"]  # fixtures
 
@@ -91,6 +93,7 @@ def test_what_is_no_archive_is_refused(tmp_path: Path) -> None:
         ({"descriptors": np.zeros((3, 3))}, r"'descriptors': \(3, 3\)"),
         ({"genotypes": np.asarray(1.0)}, r"'genotypes': \(\)"),
         ({"genotypes": np.full((3, 2), "a")}, "genotypes are <U1, not floats"),
+        ({"fitnesses": np.zeros(3, np.int32)}, "fitnesses are int32, not floats"),
     ):
         np.savez(tmp_path / "archive.npz", **{**arrays, **change})
         with pytest.raises(ArchiveError, match=message):
@@ -179,3 +182,14 @@ def test_a_checkpoint_of_another_version_is_refused(tmp_path: Path) -> None:
     path.write_bytes(b"newton_qd checkpoint 1 0\n")
     with pytest.raises(CheckpointError, match="not a checkpoint of this version"):
         load_checkpoint(path)
+
+
+def test_metrics_that_an_earlier_version_did_not_have_are_not_known(
+    reference: Path,
+) -> None:
+    found = load_checkpoint(reference / "checkpoint.bin")
+    early = dataclasses.replace(found, metrics=found.metrics[:, :7])
+    metrics = Search(SMALL, point_task(SMALL)).restore(early).metrics
+    assert metrics.shape == found.metrics.shape
+    assert np.array_equal(metrics[:, :7], early.metrics)
+    assert np.isnan(metrics[:, 7:]).all()

@@ -233,3 +233,12 @@ def test_a_run_counts_what_is_differentiated() -> None:
     metrics = run(dataclasses.replace(config, options=options)).metrics
     np.testing.assert_array_equal(np.diff(metrics["evaluations"]), 16 + 16 * 3)
     assert metrics["qd_score"][-1] > metrics["qd_score"][0]
+
+
+@pytest.mark.slow
+def test_only_what_is_scored_has_several_starts() -> None:
+    """Each evaluation counts once for each start, each gradient once."""
+    config = SMALL.replace(algorithm="me-ascent", iterations=1, starts=3)
+    options: Any = {"climbers": 16, "climb_worlds": 3}
+    metrics = run(dataclasses.replace(config, options=options)).metrics
+    np.testing.assert_array_equal(np.diff(metrics["evaluations"]), 16 * 3 + 16 * 3)

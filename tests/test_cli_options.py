@@ -146,6 +146,18 @@ def test_cells_replace_those_of_a_config(
             assert (config.grid, config.centroids) == expected
 
 
+def test_ranges_are_added_to_those_of_a_config(tmp_path: Path) -> None:
+    ranges: Any = {"friction": (0.5, 1.5)}
+    kept = EvolveConfig(env_name="hopper_uni", randomize=ranges)
+    path = tmp_path / "config.json"
+    path.write_text(config_to_json(kept, environment_facts()))
+    parser = argparse.ArgumentParser()
+    add_arguments(parser.add_subparsers(), lambda *_: 0)
+    arguments = ["evolve", "--config", str(path), "--randomize", "gravity=9,10"]
+    config, _ = settle(parser.parse_args(arguments))
+    assert dict(config.randomize) == {**ranges, "gravity": (9.0, 10.0)}
+
+
 def test_wrong_options_of_the_environment(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -21,6 +21,7 @@ import newton_qd.compat
 from newton_qd.compat import finder
 from newton_qd.compat.contents import BRAX_V1, CONTENTS
 from newton_qd.compat.scoring import evaluate
+from newton_qd.envs.state import State
 from newton_qd.errors import MissingExtra
 
 TESTS = Path(__file__).resolve().parent
@@ -217,6 +218,12 @@ def test_a_policy_scores_the_same_in_every_batch() -> None:
         np.testing.assert_array_equal(again[1], descriptors[:count])
 
 
+class Steps(NamedTuple):
+    rewards: jax.Array
+    dones: jax.Array
+    obs: jax.Array
+
+
 def test_no_fault_pays_in_a_scoring_function() -> None:
     """An action of 1e4 ended the episode with the return 0; the others are below."""
     env = newton_qd.create("pointmaze", episode_length=5)
@@ -240,6 +247,23 @@ def test_no_fault_pays_in_a_scoring_function() -> None:
     actions = np.array([[0.1, 0.1], [np.nan, 0.0]], np.float32)
     found = scores(jax.random.split(jax.random.key(0), 2), actions)
     assert np.isfinite(found[0][0]) and found[0][1] == -np.inf
+
+
+def test_a_fault_after_the_end_costs_nothing() -> None:
+    zero = jnp.zeros(())
+    start = State(jnp.zeros((), jnp.int32), zero[None], zero, zero, {}, {})
+    start = start.replace(info={"fault": jnp.zeros((), jnp.int32)})
+
+    def play(state: Any, faults: jax.Array) -> tuple:
+        step = state.pipeline_state
+        after = state.replace(pipeline_state=step + 1, info={"fault": faults[step]})
+        done = (step == 2).astype(jnp.float32)
+        return after, faults, Steps(jnp.ones(()), done, state.obs)
+
+    faults = jnp.array([[0, 0, 0, 1], [0, 1, 0, 0]])
+    described: Any = lambda data, _: data.obs[:, 0]  # noqa: E731
+    found = evaluate(play, (start, faults), (None, 0), 4, described)
+    assert found[0].tolist() == [3.0, -np.inf]
 
 
 def test_mask_begins_after_the_end() -> None:

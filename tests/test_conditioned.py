@@ -187,6 +187,63 @@ def test_an_archive_without_elites_has_no_spread() -> None:
     assert float(_spread(jnp.float32([2.0, -jnp.inf, 4.0]))) == 1
 
 
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass
+class Idle:
+    """A learner that learns nothing."""
+
+    first: jax.Array
+
+
+def test_the_unit_is_the_largest_deviation_so_far() -> None:
+    made: Any = emitter()
+    made._method = types.SimpleNamespace(update=lambda learner, *_: (learner, 0))
+    made._worlds = lambda *_: jnp.zeros(1)
+    state = types.SimpleNamespace(
+        learner=Idle(jnp.zeros(1)),
+        scale=None,
+        unit=jnp.float32(2.0),
+        logits=jnp.zeros(4),
+        cells=jnp.zeros(4, jnp.int32),
+        failed=jnp.zeros((), jnp.int32),
+        key=jax.random.key(0),
+    )
+
+    @compiled
+    def later(fitnesses: jax.Array) -> jax.Array:
+        held = grid(2)
+        held = held.replace(fitnesses=held.fitnesses.at[:3, 0].set(fitnesses))
+        return made.state_update(state, held, descriptors=jnp.zeros((4, 2))).unit
+
+    several = later(jnp.float32([1.0, 7.0, 3.0]))
+    np.testing.assert_allclose(several, np.std([1, 7, 3]), rtol=1e-6)
+    assert later(jnp.ones(3)) == 2
+
+
+def grid(count: int) -> MapElitesRepertoire:
+    """An archive of (count, count) cells with one elite, in the first of them."""
+    cells = compute_euclidean_centroids((count, count), [-1.0, -1.0], [3.0, 1.0])
+    held = MapElitesRepertoire.init_default(genotype=jnp.zeros(2), centroids=cells)
+    return held.replace(fitnesses=held.fitnesses.at[0, 0].set(1.0))
+
+
+def test_multipliers_stay_within_bounds() -> None:
+    made, held = emitter(), grid(2)
+    logits = jnp.array([6.0, 5.9, 0.0, -6.0])
+    state = types.SimpleNamespace(logits=logits, cells=jnp.arange(4))
+    places = held.centroids.at[:3].add(5.0)  # the last one hits
+    found = made._multipliers(state, held, places)
+    np.testing.assert_allclose(found, [6.0, 6.0, 0.3, -6.0], rtol=1e-6)
+
+
+def test_empty_targets_are_near_elites() -> None:
+    made, held = emitter(empty=1.0), grid(8)
+    cells = np.asarray(made._targets(held, jax.random.key(0), 16))
+    place = np.asarray(held.centroids)
+    away = np.linalg.norm(place - place[0], axis=1)
+    assert cells.min() > 0 and away[cells].mean() < 0.6 * away[1:].mean()
+
+
 @pytest.mark.slow
 def test_the_actor_starts_as_the_best_for_every_target() -> None:
     held, state = begun()

@@ -282,6 +282,18 @@ def test_a_fault_stays_in_its_world_and_has_no_gradient(name: str) -> None:
     assert not np.any(gradient.q[1]) and np.any(gradient.q[0])
 
 
+def test_a_swimmer_that_is_nowhere_has_a_finite_gradient() -> None:
+    env = make("swimmer")
+    state, action = env.fixed_state(), jnp.ones(env.action_size, env.dtype)
+
+    def reward(q: jax.Array) -> jax.Array:
+        lost = dataclasses.replace(state.pipeline_state, q=q)
+        return env.step(state.replace(pipeline_state=lost), action).reward
+
+    q = state.pipeline_state.q.at[3].set(jnp.nan)
+    assert not jax.jit(jax.grad(reward))(q).any()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_gradient_of_an_episode(name: str, x64: None) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from newton_qd.envs.state import State
 from newton_qd.errors import FaultError
 from newton_qd.gradients import GradientReport, diagnose_gradients
 from newton_qd.gradients.doctor_input import checked_genotypes
+from newton_qd.gradients.report import HorizonRow
 
 
 class Growing:
@@ -238,6 +240,47 @@ def test_few_directions_are_enough(directions: int) -> None:
     assert report.exact_horizon == 12
 
 
+def first_is(action: float) -> np.ndarray:
+    """Four plans of one step; the actions of the others are 0."""
+    return np.array([action, 0.0, 0.0, 0.0]).reshape(4, 1, 1)
+
+
+class Turned(Growing):
+    """The gradient is that of the negative reward where actions are above 1."""
+
+    def step(self, state: State, action: jax.Array) -> State:
+        after = super().step(state, action)
+        still = jax.lax.stop_gradient(after.reward)
+        sign = jnp.where(action[0] > 1, -1.0, 1.0)
+        return after.replace(reward=still + sign * (after.reward - still))
+
+
+def test_the_worst_world_decides() -> None:
+    env: Any = Turned(0.5)
+    report = diagnose_gradients(env, horizons=(1,), genotypes=first_is(2.0), samples=4)
+    row = report.horizons[0]
+    assert row.cosine > 0.99 and row.worst_cosine < -0.99
+
+
+class Fragile(Growing):
+    """At fault where actions are above a million, and not nearly ten millions."""
+
+    def step(self, state: State, action: jax.Array) -> State:
+        fault = (action[0] > 1e6) & (jnp.abs(action[0] - 1e7) > 0.1)
+        after = super().step(state, action)
+        return after.replace(info={"fault": fault.astype(jnp.int32)})
+
+    def reset(self, rng: jax.Array) -> State:
+        return super().reset(rng).replace(info={"fault": jnp.zeros((), jnp.int32)})
+
+
+def test_one_world_without_sound_samples_is_told() -> None:
+    env: Any = Fragile(0.5)
+    options: Any = {"genotypes": first_is(1e7), "sigma": 100.0, "samples": 4}
+    with pytest.raises(FaultError, match=r"sigma: got 100.0, fewer than two pairs"):
+        diagnose_gradients(env, horizons=(1,), **options)
+
+
 class Rounded(Growing):
     """A reward that does not change, except for its last digits."""
 
@@ -272,6 +315,41 @@ def test_a_gradient_of_nothing_is_of_no_use(tmp_path: Path) -> None:
     assert report.exact_horizon == 2 and report.useful_horizon == 0
     assert report.verdict.startswith("The gradient is 0 up to 2 control steps (0.2 s)")
     report.write(tmp_path)
+
+
+class Invented(Growing):
+    """A reward that does not change, with a gradient."""
+
+    def _state(self, x: jax.Array, steps: jax.Array) -> State:
+        reward = 1 + x[0] - jax.lax.stop_gradient(x[0])
+        return super()._state(x, steps).replace(reward=reward)
+
+
+def test_a_gradient_where_nothing_changes_is_wrong() -> None:
+    env: Any = Invented(0.5)
+    report = diagnose_gradients(env, horizons=(1, 2), worlds=2, samples=4)
+    assert report.exact_horizon == 0 and np.isinf(report.horizons[0].length)
+
+
+def report_of(*changes: dict[str, Any]) -> GradientReport:
+    """A report whose numbers are all 1, except for these of its horizons."""
+    ones: Any = dict.fromkeys((f.name for f in dataclasses.fields(HorizonRow)), 1.0)
+    rows = tuple(HorizonRow(**{**ones, **change}) for change in changes)
+    return GradientReport("growing", 0.1, True, 0.1, rows, ())
+
+
+def test_a_horizon_ends_at_the_first_bad_row() -> None:
+    bad = {"steps": 2, "worst_cosine": 0.0, "order": 0.0}
+    report = report_of({"steps": 1}, bad, {"steps": 4})
+    assert report.exact_horizon == report.useful_horizon == 1
+
+
+def test_most_episodes_are_more_than_half() -> None:
+    few, most = (
+        report_of({"steps": 1}, {"steps": 2, "alive": alive}) for alive in (0.75, 0.25)
+    )
+    assert "Most episodes end" not in few.verdict
+    assert "Most episodes end before step 2" in most.verdict
 
 
 def test_an_environment_without_precision(

@@ -99,6 +99,24 @@ def test_gradients_that_were_set_to_zero_are_not_known() -> None:
     assert read({**extra, "overflowed": jnp.ones(4, jnp.int32)}).finite.all()
 
 
+def lost(genotypes: jax.Array, key: jax.Array) -> tuple:
+    """Scores of which no gradient is finite."""
+    fitnesses, descriptors, extra = score(genotypes, key)
+    return fitnesses, descriptors, {"gradients": jnp.nan * extra["gradients"]}
+
+
+def test_elites_without_finite_gradients_are_not_known() -> None:
+    repertoire, state = begin(OMGMEGAEmitter(4, sigma_g=0.5), scoring=lost)
+    assert (repertoire.fitnesses > -jnp.inf).any()
+    assert not state.known(repertoire).any()
+
+
+def test_weight_decay_moves_nobody_without_a_gradient() -> None:
+    emitter = GradientVariationEmitter(4, optax.adamw(0.1, weight_decay=1.0))
+    genotypes = np.asarray(emit(emitter, *begin(emitter, 1, lost)))
+    np.testing.assert_array_equal(genotypes, np.tile(start()[0], (4, 1)))
+
+
 @pytest.mark.parametrize("size", [1e-30, 1.0, 1e25, 3e38])
 def test_lengths_of_large_gradients_do_not_overflow(size: float) -> None:
     rows = jnp.asarray([[0.6, 0.8], [0.0, 0.0]], jnp.float32) * size

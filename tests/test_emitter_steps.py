@@ -33,6 +33,7 @@ from newton_qd.qd.emitters import (
     RestartRule,
     SteeringEmitter,
 )
+from newton_qd.qd.emitters.ranking import best_of
 from newton_qd.qd.scoring.gradient_scores import normalize
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
@@ -168,6 +169,21 @@ def test_points_restart_from_elites(
     restarted = np.asarray(ages) == 0
     assert np.all(np.asarray(elite)[restarted])
     np.testing.assert_array_equal(np.all(np.asarray(mean) == 0, axis=1), restarted)
+
+
+def test_failed_offspring_do_not_move_the_distribution() -> None:
+    emitter = CMAMEGAEmitter(score, sigma_g=0.5, batch_size=5)
+    begun = emitter._strategy(2).init(jnp.float32)
+    coefficients = jnp.full((4, 3), 100.0).at[0].set(0.5)
+    finite = jnp.array([True, False, False, False])
+    scores = jnp.float32([1, 0, 0, 0]), jnp.full(4, -jnp.inf)
+    after, improved, _ = compiled(emitter._adapt)(begun, coefficients, *scores, finite)
+    assert improved and 0 < after.mean.max() <= 0.5
+
+
+def test_offspring_that_all_failed_are_equally_good() -> None:
+    values = jnp.array([jnp.nan, 1.0, -jnp.inf])
+    assert best_of(jnp.ones(3), values, jnp.zeros(3, bool))[1]
 
 
 class Watched(CMAMEGAEmitter):

@@ -19,6 +19,7 @@ from newton_qd.extractors import (
     get_final_xy_position,
 )
 from newton_qd.gradients import (
+    Episode,
     EpisodeGradients,
     GradientOptions,
     make_directional_gradient,
@@ -26,6 +27,7 @@ from newton_qd.gradients import (
     make_episode_gradient,
     with_smooth_descriptor,
 )
+from newton_qd.gradients.flow import passed_back
 from newton_qd.qd.scoring.gradient_scoring import make_gradient_scoring_function
 from newton_qd.qd.scoring.task import Task
 
@@ -297,6 +299,26 @@ def test_no_gradient_is_silently_not_finite() -> None:
     clipped = on_line(growth, plan, GradientOptions(clip=1.0), limit)
     assert not clipped.overflowed.any()
     np.testing.assert_array_equal(clipped.gradients[1, 0, :, 0], [2, 2, 2, 1])
+
+
+def test_a_fault_after_the_end_costs_nothing() -> None:
+    result = on_line(1.0, [[[1.0], [20.0], [2000.0], [0.0]]], GradientOptions())
+    assert result.fitnesses[0] == 1 + 21 and not result.faulty.any()
+
+
+def test_a_descriptor_that_is_not_finite_is_a_fault() -> None:
+    def undefined(data: Any, mask: jax.Array) -> jax.Array:
+        return data.state_desc[:, 0] * jnp.nan
+
+    found = Episode(Line(1.0), None, undefined, episode_length=2)(
+        jnp.ones((2, 1)), jax.random.key(0)
+    )
+    assert found.faulty and found.fitness == -np.inf
+
+
+def test_a_gradient_that_is_cut_is_zero_whatever_it_was() -> None:
+    _, back = jax.vjp(lambda x: passed_back(x, jnp.float32(0), None), jnp.ones(2))
+    assert back(jnp.array([jnp.inf, jnp.nan]))[0].tolist() == [0, 0]
 
 
 @pytest.mark.parametrize(

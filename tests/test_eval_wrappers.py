@@ -92,6 +92,22 @@ def test_no_fault_pays_in_an_evaluation(wrapper: type[Wrapper]) -> None:
         assert float(sums["reward"]) == total and np.isfinite(sums["moved"])
 
 
+class Unmeasured(Line):
+    """A line whose metric is not known beyond 1.6."""
+
+    def step(self, state: State, action: jax.Array, params: Params = None) -> State:
+        after = super().step(state, action, params)
+        moved = jnp.where(after.pipeline_state > 1.6, jnp.nan, jnp.float32(1))
+        return after.replace(metrics={"moved": moved})
+
+
+@pytest.mark.parametrize("end", [1.2, 100.0])
+def test_a_metric_that_is_not_known_within_an_episode_has_no_sum(end: float) -> None:
+    states = play(EvalWrapper(EpisodeWrapper(Unmeasured(end), 10, 1)), 4)
+    total = states[-1].info["eval_metrics"].episode_metrics["moved"]
+    assert np.isnan(total) == (end > 50)
+
+
 @pytest.mark.parametrize("wrapper", [EvalWrapper, CompletedEvalWrapper])
 def test_eval_refuses_what_it_cannot_sum(
     wrapper: type[EvalWrapper] | type[CompletedEvalWrapper],

@@ -7,6 +7,7 @@ The task needs no physics, so that a run takes a fraction of a second;
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 from pathlib import Path
 from typing import Any
@@ -16,10 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from point_runs import SMALL, PointEnv, compile_once, point_task, reference, run
+from qdax.core.containers.mapelites_repertoire import MapElitesRepertoire
 
 from newton_qd.qd.config import ConfigError
 from newton_qd.qd.run import generation
 from newton_qd.qd.run.archive import load_archive
+from newton_qd.qd.run.cells import cell_centroids
 from newton_qd.qd.run.evolution import evolve
 from newton_qd.qd.run.search import SearchError
 from newton_qd.qd.scoring.rollout import make_policy, make_scoring_function
@@ -86,6 +89,49 @@ def test_metrics_see_quality(reference: Path) -> None:
     assert np.all(np.diff(gain) >= 0) and gain[-1] > gain[0] >= 0
 
 
+class Unchanging:
+    """An emitter whose state never changes."""
+
+    def init(self, **told: Any) -> int:
+        del told
+        return 0
+
+    def state_update(self, state: int, **told: Any) -> int:
+        del told
+        return state
+
+
+def metrics_of(fitnesses: list[float], told: dict[str, Any]) -> tuple[Any, Any]:
+    """Metrics of a first generation, and of one of the same individuals after it."""
+    count = len(fitnesses)
+    genotypes = jnp.zeros((count, 2))
+    grid = jnp.linspace(0, 1, 5)[:, None]
+    empty = MapElitesRepertoire.init_default(genotype=genotypes[0], centroids=grid)
+    emitter: Any = Unchanging()
+    made = generation.Generation(
+        emitter, jax.random.key(0), takes_faulty=False, offset=0.0
+    )
+    scores: Any = jnp.float32(fitnesses), jnp.linspace(0, 1, count)[:, None], {}
+
+    @functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
+    def begin_and_tell() -> tuple[Any, Any]:
+        repertoire, state, first = made.begin(empty, genotypes, scores)
+        initial = first["initial_fitness"]
+        later = made.tell(repertoire, state, genotypes, told, scores, initial)[2]
+        return first, later
+
+    return begin_and_tell()
+
+
+def test_lost_gradients_of_every_part_of_an_emitter_are_rejected() -> None:
+    lost = {"climbers_overflowed": jnp.array([True, False, True])}
+    assert metrics_of([1.0, 2.0, 3.0], lost)[1]["rejected"] == 2
+
+
+def test_the_initial_fitness_is_the_median_of_what_is_finite() -> None:
+    assert metrics_of([1.0, 2.0, 9.0, -np.inf], {})[0]["initial_fitness"] == 2
+
+
 @pytest.mark.slow
 def test_corrected_metrics_are_those_of_the_elites_put_anew(tmp_path: Path) -> None:
     config = SMALL.replace(iterations=2, reevaluations=5)
@@ -125,6 +171,13 @@ def test_voronoi_cells() -> None:
     assert first.archive.centroids.shape == (10, 2)
     assert np.array_equal(first.archive.centroids, again.archive.centroids)
     assert np.array_equal(first.archive.genotypes, again.archive.genotypes)
+
+
+def test_voronoi_cells_fill_the_limits_of_each_component() -> None:
+    config = SMALL.replace(grid=None, centroids=6)
+    limits = np.zeros(2, np.float32), np.array([1, 10], np.float32)
+    found = np.asarray(cell_centroids(config, limits, jax.random.key(0)))
+    assert found[:, 0].max() <= 1 and found[:, 1].max() > 5
 
 
 def test_default_grid_is_filled_in() -> None:
@@ -273,7 +326,12 @@ def test_what_cannot_be_settings_is_named() -> None:
 
 
 @pytest.mark.parametrize(
-    "sizes", [{"batch_size": 2_000_000_000}, {"hidden": (1_000_000, 1_000_000)}]
+    "sizes",
+    [
+        {"batch_size": 2_000_000_000},
+        {"hidden": (1_000_000, 1_000_000)},
+        {"hidden": (100_000,), "grid": (1000, 1000)},
+    ],
 )
 def test_sizes_that_cannot_fit_are_refused(sizes: dict[str, Any]) -> None:
     """Before anything allocates, with the memory that they need."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from newton_qd.cli.progress import ProgressCount
 from newton_qd.qd.run import plot
 from newton_qd.qd.run.archive import Archive
+from newton_qd.qd.run.plot_colours import fitness_colours
 from newton_qd.qd.run.progress import Progress
 
 # QDax and what it imports warn about their own use of other packages.
@@ -68,6 +70,33 @@ def test_nested_picture_puts_every_cell_in_its_place() -> None:
         a, b, c, d = (centroid * np.array(grid)).astype(int)
         if np.isfinite(fitness):
             assert image[b * 5 + d, a * 4 + c] == fitness
+
+
+@pytest.mark.parametrize(
+    ("grid", "centres"), [((2,), [[0.75], [0.25]]), (None, [[0.7], [0.3]])]
+)
+def test_bars_are_where_their_cells_are(
+    grid: tuple[int, ...] | None, centres: list[list[float]]
+) -> None:
+    places = np.array(centres)
+    archive = Archive(np.zeros((2, 1)), np.array([7.0, 5.0]), places, places)
+    limits = np.zeros(1), np.ones(1)
+    figure = plot.plot_archive(archive, grid=grid, limits=limits, labels=("a",))
+    bars: Any = [bar for bar in figure.axes[0].patches if bar.get_width()]
+    tops = {bar.get_x(): bar.get_y() + bar.get_height() for bar in bars}
+    assert tops == pytest.approx({0.0: 5.0, 0.5: 7.0})
+
+
+def test_points_have_the_colours_of_their_fitnesses() -> None:
+    points = np.eye(5)[:3]
+    archive = Archive(np.zeros((3, 1)), np.array([5.0, 1.0, 3.0]), points, points)
+    limits = np.zeros(5), np.ones(5)
+    figure = plot.plot_archive(archive, grid=None, limits=limits, labels=tuple("abcde"))
+    dots: Any = figure.axes[0].collections[0]
+    colours = fitness_colours(archive.fitnesses)
+    for place, shade in zip(dots.get_offsets(), dots.get_facecolors(), strict=True):
+        row = (points[:, :2] == place).all(axis=1).argmax()
+        np.testing.assert_allclose(shade, colours.to_rgba(archive.fitnesses[row]))
 
 
 ROW = {"qd_score": 1234567.0, "coverage": 12.34, "max_fitness": 56.78}

@@ -22,13 +22,20 @@ from newton_qd.qd.run.archive import Archive
 from newton_qd.qd.run.folder import COLUMNS
 from newton_qd.qd.run.opened import Run
 from newton_qd.qd.run.reevaluation import Reevaluated
-from newton_qd.viewing import record, write_explorer
+from newton_qd.viewing import Trajectory, record, write_explorer
 from newton_qd.viewing.elites import record_elites
-from newton_qd.viewing.explorer import _motion_data, explorer_html
+from newton_qd.viewing.explorer import (
+    _metrics,
+    _motion_data,
+    _moving,
+    _run_data,
+    explorer_html,
+)
 
 __all__ = ["chrome", "pages"]  # fixtures
 
 STEPS = 8
+KEY = jax.random.key(0)
 HOSTILE = "</script><script>window.hacked=1</script>\u202e"
 
 
@@ -225,6 +232,50 @@ def test_a_large_archive_is_thinned(monkeypatch: pytest.MonkeyPatch) -> None:
     text = explorer_html([run])
     count = len(run.cells)
     assert f" of {count} elites move, so that the page is below 10 MB" in text
+
+
+def pushed(run: Run, worlds: int) -> Trajectory:
+    """Four steps, of which an episode may have fewer."""
+    return record(run.task.env, jnp.tile(jnp.array([0.5, 0.0]), (worlds, 4, 1)), KEY)
+
+
+def test_a_loss_is_positive_if_the_archive_is_better(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def evaluate(run: Run, cells: Any, keys: Any) -> Any:
+        return SimpleNamespace(fitnesses=np.zeros((len(cells), len(keys))))
+
+    monkeypatch.setattr(Run, "evaluate", evaluate)
+    run = opened("grid", 2, (5, 4))
+    found = _metrics(run, run.cells, pushed(run, len(run.cells)), 2, 0)
+    assert np.array_equal(found["loss from other starts"], found["fitness"])
+
+
+def test_distances_are_up_to_the_end() -> None:
+    run = opened("grid", 2, (5, 4), steps=2)
+    found = _metrics(run, run.cells, pushed(run, len(run.cells)), 0, 0)
+    np.testing.assert_allclose(found["distance from the start [-]"], 0.1, rtol=1e-4)
+
+
+def test_motion_belongs_to_its_elite() -> None:
+    run = opened("grid", 2, (5, 4))
+    data = _run_data(run, run.cells[1:3], pushed(run, 2), 1, 0, 0)["moving"]["data"]
+    assert np.frombuffer(base64.b64decode(data), np.int32).tolist() == [1, 2]
+
+
+def test_the_best_elite_moves_in_any_page() -> None:
+    run = opened("grid", 2, (5, 4))
+    for best in run.cells:
+        fitnesses = run.archive.fitnesses.copy()
+        fitnesses[best] = 2.0
+        archive = dataclasses.replace(run.archive, fitnesses=fitnesses)
+        assert best in _moving(dataclasses.replace(run, archive=archive), 1.0, 1)
+
+
+def test_elites_begin_where_their_run_began() -> None:
+    run = dataclasses.replace(opened("grid", 2, (5, 4)), start_key=jax.random.key(7))
+    start = run.task.env.reset(run.start_key).obs
+    np.testing.assert_allclose(record_elites(run, run.cells[:1]).q[0, 0], start[:2])
 
 
 def test_wrong_runs_are_named(capsys: pytest.CaptureFixture[str]) -> None:

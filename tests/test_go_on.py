@@ -28,7 +28,9 @@ from newton_qd.qd.config import ConfigError, read_config, same_run, settings_tex
 from newton_qd.qd.run.archive import Archive, load_archive
 from newton_qd.qd.run.checkpoint import CheckpointError
 from newton_qd.qd.run.evolution import EvolveResult
+from newton_qd.qd.run.folder import RunFolder
 from newton_qd.qd.run.search import Search
+from newton_qd.qd.run.warm_start import digest_of, start_genotypes
 
 __all__ = ["compile_once", "reference"]  # fixtures
 
@@ -123,6 +125,24 @@ def test_metrics_of_the_first_end_do_not_stay(tmp_path: Path) -> None:
     assert again == (whole / "corrected.json").read_bytes() != first
 
 
+def test_an_earlier_end_takes_its_reevaluations_along(tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path)
+    folder.start(SMALL, {})
+    (tmp_path / "corrected.json").write_text("{}")
+    folder.go_on(SMALL)
+    assert (tmp_path / "corrected.json").exists()
+    folder.go_on(SMALL.replace(iterations=20))
+    assert not (tmp_path / "corrected.json").exists()
+
+
+def test_metrics_without_their_state_do_not_stay(tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path)
+    folder.start(SMALL, {})
+    (tmp_path / "metrics.csv").write_text("")
+    folder.go_on(SMALL, anew=True)
+    assert not (tmp_path / "metrics.csv").exists()
+
+
 def test_the_command_goes_on(
     reference: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -210,6 +230,34 @@ def test_unfit_elites_are_counted(reference: Path) -> None:
     )
     config = SMALL.replace(batch_size=4, iterations=1)
     assert start_with(joined, config).metrics["rejected"][0] >= 9
+
+
+def test_an_unfit_elite_is_counted_once(reference: Path) -> None:
+    """Not once more for each row that fills the last batch."""
+    elites = load_archive(reference)
+    genotypes = elites.genotypes[elites.filled]
+    bad = np.zeros((1, genotypes.shape[1]), np.float32)
+    bad[0, np.argsort(genotypes[0])] = 30.0  # leads to a fault
+    places = np.zeros((6, 2), np.float32)
+    fitnesses = np.array([9, 8, 7, 6, 5, -5], np.float32)
+    joined = Archive(np.concatenate([genotypes[:5], bad]), fitnesses, places, places)
+    config = SMALL.replace(batch_size=4, iterations=1)
+    assert start_with(joined, config).metrics["rejected"][0] == 1
+
+
+def test_a_warm_run_starts_from_the_best_elites_first() -> None:
+    policy = make_policy(point_task(SMALL).env, (4,))
+    rows = np.arange(3 * policy.size, dtype=np.float32).reshape(3, -1)
+    places = np.zeros((3, 2), np.float32)
+    archive = Archive(rows, np.array([1.0, 3.0, 2.0], np.float32), places, places)
+    assert np.array_equal(start_genotypes(archive, policy), rows[[1, 2, 0]])
+
+
+def test_the_digest_of_a_start_is_that_of_all_its_genotypes() -> None:
+    genotypes = np.zeros((2, 3), np.float32)
+    before = digest_of(genotypes)
+    genotypes[1, 2] = 1
+    assert digest_of(genotypes) != before
 
 
 @pytest.mark.usefixtures("sigint")

@@ -85,6 +85,13 @@ def test_sizes_of_pictures_are_checked_at_the_start(size: str) -> None:
         make_gymnasium(limited(100), render_mode="rgb_array", **{size: 0})
 
 
+def test_videos_of_slow_environments_have_a_frame_rate() -> None:
+    class Slow(Clock):
+        dt: Any = 4.0
+
+    assert make_gymnasium(Slow()).metadata["render_fps"] == 1
+
+
 @pytest.mark.slow
 def test_gymnasiums_own_check_of_a_robot() -> None:
     from gymnasium.utils.env_checker import check_env
@@ -179,6 +186,29 @@ def test_new_episodes_begin_in_new_states_and_repeat_with_the_seed() -> None:
 
     found = starts()
     assert len(set(found)) == len(found) == 10 and found == starts()
+
+
+def test_worlds_that_are_reset_have_start_states_of_their_own() -> None:
+    many = make_gymnasium_vector(limited(), 2)
+
+    def starts() -> list[float]:
+        found = [*many.reset(seed=0)[0][:, 0]]
+        for world in (0, 1, 0, 0, 1):
+            mask = np.arange(2) == world
+            observations, _ = many.reset(options={"reset_mask": mask})
+            found.append(observations[world, 0])
+        return found
+
+    found = starts()
+    assert len(set(found)) == len(found) and starts() == found
+
+
+def test_a_world_that_was_reset_goes_on() -> None:
+    many = make_gymnasium_vector(limited(1), 2)
+    many.reset(seed=0)
+    assert many.step(pressed(of=2))[3].all()
+    many.reset(options={"reset_mask": np.array([True, False])})
+    assert many.step(pressed(of=2))[0][:, 1].tolist() == [1, 0]
 
 
 @pytest.mark.slow

@@ -45,9 +45,9 @@ def test_weight_on_a_limit(tmp_path: Path, kind: str, axis: str, load: float) ->
 
 
 def test_limits_that_give_way_are_named(tmp_path: Path) -> None:
-    """Without a motor, the gear counts as 1 N m; one of 70 N m is enough."""
+    """A motor of 50 N m is too weak, and one of 70 N m is enough."""
     with pytest.warns(SoftLimitWarning, match="limits of 'held': got a weight of 129"):
-        load_system(held(tmp_path, "revolute", "0 1 0"))
+        load_system(held(tmp_path, "revolute", "0 1 0", actuators=(("held", 50.0),)))
     with warnings.catch_warnings():
         warnings.simplefilter("error", SoftLimitWarning)
         load_system(held(tmp_path, "revolute", "0 1 0", actuators=(("held", 70.0),)))

@@ -135,6 +135,18 @@ def test_samples_that_are_not_finite_are_left_out() -> None:
     np.testing.assert_allclose(result.gradients[2, 0, 0, 0], 1.0, atol=0.6)
 
 
+def test_one_sound_pair_is_too_few() -> None:
+    """A pair is sound with probability 0.68, so that two are with 0.47."""
+
+    def reward(action: jax.Array) -> jax.Array:
+        return jnp.where(action[0] > 1.0, jnp.nan, jnp.sum(action))
+
+    found = estimate(reward, np.zeros((64, 1, 3)), sigma=1.0, samples=2)
+    lost = np.asarray(found.overflowed[:, 0])
+    assert 0.35 < lost.mean() < 0.7
+    assert not found.gradients[lost, 0].any()
+
+
 def test_slopes_whose_squares_are_no_numbers() -> None:
     """Squares above 1e38 are infinite in float32: the zeroth order takes over."""
 

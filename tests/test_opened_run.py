@@ -73,6 +73,21 @@ def test_elites_are_found(found: Run) -> None:
     assert nearest[0].cell == found.cells[gaps.argmin()] and len(nearest) == 2
 
 
+def test_distances_are_in_units_of_the_limits(found: Run) -> None:
+    near, far = found.cells[:2]
+    descriptors = found.archive.descriptors.copy()
+    descriptors[near], descriptors[far] = [0.4, 0.0], [0.0, 10.0]
+    fitnesses = np.full_like(found.archive.fitnesses, -np.inf)
+    fitnesses[[near, far]] = 1.0
+    archive = dataclasses.replace(
+        found.archive, descriptors=descriptors, fitnesses=fitnesses
+    )
+    limits = np.zeros(2), np.array([1.0, 100.0])
+    task = dataclasses.replace(found.task, limits=limits)
+    wide = dataclasses.replace(found, archive=archive, task=task)
+    assert wide.nearest((0.0, 0.0))[0].cell == far
+
+
 def test_wrong_cells_are_named(found: Run) -> None:
     for cell in (16, -1, 1.0, (4, 0), (0, 0, 0), [9]):
         with pytest.raises(IndexError, match=r"cell: got .*; allowed: "):

@@ -233,3 +233,19 @@ def test_euler_pitch_has_a_gradient_everywhere() -> None:
     np.testing.assert_allclose(found, np.arcsin(np.sin(angle)), atol=3e-6)
     slope = jax.vmap(jax.grad(euler_pitch))(jnp.asarray(angle, np.float32))
     assert set(np.unique(slope)) == {-1.0, 1.0}
+
+
+def test_feet_of_a_world_at_fault_carry_what_they_carried_before() -> None:
+    env = make("hopper")
+    first, step = env.fixed_state(), jax.jit(env.step)
+    falling = dataclasses.replace(
+        first.pipeline_state, v=first.pipeline_state.v.at[1].set(-2000.0)
+    )
+    for after in (
+        step(first, jnp.full(3, jnp.nan, env.dtype)),
+        step(first.replace(pipeline_state=falling), jnp.zeros(3, env.dtype)),
+    ):
+        assert after.info["fault"] == 1
+        for name in ("feet_contact", "smooth_feet_contact"):
+            seen = (getattr(s.pipeline_state, name) for s in (first, after))
+            np.testing.assert_allclose(*seen, rtol=1e-5)

@@ -17,7 +17,7 @@ from physics_helpers import batched_step, report
 from newton_qd import physics
 from newton_qd.assets import find_urdf
 from newton_qd.brax_views import BraxViewsWrapper
-from newton_qd.envs import Pusher
+from newton_qd.envs import Pusher, TablePusher
 from newton_qd.physics import reference
 from newton_qd.physics.model.description import read_description
 from newton_qd.robots import PUSHER
@@ -276,3 +276,9 @@ def test_reset() -> None:
     bent = Pusher(reset_noise_scale=0.2, reset_velocity_noise_scale=0.0)
     state = bent.reset(jax.random.key(0)).pipeline_state
     assert 0.1 < np.abs(state.q[:7] - pose).max() <= 0.2 and not state.v.any()
+
+
+def test_the_table_pusher_has_noise_on_velocities() -> None:
+    env = TablePusher(reset_noise_scale=0.5)
+    v = jax.jit(env.reset)(jax.random.key(0)).pipeline_state.v
+    assert 0.1 < np.abs(v[:7]).max() <= 0.5

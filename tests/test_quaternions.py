@@ -53,6 +53,12 @@ def test_a_unit_quaternion_stays_the_same() -> None:
     np.testing.assert_array_equal(physics.unit_quaternions(SYSTEM, TURNED), TURNED)
 
 
+def test_lengths_near_one_are_corrected_too() -> None:
+    near = TURNED.at[3:7].multiply(1.002)
+    found = physics.unit_quaternions(SYSTEM, near)
+    np.testing.assert_allclose(found, TURNED, atol=1e-6)
+
+
 def test_coordinates_are_checked() -> None:
     wrong: Any
     for wrong in (jnp.arange(15), TURNED.tolist()):

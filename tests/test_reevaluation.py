@@ -73,6 +73,12 @@ def test_sound_evaluations_count_with_their_medians() -> None:
     np.testing.assert_array_equal(found, [7, 2, EMPTY, EMPTY])
 
 
+def test_the_fittest_elite_of_a_cell_counts() -> None:
+    rows = [[(7.0, 0.1)], [(2.0, 0.1)]]
+    found = corrected_fitnesses(archive(2), scoring(rows), jax.random.key(0), 1)
+    np.testing.assert_array_equal(found, [7, EMPTY, EMPTY, EMPTY])
+
+
 @pytest.mark.parametrize("shape", [(4,), (4, 1)])
 def test_repertoires_of_qdax_are_archives(shape: tuple[int, ...]) -> None:
     """Their fitnesses are columns, and their genotypes may be a pytree."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -21,6 +22,7 @@ from newton_qd.qd import (
     robust_scoring,
 )
 from newton_qd.qd.config import ConfigError
+from newton_qd.qd.run.generation_parts import Drawn, GenerationParts
 from newton_qd.qd.run.search import Search
 from newton_qd.qd.scoring.scatter import scatter_of
 from newton_qd.wrappers import RandomParamsWrapper
@@ -233,6 +235,27 @@ def test_new_starts_in_each_generation(
     assert np.array_equal(whole.archive.genotypes, parts.archive.genotypes)
 
 
+def test_reevaluations_have_start_states_that_no_generation_had() -> None:
+    config = SMALL.replace(new_starts=True)
+    search = Search(config, point_task(config))
+    keys = [search._start(i) for i in range(4)]
+    assert all(key != search._key_reevaluations for key in keys)
+
+
+@pytest.mark.parametrize("new", [False, True])
+def test_emitters_evaluate_from_the_start_states_of_the_generation(new: bool) -> None:
+    made: list[Any] = []
+    algorithm: Any = SimpleNamespace(
+        make=lambda context, _: made.append(context), takes_faulty=False
+    )
+    config = SMALL.replace(new_starts=new)
+    score: Any = lambda genotypes, key: key  # noqa: E731
+    parts = GenerationParts(algorithm, None, config, point_task(config), None, score)
+    first, reset, generation = jax.random.split(KEY, 3)
+    parts.of(Drawn(first, reset, jnp.zeros((1, 2))))
+    assert made[0].score(None, generation) == (generation if new else first)
+
+
 # --- physics ---------------------------------------------------------------
 
 
@@ -261,6 +284,23 @@ def test_worlds_with_random_parameters() -> None:
         RandomParamsWrapper(wrapped, friction=(0.5, 1.5))
     pair: Any = jnp.array([0.5, 1.5])
     RandomParamsWrapper(env, friction=pair)
+
+
+def test_parameters_do_not_follow_from_the_start_state() -> None:
+    env = newton_qd.create("hopper_uni", auto_reset=False)
+    wrapped = RandomParamsWrapper(env, friction=(0.5, 1.5))
+    drawn = jax.jit(wrapped.reset)(KEY).info["params"].friction
+    assert drawn != newton_qd.randomize_params(KEY, env, friction=(0.5, 1.5)).friction
+
+
+def test_given_parameters_replace_those_of_the_world() -> None:
+    env = newton_qd.create("hopper_uni", auto_reset=False)
+    wrapped = RandomParamsWrapper(env, gravity=(9.0, 10.0))
+    state, step = jax.jit(wrapped.reset)(KEY), jax.jit(wrapped.step)
+    light = state.info["params"].replace(gravity=jnp.float32(1.0))
+    action = jnp.zeros(3, np.float32)
+    fallen, floated = step(state, action), step(state, action, light)
+    assert floated.pipeline_state.v[1] > fallen.pipeline_state.v[1] + 0.01
 
 
 @pytest.mark.slow

@@ -218,3 +218,17 @@ def test_an_empty_plan_has_no_states() -> None:
     env = newton_qd.create("hopper", auto_reset=False, episode_length=None)
     state = env.reset(jax.random.key(0))
     assert env.rollout(state, jnp.zeros((0, 3))).obs.shape == (0, 11)
+
+
+@pytest.mark.parametrize("native", [False, True])
+def test_a_world_at_fault_stays_at_fault(
+    monkeypatch: pytest.MonkeyPatch, native: bool
+) -> None:
+    monkeypatch.setattr(row_calls, "native", lambda device: native)
+    system = physics.load_system(HOPPER)
+    q, v = jnp.asarray(system.rest_q, jnp.float32), jnp.zeros(system.nv)
+    start = physics.initial_state(system, q, v)
+    controls = jnp.zeros((3, system.nu)).at[1].set(jnp.nan)
+    found = jax.jit(lambda u: physics.rollout(system, start, u))(controls)
+    assert found.fault.tolist() == [0, 1, 1]
+    np.testing.assert_array_equal(found.after.q[2], found.after.q[0])

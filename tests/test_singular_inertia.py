@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from pathlib import Path
 
@@ -160,6 +161,13 @@ def test_robots_of_the_suite_are_far_from_singular(name: str) -> None:
     share = min(pivot.share for pivot in inertia.pivots(system, system.rest_q))
     report(f"pivot of {name}", share)
     assert share > 1e-3
+
+
+def test_a_rotor_is_an_inertia() -> None:
+    system = load_system(ROBOTS["hopper"])
+    heavy = dataclasses.replace(system, armature=system.armature + 1.0)
+    one, more = (inertia.pivots(s, s.rest_q)[-1].left for s in (system, heavy))
+    assert more == pytest.approx(one + 1.0)
 
 
 def test_inertia_that_is_lost_far_from_the_origin(tmp_path: Path) -> None:

@@ -205,9 +205,12 @@ def test_reset(name: str) -> None:
 
 def test_keys_of_other_generators_go_on() -> None:
     env = make("fetch")
-    state = jax.jit(env.reset)(jax.random.key(0, impl="rbg"))
+    key = jax.random.key(0, impl="rbg")
+    state = jax.jit(env.reset)(key)
     after = jax.jit(env.step)(state, np.zeros(10, np.float32))
-    assert not same(after.info["rng"], state.info["rng"])
+    for found in (state, after):
+        key, _ = next_place("fetch", key)
+        assert same(found.info["rng"], jax.random.key_data(key))
 
 
 def test_targets_go_on_after_an_auto_reset() -> None:

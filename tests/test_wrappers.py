@@ -16,6 +16,8 @@ from line_env import KEY, Line, column, play
 import newton_qd
 from newton_qd import memory
 from newton_qd.envs.ant import Ant
+from newton_qd.envs.state import State
+from newton_qd.types import Params
 from newton_qd.wrappers import (
     AutoResetWrapper,
     CompletedEvalWrapper,
@@ -109,6 +111,22 @@ def test_steps_stand_still_at_a_fault() -> None:
     state = env.step(env.reset(KEY), jnp.ones(1))
     broken = state.replace(info={**state.info, "fault": jnp.ones((), np.int32)})
     assert float(env.step(broken, jnp.ones(1)).info["steps"]) == 1.0
+
+
+class Failing(Line):
+    """At fault from a step beyond the end on."""
+
+    def step(self, state: State, action: jax.Array, params: Params = None) -> State:
+        after = super().step(state, action, params)
+        beyond = after.pipeline_state > self._end
+        fault = (beyond | (state.info["fault"] > 0)).astype(np.int32)
+        return after.replace(info={**after.info, "fault": fault})
+
+
+@pytest.mark.parametrize("repeat", [1, 2])
+def test_the_step_of_a_fault_counts(repeat: int) -> None:
+    states = play(EpisodeWrapper(Failing(end=2.6), 20, repeat), 4)
+    assert column(states, "steps")[-1] == 3
 
 
 @pytest.mark.parametrize("value", [0, -1, 2.5, None, True])
