@@ -82,8 +82,10 @@ def test_bars_are_where_their_cells_are(
     archive = Archive(np.zeros((2, 1)), np.array([7.0, 5.0]), places, places)
     limits = np.zeros(1), np.ones(1)
     figure = plot.plot_archive(archive, grid=grid, limits=limits, labels=("a",))
-    bars: Any = [bar for bar in figure.axes[0].patches if bar.get_width()]
-    tops = {bar.get_x(): bar.get_y() + bar.get_height() for bar in bars}
+    bars: Any = figure.axes[0].patches
+    tops = {
+        bar.get_x(): bar.get_y() + bar.get_height() for bar in bars if bar.get_width()
+    }
     assert tops == pytest.approx({0.0: 5.0, 0.5: 7.0})
 
 

@@ -250,7 +250,8 @@ def test_emitters_evaluate_from_the_start_states_of_the_generation(new: bool) ->
     )
     config = SMALL.replace(new_starts=new)
     score: Any = lambda genotypes, key: key  # noqa: E731
-    parts = GenerationParts(algorithm, None, config, point_task(config), None, score)
+    nothing: Any = None
+    parts = GenerationParts(algorithm, None, config, point_task(config), nothing, score)
     first, reset, generation = jax.random.split(KEY, 3)
     parts.of(Drawn(first, reset, jnp.zeros((1, 2))))
     assert made[0].score(None, generation) == (generation if new else first)
