@@ -160,29 +160,27 @@ def check_extractor(env: object, extractor: object) -> None:
     raise ValueError(message("descriptor_extractor", given, allowed, why=why))
 
 
-def reads_last(extractor: DescriptorExtractor, length: int) -> bool:
+def reads_last(extractor: DescriptorExtractor, steps: int, length: int) -> bool:
     """Returns whether the descriptor of an episode depends on its end alone.
 
-    For an extractor of others, it is tried: the end of an episode of 16 steps changes,
-    and then all but the end. One that needs another number of steps does not count.
+    For an extractor of others, it is tried: the last step of a random episode changes,
+    and then all steps but the last.
 
     Args:
         extractor: Computes descriptors of episodes.
+        steps: Number of steps of an episode.
         length: Number of components of a state descriptor.
     """
     if any(extractor is one for one in (*_READS, get_mean_state_descriptor)):
         return extractor is get_final_xy_position
     with jax.ensure_compile_time_eval():
-        one, two = jax.random.uniform(jax.random.key(0), (2, 1, 16, length))
-        mask = jnp.zeros((1, 16), one.dtype)
-        end = jnp.arange(16)[:, None] == 15
-        try:
-            first, other_end, other_begin = (
-                np.asarray(extractor(Trajectories(values), mask))
-                for values in (one, jnp.where(end, two, one), jnp.where(end, one, two))
-            )
-        except Exception:  # whatever a function of others raises
-            return False
+        one, two = jax.random.uniform(jax.random.key(0), (2, 1, steps, length))
+        mask = jnp.zeros((1, steps), one.dtype)
+        end = jnp.arange(steps)[:, None] == steps - 1
+        first, other_end, other_begin = (
+            np.asarray(extractor(Trajectories(values), mask))
+            for values in (one, jnp.where(end, two, one), jnp.where(end, one, two))
+        )
     return bool(np.any(first != other_end) and np.all(first == other_begin))
 
 

@@ -351,8 +351,8 @@ def test_which_extractors_read_the_end_alone() -> None:
     def two_sides(data: Any, mask: Any) -> jax.Array:
         return jax.nn.softmax(last(data, mask))
 
-    assert reads_last(get_final_xy_position, 2) and reads_last(last, 3)
-    assert reads_last(two_sides, 2)
+    assert reads_last(get_final_xy_position, 20, 2) and reads_last(last, 20, 3)
+    assert reads_last(two_sides, 20, 2)
     for extractor in (
         get_feet_contact_proportion,
         get_mean_state_descriptor,
@@ -361,4 +361,4 @@ def test_which_extractors_read_the_end_alone() -> None:
         way,
         windows,
     ):
-        assert not reads_last(extractor, 2)
+        assert not reads_last(extractor, 20, 2)

@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import optax
 
 from newton_qd.envs.state import select
-from newton_qd.extractors import reads_last
 from newton_qd.gradients.flow import passed_back
 from newton_qd.qd.emitters.actor_critic_settings import ActorCriticSettings
 from newton_qd.qd.emitters.whitening import Whitening
@@ -322,11 +321,8 @@ class ActorCritic:
 
 
 def averages(task: Task) -> bool:
-    """Returns whether a task's descriptor is a mean over the episode.
-
-    An own one that does not depend on the end alone counts as a mean.
-    """
-    return not reads_last(task.descriptor_extractor, task.descriptor_length)
+    """Returns whether a task's descriptor is a mean over the episode."""
+    return not task.reads_end
 
 
 def measure_of(task: Task) -> Callable[[StateLike, StateLike], jax.Array]:

@@ -15,7 +15,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from newton_qd.extractors import reads_last
 from newton_qd.qd.scoring.rollout import Policy
 from newton_qd.qd.scoring.task import Task
 from newton_qd.types import Action, PyTree, RNGKey, StateLike
@@ -104,7 +103,7 @@ class AimedEnv:
     @functools.cached_property
     def _final(self) -> bool:
         """Whether the descriptor depends on the end of the episode alone."""
-        return reads_last(self.task.descriptor_extractor, self.task.descriptor_length)
+        return self.task.reads_end
 
     def scaled(self, descriptors: jax.Array) -> jax.Array:
         """Returns descriptors (..., D) in units of targets."""

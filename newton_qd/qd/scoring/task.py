@@ -13,7 +13,7 @@ import numpy as np
 from newton_qd import checks, tasks
 from newton_qd.checks import Fact, listed, message
 from newton_qd.envs.shown import component_names
-from newton_qd.extractors import Trajectories, get_final_xy_position
+from newton_qd.extractors import Trajectories, get_final_xy_position, reads_last
 from newton_qd.qd.config import ConfigError, EvolveConfig
 from newton_qd.robots import ROBOTS, Material
 from newton_qd.scenes import SCENES, Scene
@@ -42,6 +42,8 @@ class Task:
             score only.
         network: Network of the policies, as for ``policy_of``; ``None``: a perceptron
             with the hidden layers of the settings.
+        episode_length: Control steps of an episode. An own ``descriptor_extractor`` is
+            tried with so many steps, see ``reads_end``.
     """
 
     env: Any
@@ -50,11 +52,22 @@ class Task:
     labels: tuple[str, ...]
     reward_offset: float
     network: Any = None
+    episode_length: int = 16
 
     @property
     def descriptor_length(self) -> int:
         """Number of components of the descriptor."""
         return len(self.labels)
+
+    @property
+    def reads_end(self) -> bool:
+        """Whether the descriptor depends on the end of an episode alone.
+
+        Another one counts as a mean over the episode.
+        """
+        return reads_last(
+            self.descriptor_extractor, self.episode_length, self.descriptor_length
+        )
 
 
 def make_task(config: EvolveConfig) -> Task:
@@ -103,6 +116,7 @@ def make_task(config: EvolveConfig) -> Task:
         limits=(low, high),
         labels=_labels(env, extractor, len(low)),
         reward_offset=float(newton_qd.tables.reward_offset[name]),
+        episode_length=config.episode_length,
     )
 
 
@@ -239,12 +253,9 @@ def _require_length(extractor: DescriptorExtractor, steps: int, length: int) -> 
     """
     values = jax.ShapeDtypeStruct((1, steps, length), np.float32)
     mask = jax.ShapeDtypeStruct((1, steps), np.float32)
-    try:
-        found = jax.eval_shape(
-            lambda values, mask: extractor(Trajectories(values), mask), values, mask
-        ).shape
-    except Exception:  # it may read more of the steps; its own error comes later
-        return
+    found = jax.eval_shape(
+        lambda values, mask: extractor(Trajectories(values), mask), values, mask
+    ).shape
     if found != (1, length):
         name = "descriptor_extractor: shape for one episode"
         allowed = f"{(1, length)}, as the limits have"
