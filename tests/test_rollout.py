@@ -155,6 +155,14 @@ def test_state_descriptors_are_written_in_order() -> None:
         assert _order(own) == RolloutOrder.AT_ONCE
 
 
+def test_views_of_brax_leave_the_order_as_it_is() -> None:
+    options: Any = {"auto_reset": False, "brax_views": True}
+    for length, order in ((None, RolloutOrder.AT_ONCE), (7, RolloutOrder.IN_ORDER)):
+        env = newton_qd.create("hopper_uni", episode_length=length, **options)
+        assert _order(env) == order
+        check(env)
+
+
 def test_wrong_actions_are_refused() -> None:
     env = newton_qd.create("hopper", auto_reset=False)
     state = env.reset(jax.random.key(0))

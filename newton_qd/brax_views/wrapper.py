@@ -65,8 +65,6 @@ BODY_NAMES: Mapping[str, Mapping[str, str]] = types.MappingProxyType(
 class _Shown:
     """A robot in the structure of a pytree: compared by identity, with a short repr."""
 
-    rollout_order = RolloutOrder.AT_ONCE
-
     def __init__(self, system: System) -> None:
         self.system = system
 
@@ -112,6 +110,8 @@ class BraxViewsWrapper(Wrapper):
     ``BraxState``. The robot is part of their structure, so ``jax.tree.map`` over states
     of two robots, or of one robot in two materials, raises an error.
     """
+
+    rollout_order = RolloutOrder.AT_ONCE
 
     def __init__(self, env: Env, body_names: Mapping[str, str] | None = None) -> None:
         """Wraps an environment.
