@@ -20,6 +20,7 @@ from newton_qd.extractors import (
 from newton_qd.gradients import (
     with_smooth_descriptor,
 )
+from newton_qd.wrappers import FeetContactWrapper
 
 WIDTHS = (1.0, 0.1, 1e-2, 1e-3, 1e-4, 1e-5)
 
@@ -92,3 +93,27 @@ def test_smooth_descriptor_leaves_the_environment_as_it_was() -> None:
     options = [{"smooth_width": 0.1, "straight_through": "no"}]
     with pytest.raises(TypeError, match="straight_through: got 'no'; allowed: True, F"):
         newton_qd.create("ant_uni", qdax_wrappers_kwargs=options)
+
+
+class FeetInTheAir(FeetContactWrapper):
+    """Another descriptor of the same contacts."""
+
+    def describe(self, state: State) -> jax.Array:
+        return 1 - super().describe(state)
+
+
+def test_a_descriptor_of_your_own_stays_what_it_is() -> None:
+    env = newton_qd.create("ant", episode_length=None, auto_reset=False)
+    own = FeetInTheAir(env, "ant")
+    smooth = with_smooth_descriptor(own, 0.1)
+    assert isinstance(smooth, FeetInTheAir)
+    readings = [
+        e.reset(jax.random.key(0)).info["state_descriptor"] for e in (own, smooth)
+    ]
+    np.testing.assert_array_equal(readings[0], 1)
+    assert np.all(readings[1] < 1)
+
+
+def test_the_text_of_a_smooth_environment_has_its_name() -> None:
+    env = newton_qd.create("ant_uni", episode_length=None, auto_reset=False)
+    assert repr(with_smooth_descriptor(env, 0.1)).startswith("<ant_uni: ")

@@ -47,7 +47,7 @@ def with_smooth_descriptor(
     if not isinstance(env, Wrapper):
         return env
     if isinstance(env, FeetContactWrapper):
-        return FeetContactWrapper(env.env, env.name, width, straight_through, tail)
+        return env.smoothed(width, straight_through, tail)
     changed = copy.copy(env)
     changed.env = with_smooth_descriptor(env.env, width, straight_through, tail)
     return changed

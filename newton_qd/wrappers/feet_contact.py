@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+from typing import Self
+
 import jax
 import jax.numpy as jnp
 
@@ -78,6 +81,21 @@ class FeetContactWrapper(DescriptorWrapper):
         super().__init__(env, env_name)
         self._smooth = smooth_width is not None
         self._straight_through = straight_through
+
+    def smoothed(self, width: float, straight_through: bool, tail: str) -> Self:
+        """Returns this wrapper with a smooth contact; this one does not change.
+
+        Args:
+            width: As ``smooth_width`` of the class; it is checked already.
+            straight_through: As for the class.
+            tail: As ``smooth_tail`` of the class.
+        """
+        changed = copy.copy(self)
+        changed.env = self.env.with_base(
+            lambda base: _with_smooth_feet(base, width, tail)
+        )
+        changed._smooth, changed._straight_through = True, straight_through
+        return changed
 
     def describe(self, state: State) -> Descriptor:
         """Returns the ground contact of each foot (nf,), from 0 to 1."""
