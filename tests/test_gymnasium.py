@@ -142,6 +142,9 @@ def test_worlds_of_a_vector_begin_as_single_ones() -> None:
     assert np.array_equal(observations, [one.reset(seed=5 + n)[0] for n in range(3)])
     observations, _ = many.reset(seed=[9, 1, 4])
     assert np.array_equal(observations, [one.reset(seed=n)[0] for n in (9, 1, 4)])
+    for kind in (np.int32, np.uint8):
+        observations, _ = many.reset(seed=np.array([9, 1, 4], kind))  # pyright: ignore[reportArgumentType]
+        assert np.array_equal(observations, [one.reset(seed=n)[0] for n in (9, 1, 4)])
     for seeds in ([1.5, 2, 3], [None, 1, 2], [1, 2]):
         with pytest.raises(ValueError, match=r"seed: got .*; allowed: an integer, or"):
             many.reset(seed=seeds)  # pyright: ignore[reportArgumentType]

@@ -237,7 +237,7 @@ class GymnasiumVectorEnv(Pickled, gymnasium.vector.VectorEnv):
         """Returns first states of all worlds, from seeds or from random numbers."""
         if seeds is None:
             seeds = self.np_random.integers(2**32, size=self.num_envs)
-        return self._reset(self._keys((seeds % 2**32).astype(np.uint32)))
+        return self._reset(self._keys(seeds.astype(np.uint32)))  # modulo 2**32
 
     def _begun(self, state: State, begins: np.ndarray) -> State:
         """Returns the state with new episodes in some worlds.
