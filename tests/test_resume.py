@@ -40,6 +40,7 @@ from newton_qd.qd.run.archive import load_archive
 from newton_qd.qd.run.checkpoint import CheckpointError, load_checkpoint
 from newton_qd.qd.run.folder import RunFolder
 from newton_qd.qd.run.interrupt import INTERRUPTED, graceful_stop
+from newton_qd.qd.run.leaves import leaf_to_device, leaf_to_host
 from newton_qd.qd.run.progress import Progress
 from newton_qd.qd.run.search import Search, SearchError
 
@@ -47,6 +48,13 @@ __all__ = ["compile_once", "reference"]  # fixtures
 
 # QDax and what it imports warn about their own use of other packages.
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
+
+
+@pytest.mark.parametrize("generator", ["threefry2x32", "rbg"])
+def test_a_key_of_an_emitter_keeps_its_generator(generator: str) -> None:
+    key = jax.random.key(3, impl=generator)
+    like = jax.eval_shape(lambda: key)
+    assert leaf_to_device(leaf_to_host(key), like) == key
 
 
 @pytest.mark.optimized

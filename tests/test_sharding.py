@@ -21,7 +21,7 @@ from test_algorithms import CRITIC
 import newton_qd
 from newton_qd.qd.config import ConfigError, EvolveConfig
 from newton_qd.qd.run.evolution import evolve
-from newton_qd.qd.scoring.sharding import device_mesh
+from newton_qd.qd.scoring.sharding import device_mesh, on_mesh
 
 TESTS = Path(__file__).resolve().parent
 COMMON = """
@@ -251,6 +251,16 @@ for task, counts in {tasks!r}:
     answer += [evolved(*task, devices=count) == alone for count in counts]
 """
     assert devices.answer(EVOLVE + code) == [True] * 5
+
+
+@pytest.mark.parametrize("generator", ["threefry2x32", "rbg"])
+def test_keys_of_several_processes_keep_their_generator(
+    monkeypatch: pytest.MonkeyPatch, generator: str
+) -> None:
+    monkeypatch.setattr(jax, "process_count", lambda: 2)
+    key = jax.random.key(3, impl=generator)
+    draw = on_mesh(lambda key: jax.random.bits(key, (2,)), device_mesh(1))
+    np.testing.assert_array_equal(draw(key), jax.random.bits(key, (2,)))
 
 
 @pytest.mark.slow

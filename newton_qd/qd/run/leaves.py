@@ -22,7 +22,8 @@ def leaf_to_host(leaf: Any) -> np.ndarray:
 def leaf_to_device(leaf: np.ndarray, like: Any) -> jax.Array:
     """Inverts ``leaf_to_host``."""
     if jnp.issubdtype(like.dtype, jax.dtypes.prng_key):
-        return jax.random.wrap_key_data(jnp.asarray(leaf))
+        impl = jax.random.key_impl(jnp.empty((), like.dtype))
+        return jax.random.wrap_key_data(jnp.asarray(leaf), impl=impl)
     return jnp.asarray(leaf, like.dtype)
 
 

@@ -140,5 +140,6 @@ def _copied(leaf: jax.Array, everywhere: NamedSharding) -> jax.Array:
         return jax.device_put(leaf, everywhere)
     if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
         numbers = np.asarray(jax.random.key_data(leaf))
-        return jax.random.wrap_key_data(jax.device_put(numbers, everywhere))
+        impl = jax.random.key_impl(leaf)
+        return jax.random.wrap_key_data(jax.device_put(numbers, everywhere), impl=impl)
     return jax.device_put(np.asarray(leaf), everywhere)
