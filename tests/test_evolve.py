@@ -290,6 +290,12 @@ def test_descriptors_out_of_bounds_go_to_the_nearest_cell() -> None:
     np.testing.assert_array_equal(distance.argmin(1), np.flatnonzero(filled))
 
 
+def test_a_task_can_be_a_static_argument() -> None:
+    task = point_task(SMALL)
+    twice = jax.jit(lambda task, x: 2 * x, static_argnums=0)
+    assert [twice(one, 3) for one in (task, dataclasses.replace(task))] == [6, 6]
+
+
 def test_wrong_arguments_of_a_policy_are_named() -> None:
     env = point_task(SMALL).env
     for hidden, words in (("ab", "hidden: got 'ab'"), ((4, 0), r"hidden\[1\]: got 0")):

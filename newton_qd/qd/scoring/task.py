@@ -26,9 +26,12 @@ _OWN = (
 """Arguments of ``create`` that are not for the settings of a run."""
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Task:
     """A Quality-Diversity task.
+
+    It compares and hashes by identity, so it can be a static argument of jitted
+    functions.
 
     Attributes:
         env: Environment with unbatched ``reset`` and ``step`` and without
