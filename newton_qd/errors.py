@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Sequence
 
 
@@ -48,3 +49,17 @@ class MissingExtra(ImportError):  # noqa: N818 - likewise
             f"This needs {self.package}, which is not installed. "
             f"Install it with: pip install 'newton_qd[{self.extra}]'"
         )
+
+
+def require_extra(package: str, extra: str) -> None:
+    """Checks that an optional dependency is installed.
+
+    Args:
+        package: Name of the module to import.
+        extra: Extra of ``newton_qd`` that installs it.
+
+    Raises:
+        MissingExtra: It is not installed.
+    """
+    if importlib.util.find_spec(package) is None:
+        raise MissingExtra(package, extra)

@@ -55,7 +55,6 @@ LEAVES: dict[str, set[str]] = {
 }
 # The rooms of `qd`: a module may import those of its own room and those before it.
 ROOMS = (
-    "extras",
     "facts",
     "config",
     "study",

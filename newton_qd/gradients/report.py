@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-import importlib.util
 import io
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from newton_qd.errors import MissingExtra
+from newton_qd.errors import require_extra
 from newton_qd.files import write_atomically
 
 if TYPE_CHECKING:
@@ -270,8 +269,7 @@ class GradientReport:
         Raises:
             MissingExtra: matplotlib is not installed.
         """
-        if importlib.util.find_spec("matplotlib") is None:
-            raise MissingExtra("matplotlib", "viz")
+        require_extra("matplotlib", "viz")
         from matplotlib.figure import Figure
 
         figure = Figure(figsize=(11, 4), layout="constrained")

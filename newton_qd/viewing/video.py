@@ -12,8 +12,8 @@ import numpy as np
 
 from newton_qd import checks
 from newton_qd.checks import listed, message
+from newton_qd.errors import require_extra
 from newton_qd.files import temporary_name
-from newton_qd.qd.extras import require_extra
 from newton_qd.viewing.camera import pictures, times
 from newton_qd.viewing.trajectory import Trajectory
 

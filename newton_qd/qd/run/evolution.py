@@ -17,10 +17,10 @@ from jax.sharding import Mesh
 
 from newton_qd import checks
 from newton_qd.checks import Fact, message
+from newton_qd.errors import require_extra
 from newton_qd.physics import interrupts
 from newton_qd.qd.algorithms import algorithm_named
 from newton_qd.qd.config import ConfigError, EvolveConfig
-from newton_qd.qd.extras import require_extra
 from newton_qd.qd.facts import environment_facts
 from newton_qd.qd.run.archive import Archive
 from newton_qd.qd.run.checkpoint import Checkpoint

@@ -16,9 +16,9 @@ import numpy as np
 from newton_qd import checks
 from newton_qd.checks import Fact, message
 from newton_qd.envs.inputs import require_key
+from newton_qd.errors import require_extra
 from newton_qd.qd.algorithms import ALGORITHMS, algorithm_named
 from newton_qd.qd.config import ConfigError, EvolveConfig, read_config
-from newton_qd.qd.extras import require_extra
 from newton_qd.qd.run.archive import Archive
 from newton_qd.qd.run.folder import CONFIG, REEVALUATED
 from newton_qd.qd.run.plot import grid_indices

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from newton_qd.errors import require_extra
 from newton_qd.qd.algorithms import ALGORITHMS, algorithm_named
 from newton_qd.qd.config import EvolveConfig
-from newton_qd.qd.extras import require_extra
 from newton_qd.qd.run.archive import Archive
 from newton_qd.qd.run.plot_cells import draw_intervals, draw_pairs, draw_tessellation
 from newton_qd.qd.run.plot_grid import draw_line, draw_nested, grid_indices

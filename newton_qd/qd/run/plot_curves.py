@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from newton_qd.errors import require_extra
 from newton_qd.qd.config import EvolveConfig
-from newton_qd.qd.extras import require_extra
 from newton_qd.qd.run.reevaluation import Reevaluated
 
 if TYPE_CHECKING:

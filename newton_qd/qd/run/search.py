@@ -13,10 +13,10 @@ import numpy as np
 from jax.sharding import Mesh
 
 from newton_qd.checks import message
+from newton_qd.errors import require_extra
 from newton_qd.qd.algorithms import AlgorithmSpec, algorithm_named
 from newton_qd.qd.algorithms.options import refused_options
 from newton_qd.qd.config import ConfigError, EvolveConfig, settings_text
-from newton_qd.qd.extras import require_extra
 from newton_qd.qd.run.archive import Archive
 from newton_qd.qd.run.cells import cell_centroids
 from newton_qd.qd.run.checkpoint import Checkpoint

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Self
 
-from newton_qd.qd.extras import require_extra
+from newton_qd.errors import require_extra
 
 _FLUSH_SECONDS = 1  # a killed run loses this part of its curves, but no metrics.csv
 

@@ -14,7 +14,7 @@ from jax.flatten_util import ravel_pytree
 from newton_qd import checks
 from newton_qd.checks import Fact, message
 from newton_qd.envs.inputs import require_key
-from newton_qd.qd.extras import require_extra
+from newton_qd.errors import require_extra
 from newton_qd.real_numbers import real_numbers
 from newton_qd.types import Repertoire, ScoringFunction
 

@@ -14,9 +14,9 @@ from jax.flatten_util import ravel_pytree
 from newton_qd import checks
 from newton_qd.checks import Fact, message
 from newton_qd.envs.inputs import require_key
+from newton_qd.errors import require_extra
 from newton_qd.gradients.episode import Episode
 from newton_qd.gradients.flow import EXACT, GradientOptions
-from newton_qd.qd.extras import require_extra
 from newton_qd.qd.scoring.task import Task
 from newton_qd.types import (
     Environment,
