@@ -81,9 +81,7 @@ def run(arguments: argparse.Namespace) -> int:
         ConfigError: The folder for the files cannot be written.
     """
     import newton_qd
-    from newton_qd.physics.precision import quiet
 
-    quiet()
     if arguments.json:
         refused = "--json: got it with gradients; allowed: without WHAT"
         return complain(arguments, refused, BAD_ARGUMENTS)

@@ -37,9 +37,7 @@ def run(arguments: argparse.Namespace) -> int:
         UnknownEnvironment: No environment has this name.
     """
     import newton_qd
-    from newton_qd.physics.precision import quiet
 
-    quiet()
     if arguments.name is not None:
         found = _facts(arguments.name, whole=True)
         print(json.dumps(found, indent=2) if arguments.json else _description(found))

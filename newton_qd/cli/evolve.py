@@ -58,13 +58,11 @@ def run(
     # that argument errors are fast. The signal is delayed until the imports end,
     # because an exception during the import of an extension module can crash Python.
     with graceful_stop(b"\nstopping\n") as stop:
-        from newton_qd.physics.precision import quiet
         from newton_qd.qd.run.evolution import evolve
         from newton_qd.qd.run.search import SearchError
         from newton_qd.qd.scoring.task import make_task
     if stop.requested:
         raise KeyboardInterrupt
-    quiet()
     try:
         result = evolve(
             config,

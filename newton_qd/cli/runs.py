@@ -81,11 +81,9 @@ def opened(folder: Path, task_factory: TaskFactory) -> Run:
     Raises:
         ConfigError: The folder does not exist, or holds no run.
     """
-    from newton_qd.physics.precision import quiet
     from newton_qd.qd.run.opened import load_run
     from newton_qd.qd.scoring.task import make_task
 
-    quiet()
     if not folder.is_dir():
         why = "which is a file" if folder.exists() else "which does not exist"
         allowed = "a results folder, as newton-qd evolve writes it"

@@ -374,11 +374,9 @@ def _random_trajectory(arguments: argparse.Namespace) -> Trajectory:
             raise ConfigError(message(f"--{name}", getattr(arguments, name), allowed))
     import jax
 
-    from newton_qd.physics.precision import quiet
     from newton_qd.viewing import record
     from newton_qd.viewing.recording import check_memory
 
-    quiet()
     steps, worlds = arguments.steps or _RANDOM_STEPS, arguments.best or 1
     env = newton_qd.create(arguments.what, episode_length=steps, auto_reset=False)
     check_memory(env, steps, worlds)

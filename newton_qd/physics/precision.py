@@ -19,8 +19,6 @@ from types import ModuleType
 
 import warp as wp
 
-from newton_qd.physics import messages
-
 _TEMPLATE = Path(__file__).parent / "kernels"
 _TEMPLATE_PACKAGE = "newton_qd.physics.kernels"
 _VECTOR_BYTES = 32
@@ -196,8 +194,3 @@ def pack_width(dtype: str, device: wp.Device) -> int:
     if not device.is_cpu:
         return 1
     return _VECTOR_BYTES // (4 if dtype == "float32" else 8)
-
-
-def quiet() -> None:
-    """Turns off Warp's messages; importing ``newton_qd.physics`` does it already."""
-    messages.quiet()
