@@ -8,7 +8,7 @@ import numpy as np
 
 from newton_qd.envs.base import PhysicsEnv
 from newton_qd.envs.contacts import angular_changes, linear_changes
-from newton_qd.envs.limits import within
+from newton_qd.envs.limits import survival, within
 from newton_qd.envs.options import checked_options
 from newton_qd.envs.vectors import length, ordered_sum, rounded
 from newton_qd.physics.explicit_mesh import split_as
@@ -123,12 +123,8 @@ class Ant(PhysicsEnv):
         position = after.q[:3]
         velocity = rounded((position[:2] - before.q[:2]) / self.dt)
         healthy = within(position[2], self._healthy_z_range, self.termination_width)
-        if self._terminate_when_unhealthy:
-            bonus, done = jnp.full_like(healthy, self._healthy_reward), 1 - healthy
-        else:
-            # only done has a gradient
-            bonus = self._healthy_reward * jax.lax.stop_gradient(healthy)
-            done = jnp.zeros_like(healthy)
+        ends = self._terminate_when_unhealthy
+        bonus, done = survival(healthy, self._healthy_reward, ends=ends)
         control = rounded(self._ctrl_cost_weight * ordered_sum(jnp.square(action)))
         contact = rounded(self._contact_cost_weight * self._contact_effort(after))
         reward = velocity[0] + bonus - control - contact

@@ -9,7 +9,7 @@ import numpy as np
 from newton_qd import physics
 from newton_qd.envs.base import PhysicsEnv
 from newton_qd.envs.contacts import isotropic_inertia
-from newton_qd.envs.limits import within
+from newton_qd.envs.limits import survival, within
 from newton_qd.envs.options import checked_options
 from newton_qd.envs.vectors import cross, length, ordered_sum, rounded
 from newton_qd.physics.system import Kinematics, PhysicsState
@@ -161,12 +161,8 @@ class Humanoid(PhysicsEnv):
         )
         velocity = (position[:2] - start[:2]) / self.dt
         healthy = within(after.q[2], self._healthy_z_range, self.termination_width)
-        if self._terminate_when_unhealthy:
-            bonus, done = jnp.full_like(healthy, self._healthy_reward), 1 - healthy
-        else:
-            # only done has a gradient
-            bonus = self._healthy_reward * jax.lax.stop_gradient(healthy)
-            done = jnp.zeros_like(healthy)
+        ends = self._terminate_when_unhealthy
+        bonus, done = survival(healthy, self._healthy_reward, ends=ends)
         forward = rounded(self._forward_reward_weight * velocity[0])
         control = rounded(self._ctrl_cost_weight * ordered_sum(jnp.square(action)))
         metrics = {

@@ -1,10 +1,11 @@
-"""Whether a number is within limits: 0 or 1, with or without a gradient."""
+"""Whether numbers are within limits, with or without a gradient, and what it means."""
 
 from __future__ import annotations
 
 import functools
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from newton_qd import checks
@@ -41,6 +42,23 @@ def within(
         return ((value >= low) & (value <= high)).astype(value.dtype)
     check_width("width", width)
     return _step(value - low, float(width)) * _step(high - value, float(width))
+
+
+def survival(
+    healthy: jax.Array, reward: float, *, ends: bool
+) -> tuple[jax.Array, jax.Array]:
+    """Returns the bonus () for being healthy, and done ().
+
+    Args:
+        healthy: () 1 if the robot is healthy, else 0, from :func:`within`.
+        reward: Bonus per step [-].
+        ends: Whether an unhealthy robot ends the episode; if not, it only loses the
+            bonus.
+    """
+    if ends:
+        return jnp.full_like(healthy, reward), 1 - healthy
+    # only done has a gradient
+    return reward * jax.lax.stop_gradient(healthy), jnp.zeros_like(healthy)
 
 
 def check_width(name: str, width: object) -> None:

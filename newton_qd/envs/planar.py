@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from newton_qd.envs.limits import within
+from newton_qd.envs.limits import survival, within
 from newton_qd.envs.vectors import ordered_sum, rounded, wrapped
 from newton_qd.physics.system import PhysicsState
 from newton_qd.types import Action, Metrics
@@ -100,12 +100,8 @@ class UprightRun:
         """
         velocity = forward_velocity(before, after, dt)
         healthy = self._healthy(after, width)
-        if self.terminate_when_unhealthy:
-            bonus, done = jnp.full_like(healthy, self.healthy_reward), 1 - healthy
-        else:
-            # only done has a gradient
-            bonus = self.healthy_reward * jax.lax.stop_gradient(healthy)
-            done = jnp.zeros_like(healthy)
+        ends = self.terminate_when_unhealthy
+        bonus, done = survival(healthy, self.healthy_reward, ends=ends)
         forward = rounded(self.forward_reward_weight * velocity)
         control = rounded(self.ctrl_cost_weight * ordered_sum(jnp.square(action)))
         metrics = {
