@@ -10,7 +10,6 @@
 from __future__ import annotations
 
 import contextlib
-import io
 import json
 import os
 from collections.abc import Iterator
@@ -37,6 +36,7 @@ from newton_qd.qd.run.checkpoint import (
     CheckpointError,
     load_checkpoint,
     npz_bytes,
+    read_npz,
     save_checkpoint,
 )
 
@@ -177,10 +177,9 @@ class RunFolder:
         path = self.path / START
         if not path.is_file():
             return None
-        content = io.BytesIO(path.read_bytes())
+        content = path.read_bytes()
         try:
-            with np.load(content, allow_pickle=False) as arrays:
-                return arrays["genotypes"]
+            return read_npz(content)["genotypes"]
         except DAMAGE as error:
             raise CheckpointError(f"{path} is damaged: {error}") from error
 
