@@ -6,12 +6,16 @@ import dataclasses
 import os
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from newton_qd import checks
 from newton_qd.checks import Fact, message
-from newton_qd.qd.run.checkpoint import DAMAGE, npz_bytes, read_npz
+from newton_qd.qd.run.checkpoint import DAMAGE, Checkpoint, npz_bytes, read_npz
+
+if TYPE_CHECKING:  # the command line opens archives without JAX
+    from newton_qd.types import Repertoire
 
 ARCHIVE = "archive.npz"
 FORMAT = 1
@@ -42,6 +46,26 @@ class Archive:
     def filled(self) -> np.ndarray:
         """(cells,) whether a cell holds an individual."""
         return np.isfinite(self.fitnesses)
+
+
+def archive_of(state: Checkpoint) -> Archive:
+    """Returns the archive in a checkpoint."""
+    return Archive(*(getattr(state, f.name) for f in dataclasses.fields(Archive)))
+
+
+def repertoire_of(archive: Archive | Checkpoint) -> Repertoire:
+    """Returns an archive as ``MapElitesRepertoire`` of QDax."""
+    import jax.numpy as jnp
+    from qdax.core.containers.mapelites_repertoire import MapElitesRepertoire
+
+    return MapElitesRepertoire(
+        genotypes=jnp.asarray(archive.genotypes),
+        fitnesses=jnp.asarray(archive.fitnesses[:, None]),
+        extra_scores={},
+        keys_extra_scores=(),
+        descriptors=jnp.asarray(archive.descriptors),
+        centroids=jnp.asarray(archive.centroids),
+    )
 
 
 def archive_bytes(archive: Archive) -> bytes:

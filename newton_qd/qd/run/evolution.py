@@ -22,7 +22,7 @@ from newton_qd.physics import interrupts
 from newton_qd.qd.algorithms import algorithm_named
 from newton_qd.qd.config import ConfigError, EvolveConfig
 from newton_qd.qd.facts import environment_facts
-from newton_qd.qd.run.archive import Archive
+from newton_qd.qd.run.archive import Archive, archive_of
 from newton_qd.qd.run.checkpoint import Checkpoint
 from newton_qd.qd.run.folder import COLUMNS, EVENTS, RunFolder
 from newton_qd.qd.run.interrupt import StopFlag, graceful_stop
@@ -330,12 +330,7 @@ def _result(
     columns = checkpoint.metrics.T
     return EvolveResult(
         config=config,
-        archive=Archive(
-            genotypes=checkpoint.genotypes,
-            fitnesses=checkpoint.fitnesses,
-            descriptors=checkpoint.descriptors,
-            centroids=checkpoint.centroids,
-        ),
+        archive=archive_of(checkpoint),
         metrics=dict(zip(COLUMNS, columns, strict=True)),
         iteration=checkpoint.iteration,
         interrupted=checkpoint.iteration < config.iterations,

@@ -19,7 +19,7 @@ from newton_qd.envs.inputs import require_key
 from newton_qd.errors import require_extra
 from newton_qd.qd.algorithms import ALGORITHMS, algorithm_named
 from newton_qd.qd.config import ConfigError, EvolveConfig, read_config
-from newton_qd.qd.run.archive import Archive
+from newton_qd.qd.run.archive import Archive, repertoire_of
 from newton_qd.qd.run.folder import CONFIG, REEVALUATED
 from newton_qd.qd.run.plot import grid_indices
 from newton_qd.qd.run.reevaluation import Reevaluated
@@ -107,16 +107,7 @@ class Run:
     @functools.cached_property
     def repertoire(self) -> Repertoire:
         """The archive as ``MapElitesRepertoire`` of QDax."""
-        from qdax.core.containers.mapelites_repertoire import MapElitesRepertoire
-
-        return MapElitesRepertoire(
-            genotypes=jnp.asarray(self.archive.genotypes),
-            fitnesses=jnp.asarray(self.archive.fitnesses[:, None]),
-            extra_scores={},
-            keys_extra_scores=(),
-            descriptors=jnp.asarray(self.archive.descriptors),
-            centroids=jnp.asarray(self.archive.centroids),
-        )
+        return repertoire_of(self.archive)
 
     @property
     def cells(self) -> np.ndarray:

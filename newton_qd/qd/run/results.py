@@ -14,7 +14,7 @@ import numpy as np
 from newton_qd import checks
 from newton_qd.checks import Fact, message
 from newton_qd.qd.config import ConfigError, EvolveConfig
-from newton_qd.qd.run.archive import ARCHIVE, Archive, load_archive
+from newton_qd.qd.run.archive import ARCHIVE, Archive, archive_of, load_archive
 from newton_qd.qd.run.checkpoint import Checkpoint, CheckpointError, load_checkpoint
 from newton_qd.qd.run.folder import (
     CHECKPOINT,
@@ -48,7 +48,7 @@ def read_results(
     if config is not None:
         require_same_run(path / CHECKPOINT, state, config)
     columns = complete_metrics(np.asarray(state.metrics)).T
-    return _archive(state), dict(zip(COLUMNS, columns, strict=True))
+    return archive_of(state), dict(zip(COLUMNS, columns, strict=True))
 
 
 def read_archive(folder: str | os.PathLike[str]) -> Archive:
@@ -61,12 +61,7 @@ def read_archive(folder: str | os.PathLike[str]) -> Archive:
     """
     path = Path(folder)
     state = _newest(path)
-    return load_archive(path) if state is None else _archive(state)
-
-
-def _archive(state: Checkpoint) -> Archive:
-    """Returns the archive in a checkpoint."""
-    return Archive(*(getattr(state, f.name) for f in dataclasses.fields(Archive)))
+    return load_archive(path) if state is None else archive_of(state)
 
 
 def _newest(path: Path) -> Checkpoint | None:

@@ -17,7 +17,7 @@ from newton_qd.errors import require_extra
 from newton_qd.qd.algorithms import AlgorithmSpec, algorithm_named
 from newton_qd.qd.algorithms.options import refused_options
 from newton_qd.qd.config import ConfigError, EvolveConfig, settings_text
-from newton_qd.qd.run.archive import Archive
+from newton_qd.qd.run.archive import Archive, repertoire_of
 from newton_qd.qd.run.cells import cell_centroids
 from newton_qd.qd.run.checkpoint import Checkpoint
 from newton_qd.qd.run.folder import COLUMNS, complete_metrics
@@ -292,19 +292,9 @@ class Search:
         Raises:
             CheckpointError: Its arrays do not fit this version of the algorithm.
         """
-        from qdax.core.containers.mapelites_repertoire import MapElitesRepertoire
-
-        repertoire = MapElitesRepertoire(
-            genotypes=jnp.asarray(checkpoint.genotypes),
-            fitnesses=jnp.asarray(checkpoint.fitnesses[:, None]),
-            extra_scores={},
-            keys_extra_scores=(),
-            descriptors=jnp.asarray(checkpoint.descriptors),
-            centroids=jnp.asarray(checkpoint.centroids),
-        )
         return SearchState(
             checkpoint.iteration,
-            repertoire,
+            repertoire_of(checkpoint),
             complete_metrics(checkpoint.metrics),
             self._restore_emitter(checkpoint.emitter),
         )
