@@ -21,11 +21,10 @@ from newton_qd.gradients.measurements import (
     DISTANCES,
     Differences,
     Subject,
-    normal_like,
     take_differences,
     take_samples,
 )
-from newton_qd.gradients.mixed import Mixture
+from newton_qd.gradients.mixed import Mixture, normal_noise
 from newton_qd.gradients.report import ContactRow, GradientReport, HorizonRow
 from newton_qd.types import Genotype, Policy, RNGKey
 
@@ -117,7 +116,7 @@ def _report(
     difference, gradients = take_differences(subject, genotypes, keys[0], directions)
     refuse_faults(difference.faulty)
     centre = jax.tree.map(lambda x: x[:, ends - 1], gradients)
-    noise = jax.tree.map(lambda x: sigma * x, normal_like(keys[1], genotypes, samples))
+    noise = normal_noise(keys[1], genotypes, samples, sigma)
     mixed, slopes, sound = take_samples(subject, genotypes, centre, noise, sigma, ends)
     if (sound < 2).any():
         raise FaultError(

@@ -13,7 +13,7 @@ import numpy as np
 from newton_qd.envs.base import Env
 from newton_qd.gradients.exact import finite_rows
 from newton_qd.gradients.flow import tree_norm
-from newton_qd.gradients.mixed import Mixture, mixture
+from newton_qd.gradients.mixed import Mixture, mixture, normal_noise
 from newton_qd.gradients.outcome import Tally, at_fault
 from newton_qd.physics.system import PhysicsState
 from newton_qd.types import Genotype, Policy, PyTree, RNGKey
@@ -142,20 +142,9 @@ def take_differences(
             "switched": touching[:, -1, 0] != touching[:, -1, 1],
         }, gradients
 
-    drawn = normal_like(key, genotypes, directions)
+    drawn = normal_noise(key, genotypes, directions)
     found, gradients = jax.jit(jax.vmap(one))(genotypes, drawn)
     return Differences(**jax.tree.map(np.asarray, found)), gradients
-
-
-def normal_like(key: RNGKey, genotypes: Genotype, count: int) -> Genotype:
-    """Returns normal random numbers, leaves (worlds, count, ...)."""
-    leaves, structure = jax.tree.flatten(genotypes)
-    keys = jax.random.split(key, len(leaves))
-    drawn = [
-        jax.random.normal(k, (len(x), count, *x.shape[1:]), x.dtype)
-        for k, x in zip(keys, leaves, strict=True)
-    ]
-    return jax.tree.unflatten(structure, drawn)
 
 
 def _unit(tree: PyTree) -> PyTree:

@@ -91,7 +91,7 @@ def mixed_gradients(
         TypeError: A genotype is not of floating point.
     """
     require_floating(genotypes)
-    noise = _noise(noise_key, genotypes, samples, sigma)
+    noise = normal_noise(noise_key, genotypes, samples, sigma)
     noise = rows_split_as(jax.tree.leaves(genotypes)[0], noise)
     found = _pairs(gradient, genotypes, noise)
     combine = functools.partial(_combined, sigma=sigma, tolerance=tolerance)
@@ -115,7 +115,9 @@ def _pairs(
     return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), found)
 
 
-def _noise(key: RNGKey, genotypes: Genotype, samples: int, sigma: float) -> PyTree:
+def normal_noise(
+    key: RNGKey, genotypes: Genotype, samples: int, sigma: float = 1.0
+) -> PyTree:
     """Returns normal noise for every genotype, leaves (N, samples, ...)."""
     leaves, structure = jax.tree.flatten(genotypes)
     keys = jax.random.split(key, len(leaves))
