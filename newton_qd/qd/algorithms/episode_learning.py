@@ -67,7 +67,6 @@ def episode_learning(
     """
     if not options.episodes_after:
         return None
-    from newton_qd.qd.emitters.actor_critic_learner import averages
     from newton_qd.qd.emitters.episode_learner import EpisodeLearning
 
     width = options.episode_termination_width
@@ -77,5 +76,5 @@ def episode_learning(
         after=options.episodes_after,
         updates=options.episode_updates,
         weight_noise=options.episode_weight_noise,
-        averaged=averages(task),
+        averaged=not task.reads_end,
     )

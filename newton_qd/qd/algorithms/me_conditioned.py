@@ -10,19 +10,18 @@ from newton_qd.checks import message
 from newton_qd.qd.algorithms.gradient_options import (
     SHORT,
     WINDOW,
-    DifferentiableOptions,
     differentiable,
     initial_scale,
     on_robots_that_fall,
 )
+from newton_qd.qd.algorithms.learning import LearningOptions
 from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext
 from newton_qd.qd.algorithms.variation import with_isoline
 from newton_qd.qd.config import ConfigError, EvolveConfig
-from newton_qd.qd.emitters.actor_critic_settings import ActorCriticSettings
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ConditionedOptions(DifferentiableOptions, ActorCriticSettings):
+class ConditionedOptions(LearningOptions):
     """Options of MAP-Elites with an actor that is told the target descriptor.
 
     Attributes:

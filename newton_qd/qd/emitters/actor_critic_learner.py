@@ -320,11 +320,6 @@ class ActorCritic:
         return jax.lax.scan(fit, (learner.critic, learner.moments[1]), order)[0]
 
 
-def averages(task: Task) -> bool:
-    """Returns whether a task's descriptor is a mean over the episode."""
-    return not task.reads_end
-
-
 def measure_of(task: Task) -> Callable[[StateLike, StateLike], jax.Array]:
     """Returns the function of the measures (D,) of a control step of a task.
 
@@ -332,7 +327,7 @@ def measure_of(task: Task) -> Callable[[StateLike, StateLike], jax.Array]:
     other tasks, the descriptor is a mean over the episode, and the measure is the state
     descriptor.
     """
-    if averages(task):
+    if not task.reads_end:
         return lambda before, after: after.info["state_descriptor"]
 
     def velocity(before: Any, after: Any) -> jax.Array:

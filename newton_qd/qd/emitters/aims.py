@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from newton_qd.qd.emitters.whitening import Whitening
 from newton_qd.qd.scoring.rollout import Policy
 from newton_qd.qd.scoring.task import Task
 from newton_qd.types import Action, PyTree, RNGKey, StateLike
@@ -166,10 +167,9 @@ class ConditionedPolicy:
     @functools.cached_property
     def _bias(self) -> np.ndarray:
         """Places of the first layer's bias in a vector of weights."""
-        with jax.ensure_compile_time_eval():
-            places = jnp.arange(self.policy.size, dtype=jnp.float32)
-            layers = self.policy.unravel(places)["params"]
-            return np.asarray(layers["Dense_0"]["bias"]).astype(np.int32)
+        bias = Whitening.of(self.policy).bias
+        assert bias is not None  # of a perceptron
+        return bias
 
     @property
     def size(self) -> int:
