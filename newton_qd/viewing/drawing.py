@@ -241,19 +241,13 @@ def _travels(system: System) -> bool:
     Then its torso floats or slides, and something that is driven moves with it. The
     torso of an arm may be an object that it pushes.
     """
-    parents = [int(parent) for parent in system.parent]
-
-    def root(body: int) -> int:
-        return body if parents[body] < 0 else root(parents[body])
-
-    driven = np.flatnonzero(np.isin(system.v_start, system.control_dof))
-    own = root(system.torso)
-    if own not in {root(int(body)) for body in driven}:
+    roots, driven = system.roots, np.isin(system.v_start, system.control_dof)
+    if roots[system.torso] not in roots[driven]:
         return False
     body, kinds = system.torso, set()
     while body >= 0:
         kinds.add(int(system.joint_kind[body]))
-        body = parents[body]
+        body = int(system.parent[body])
     return kinds != {int(JointKind.REVOLUTE)}
 
 
@@ -271,18 +265,6 @@ def _bounds(system: System, shapes: tuple[DrawnShape, ...]) -> tuple[np.ndarray,
     low = (np.array(places) - reaches).min(axis=0)
     high = (np.array(places) + reaches).max(axis=0)
     return (low + high) / 2, float(np.linalg.norm(high - low) / 2)
-
-
-def system_builder(system: System) -> tuple[newton.ModelBuilder, ...]:
-    """Returns Newton's builder of the robot and, if there is one, of the scene.
-
-    Bodies of the first are in the order of the system.
-
-    Raises:
-        RobotDescriptionError: A URDF file is malformed.
-        OSError: A URDF file cannot be read.
-    """
-    return tuple(_builder(system, path, floats) for path, floats in _files(system))
 
 
 def _files(system: System) -> list[tuple[str, bool]]:
