@@ -76,7 +76,7 @@ def test_shares_of_a_batch_that_do_not_fit_are_refused() -> None:
         (
             "me-gradient",
             {"shortest": 3.0},
-            "shortest, longest: got .* 0 < shortest <= long",
+            "longest: got 0.5; allowed: finite numbers from 3.0",
         ),
         ("me-actor-critic", {"worlds": 0}, "worlds: got 0; allowed: .* from 1"),
         (

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import jax
@@ -10,7 +9,6 @@ import jax.numpy as jnp
 from qdax.core.emitters.emitter import Emitter
 
 from newton_qd import checks
-from newton_qd.checks import message
 from newton_qd.gradients.exact import DirectionalGradient
 from newton_qd.qd.emitters.cells import draw_cells, empty_targets, nearest_cells
 from newton_qd.types import ExtraScores, PyTree, Repertoire
@@ -64,12 +62,8 @@ class GradientLineEmitter(Emitter):
         checks.function("gradient", gradient, "a function, such as Episode.directional")
         for name, value in (("parents", parents), ("branches", branches)):
             checks.integer(name, value, most=None)
-        for name, value in (("shortest", shortest), ("longest", longest)):
-            checks.number(name, value, above=0)
-        if not 0 < shortest <= longest < math.inf:
-            given = (shortest, longest)
-            allowed = "0 < shortest <= longest, finite"
-            raise ValueError(message("shortest, longest", given, allowed))
+        checks.number("shortest", shortest, above=0)
+        checks.number("longest", longest, least=shortest)
         checks.number("steered", steered, least=0, most=1)
         self._gradient = gradient
         self._parents = parents
