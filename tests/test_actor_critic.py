@@ -357,6 +357,7 @@ def test_bad_numbers_are_refused(changes: dict[str, Any], message: str) -> None:
         ({"window": 0}, "window: got 0; allowed: .* from 1"),
         ({"batches": 21}, r"batches: got 21; .*at most worlds \* window = 20"),
         ({"clip": 0.0}, "clip: got 0.0; allowed: finite .*above 0"),
+        ({"critic": (8, 0)}, r"critic\[1\]: got 0; allowed: integers from 1"),
         ({"noise": -1.0}, "noise: got -1.0; allowed: .* from 0"),
         ({"trace": 2.0}, "trace: got 2.0; allowed: .* from 0 to 1"),
         ({"actor_trace": 2.0}, "actor_trace: got 2.0; allowed: .* from 0 to 1"),
@@ -370,3 +371,5 @@ def test_bad_settings_are_refused(changes: dict[str, Any], message: str) -> None
 def test_settings_of_a_wrong_type_are_refused() -> None:
     with pytest.raises(TypeError, match="whiten: got 'no'; allowed: True, False"):
         method(whiten="no")
+    with pytest.raises(TypeError, match="critic: got 8; allowed: a tuple of integers"):
+        method(critic=8)

@@ -61,6 +61,10 @@ class ActorCriticSettings:
             ValueError: A value is out of its range.
         """
         checks.flag("whiten", self.whiten)
+        allowed = "a tuple of integers"
+        checks.instance("critic", self.critic, (tuple, list), allowed)
+        for index, width in enumerate(self.critic):
+            checks.integer(f"critic[{index}]", width)
         object.__setattr__(self, "critic", tuple(self.critic))
         for name in ("worlds", "window", "epochs", "batches"):
             checks.integer(name, getattr(self, name), most=None)
