@@ -95,6 +95,14 @@ def test_bad_config_files(tmp_path: Path, text: str, message: str) -> None:
     assert str(path) in str(caught.value)
 
 
+def test_equal_settings_have_equal_hashes() -> None:
+    one, other = (
+        EvolveConfig(env_options={"material": {"friction": friction}})  # pyright: ignore[reportArgumentType]
+        for friction in (1, 1.0)
+    )
+    assert one == other and hash(one) == hash(other)
+
+
 def test_missing_config_file(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"cannot read .*No such file"):
         read_config(tmp_path / "config.json")

@@ -203,7 +203,7 @@ class Table(dict[str, Any]):
     """A table inside of the settings, which are hashable. It is never changed."""
 
     def __hash__(self) -> int:  # type: ignore[override]
-        return hash(json.dumps(self, sort_keys=True))
+        return hash(frozenset(self.items()))
 
 
 def plain_value(name: str, value: Any) -> Any:
