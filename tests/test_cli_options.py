@@ -305,15 +305,19 @@ def test_modules_that_cannot_be_imported(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "broken_tasks.py").write_text("import newton_qd\n1 / 0\n")
     (tmp_path / "poor_tasks.py").write_text("import no_such_package\n")
+    (tmp_path / "random.py").write_text("")
     for name, text in (
         ("no_such_tasks", "got 'no_such_tasks', which cannot be found; allowed: a mod"),
         ("no.such.tasks", "got 'no.such.tasks', which cannot be found"),
         ("missing.py", "which cannot be found"),
         ("broken_tasks", "whose import fails with ZeroDivisionError: division by zero"),
+        ("broken_tasks.py", "whose import fails with ZeroDivisionError"),
         ("poor_tasks", "ModuleNotFoundError: No module named 'no_such_package'"),
+        ("random.py", "which has the name of Python's own module random"),
     ):
         assert cli.main(["algorithms", "--module", name]) == cli.BAD_ARGUMENTS
         assert text in capsys.readouterr().err
+        assert "broken_tasks" not in sys.modules
     assert cli.main(["evolve", "my_ant"]) == cli.BAD_ARGUMENTS
     assert "registers it, add --module NAME" in capsys.readouterr().err
 

@@ -58,16 +58,24 @@ def _import(name: str) -> None:
     """Imports one module.
 
     Raises:
-        ConfigError: It cannot be found.
+        ConfigError: It cannot be found, or has the name of a module of Python.
         ModuleNotFoundError: A module that it imports cannot be found.
     """
     path = Path(name)
     if path.suffix == ".py" and path.is_file():
+        if path.stem in sys.stdlib_module_names:
+            why = f"which has the name of Python's own module {path.stem}"
+            allowed = "a file with a name of its own, like tasks.py"
+            raise ConfigError(message("--module", name, allowed, why=why))
         spec = importlib.util.spec_from_file_location(path.stem, path)
         assert spec is not None and spec.loader is not None
         module = importlib.util.module_from_spec(spec)
         sys.modules[path.stem] = module
-        spec.loader.exec_module(module)
+        try:
+            spec.loader.exec_module(module)
+        except BaseException:  # as Python's import does
+            del sys.modules[path.stem]
+            raise
         return
     try:
         importlib.import_module(name)
