@@ -39,6 +39,19 @@ def limit(device: Any = None) -> int | None:
     return min(found, default=None)
 
 
+def limit_here() -> int | None:
+    """Returns the memory [bytes] of the device on which JAX makes new arrays.
+
+    Within ``jax.default_device(...)``, it may be another one than JAX's own choice.
+    ``None``: nobody says.
+    """
+    import jax
+
+    with jax.ensure_compile_time_eval():  # also while a function is traced
+        (device,) = jax.device_put(0.0).devices()
+    return limit(device)
+
+
 def check(
     name: str, value: object, needed: int, most: int | None, error: Error = ValueError
 ) -> None:

@@ -60,6 +60,7 @@ def test_a_tame_system_is_usable_throughout(tmp_path: Path) -> None:
     assert all(row.worst_cosine > 1 - 1e-9 for row in report.horizons)
     assert all(abs(row.bias) < 5 * row.bias_error + 1e-9 for row in report.horizons)
     assert 1.0 < report.growth < 1.2
+    assert report.plot()._repr_png_().startswith(b"\x89PNG")
     report.write(tmp_path / "out")
     names = {path.name for path in (tmp_path / "out").iterdir()}
     assert names == {"horizons.csv", "contacts.csv", "report.txt", "gradients.png"}

@@ -24,6 +24,7 @@ LAYERS = (
     "checks",
     "real_numbers",
     "errors",
+    "figure",
     "files",
     "memory",
     "moved",
@@ -76,8 +77,8 @@ LEAF_HOMES = ("adapters/", "qd/", "viewing/", "compat/", "cli/")
 HOMES["brax"] = ("adapters/brax",)
 HOMES["gymnasium"] = ("adapters/gymnasium",)
 HOMES["torch"] = ("adapters/torch",)
-# the gradient doctor's report draws itself
-HOMES["matplotlib"] = (*LEAF_HOMES, "gradients/report.py")
+# the gradient doctor's report draws itself, for notebooks, too
+HOMES["matplotlib"] = (*LEAF_HOMES, "figure.py")
 # Never loaded by `import newton_qd`.
 HEAVY = {
     "brax",

@@ -102,6 +102,10 @@ def test_what_is_no_archive_is_refused() -> None:
     key = jax.random.key(0)
     with pytest.raises(TypeError, match=r"archive: got .*; allowed: an Archive, or a"):
         reevaluate(np.zeros(4), scoring([SOUND]), key, offset=0.0)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="key: got 0; allowed: one key"):
+        reevaluate(archive(1), scoring([SOUND]), 0, offset=0.0)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="score: got 3; allowed: a scoring function"):
+        reevaluate(archive(1), 3, key, offset=0.0)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="archive: got no elites; allowed: one"):
         reevaluate(archive(0), scoring([SOUND]), key, offset=0.0)
     with pytest.raises(ValueError, match="reevaluations: got 0; allowed: integers"):

@@ -14,7 +14,7 @@ from newton_qd.errors import require_extra
 from newton_qd.files import write_atomically
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from newton_qd.figure import NotebookFigure
 
 AGREEMENT = 0.999
 """Smallest cosine with central differences of a correct gradient [-]."""
@@ -263,16 +263,16 @@ class GradientReport:
         self.plot().savefig(picture, dpi=120, format="png")
         write_atomically(folder / "gradients.png", picture.getvalue())
 
-    def plot(self) -> Figure:
+    def plot(self) -> NotebookFigure:
         """Draws norm, agreement and deviation over the horizon.
 
         Raises:
             MissingExtra: matplotlib is not installed.
         """
         require_extra("matplotlib", "viz")
-        from matplotlib.figure import Figure
+        from newton_qd.figure import NotebookFigure
 
-        figure = Figure(figsize=(11, 4), layout="constrained")
+        figure = NotebookFigure(figsize=(11, 4), layout="constrained")
         left, middle, right = figure.subplots(1, 3)
         steps = [row.steps for row in self.horizons]
         left.plot(steps, [row.norm for row in self.horizons], "o-", label="median")

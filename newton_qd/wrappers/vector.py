@@ -45,7 +45,7 @@ class VectorWrapper(Wrapper):
             allowed = "environments of one world (jax.vmap nests batches)"
             raise ValueError(message("env", given, allowed))
         if batch_size > _MANY:
-            needed, most = batch_size * state_bytes(env), memory.limit(jax.devices()[0])
+            needed, most = batch_size * state_bytes(env), memory.limit_here()
             memory.check("batch_size", batch_size, needed, most)
         super().__init__(env)
         self.batch_size = int(batch_size)

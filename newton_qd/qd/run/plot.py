@@ -112,7 +112,7 @@ def plot_archive(
         MissingExtra: matplotlib is not installed.
     """
     require_extra("matplotlib", "viz")
-    from newton_qd.qd.run.figure import NotebookFigure
+    from newton_qd.figure import NotebookFigure
 
     figure = NotebookFigure(figsize=(9.0, 8.0), layout="constrained")
     figure.suptitle(title)

@@ -38,7 +38,7 @@ def curves_figure(
     require_extra("matplotlib", "viz")
     from matplotlib.ticker import EngFormatter
 
-    from newton_qd.qd.run.figure import NotebookFigure
+    from newton_qd.figure import NotebookFigure
 
     figure = NotebookFigure(figsize=(12.0, 4.0), layout="constrained")
     figure.suptitle(f"{config.env_name}: {config.algorithm}, seed {config.seed}")

@@ -12,6 +12,7 @@ import numpy as np
 
 from newton_qd import checks
 from newton_qd.checks import Fact, message
+from newton_qd.envs.inputs import require_key
 from newton_qd.qd.run import quality
 from newton_qd.types import ScoringFunction
 
@@ -90,10 +91,13 @@ def reevaluate(
         The metrics; ``None`` if ``stop`` returned true.
 
     Raises:
-        TypeError: ``archive`` is no archive.
-        ValueError: It has no elite, or several fitnesses for each; ``reevaluations`` is
-            no integer from 1; or ``offset`` is no finite number.
+        TypeError: ``archive`` is no archive, ``score`` no function, or ``key`` no key.
+        ValueError: The archive has no elite, or several fitnesses for each; ``key`` is
+            several keys; ``reevaluations`` is no integer from 1; or ``offset`` is no
+            finite number.
     """
+    checks.function("score", score, "a scoring function")
+    require_key("key", key)
     checks.integer("reevaluations", reevaluations)
     checks.number("offset", offset)
     best = corrected_fitnesses(archive, score, key, reevaluations, stop)

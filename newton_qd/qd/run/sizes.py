@@ -6,8 +6,6 @@ import itertools
 import math
 from typing import Any
 
-import jax
-
 from newton_qd import memory
 from newton_qd.qd.config import ConfigError, EvolveConfig
 from newton_qd.qd.scoring.networks import policy_for
@@ -36,9 +34,9 @@ def check_memory(config: EvolveConfig, task: Task, device: Any) -> None:
     needed = (3 * config.batch_size + cells) * policy
     if config.batch_size > _LARGE:
         needed += config.batch_size * state_bytes(task.env)
-    where = jax.devices()[0] if device is None else device
     given = (config.batch_size, config.hidden, cells)
-    name, most = "batch_size, hidden, cells", memory.limit(where)
+    name = "batch_size, hidden, cells"
+    most = memory.limit_here() if device is None else memory.limit(device)
     memory.check(name, given, needed, most, ConfigError)
 
 
