@@ -16,6 +16,10 @@ from .cpp.operators import add, mul, sub  # noqa: F401
 from .structs import Model, Offsets, Scratch
 
 PARAMETRIC = wp.constant(parametric)
+# Scale of the stiffness of contacts in the place of 0: no digit of a motion shows it.
+# At 0 itself, impulses and the width over which they are clipped are all 0, so that the
+# gradient could not tell a contact that lifts off from one that stays.
+LEAST_STIFFNESS = wp.constant(scalar(1.0e-20))
 
 
 @wp.func
@@ -144,6 +148,7 @@ def load_parameters(
         value = read_input(x, at + m.inputs.friction, size, count)
         store(sc.parameter, out + m.parameters.friction, value)
         scale = read_input(x, at + m.inputs.contact_stiffness_scale, size, count)
+        scale = choose(scale, scale, uniform(LEAST_STIFFNESS))
         value = m.contact_stiffness * scale
         store(sc.parameter, out + m.parameters.contact_stiffness, value)
         # scales of 1 give the model's total mass to the last digit
