@@ -201,9 +201,12 @@ def test_other_joints_need_no_bounds(kind: str, limit: str, tmp_path: Path) -> N
 
 SLIPS = {
     '<dynamics dampng="0.5"/>': "<dynamics>: attribute: got dampng, .*: damping, fric",
+    '<dynamics dmpng="0.5"/>': "<dynamics>: attribute: got dmpng, .*: damping, fric",
     '<orgin xyz="1 0 0"/>': "<orgin>: element: got <orgin>, .*: <origin>, <parent>",
     '<AXIS xyz="0 0 1"/>': "<AXIS>: element: got <AXIS>, .*: .*<axis>",
     '<origin xzy="1 0 0"/>': "<origin>: attribute: got xzy, .*allowed: xyz, rpy",
+    '<origin quat="1 0 0 0"/>': "<origin>: attribute: got quat, .*allowed: xyz, rpy",
+    '<origin euler="0 0 90"/>': "<origin>: attribute: got euler, .*allowed: xyz, rpy",
 }
 
 

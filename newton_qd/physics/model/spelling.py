@@ -58,9 +58,16 @@ _ATTRIBUTES = {
 }
 """Attributes of each element."""
 
+_POSES = ("origin", "axis")
+"""Elements in which an attribute of another form, such as ``quat``, would be lost."""
+
 
 def misspelt(reader: XmlReader) -> tuple[str, ...]:
-    """Returns a text about each name in links and joints that is almost a known one."""
+    """Returns a text about each name in links and joints that is almost a known one.
+
+    Of a pose, each unknown attribute has a text, unless it has a prefix, such as
+    ``drake:``.
+    """
     return tuple(
         text
         for tag in ("link", "joint")
@@ -73,7 +80,8 @@ def _inside(reader: XmlReader, element: ElementTree.Element) -> Iterator[str]:
     """Yields the texts about an element and those inside it."""
     known = _ATTRIBUTES.get(element.tag, ())
     for name in element.keys():
-        if _almost(name, known):
+        unread = element.tag in _POSES and name not in known and ":" not in name
+        if unread or _almost(name, known):
             yield str(_ignored(reader, element, "attribute", name, known))
     known = _CHILDREN.get(element.tag, ())
     for child in element:
