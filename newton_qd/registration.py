@@ -16,17 +16,21 @@ ENVIRONMENT = "a subclass of newton_qd's Env, or a function that makes an enviro
 """What a base may be."""
 
 
-def check_names(env_name: object, base_name: object) -> None:
+def check_names(env_name: object, base_name: object, replace: bool) -> None:
     """Checks the names of ``register``.
 
     Raises:
+        TypeError: ``replace`` is not True or False.
         ValueError: A name is not text, is empty, is in use, or has characters that are
             not allowed.
     """
     # A results folder has the name of the environment, so it must not be a path.
     checks.identifier("env_name", env_name)
-    if env_name in tasks.ENVIRONMENTS:
-        allowed = f"any name but {listed(tuple(tasks.ENVIRONMENTS))}"
+    checks.flag("replace", replace)
+    if env_name in (tasks.SUITE if replace else tasks.ENVIRONMENTS):
+        allowed = "a new name, or replace=True"
+        if env_name in tasks.SUITE:
+            allowed = f"any name but {listed(sorted(tasks.SUITE))}"
         raise ValueError(message("env_name", env_name, allowed, why="which is taken"))
     # Every table reads every spec, so one wrong spec would break all tables.
     checks.identifier("base_name", base_name, optional=True)

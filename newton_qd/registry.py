@@ -72,6 +72,7 @@ def register(
     descriptor_extractor: DescriptorExtractor | None = None,
     reward_offset: float | None = None,
     robot: RobotSpec | None = None,
+    replace: bool = False,
     **options: object,
 ) -> None:
     """Adds an environment to the names that ``create`` knows.
@@ -91,6 +92,8 @@ def register(
         robot: Spec of the robot inside. ``base`` gets it if it has an argument
             ``robot``; ``FEET_NAMES`` and ``COG_NAMES`` use it. ``None``: the robot
             ``base_name`` of the suite, if there is one.
+        replace: Whether ``env_name`` may be a name that was registered before, as in a
+            notebook whose cells run again. Environments of the suite stay.
         **options: Keyword arguments of ``base``. ``create`` may replace them.
 
     Raises:
@@ -99,7 +102,7 @@ def register(
         ValueError: The name is in use, a name is not text, is empty or has characters
             that are not allowed, or ``reward_offset`` is not finite.
     """
-    check_names(env_name, base_name)
+    check_names(env_name, base_name, replace)
     checks.function("base", base, "a class or a function")
     check_class(base)
     allowed = "a function of (data, mask)"
@@ -234,7 +237,8 @@ def _base(
 
     Raises:
         TypeError: ``material`` is not a ``Material``, an option is unknown, the robot
-            is missing, or a method does not return an array.
+            is missing or not the one that is made, or a method does not return an
+            array.
         ValueError: A method returns a wrong shape.
     """
     allowed = "newton_qd.robots.Material"
@@ -249,7 +253,23 @@ def _base(
         why = f"which {env_name!r} makes"
         raise TypeError(message("base", env, ENVIRONMENT, why=why))
     check_methods(env)
+    if "robot" not in options:
+        _require_robot(env_name, spec, env)
     return env if material is None else env.with_material(material)
+
+
+def _require_robot(env_name: str, spec: EnvironmentSpec, env: Env) -> None:
+    """Checks that the robot of ``register`` is the one inside the environment.
+
+    Raises:
+        TypeError: The base makes another robot, so it does not take the given one.
+    """
+    made = getattr(env.unwrapped, "robot", None)
+    if spec.robot is None or made is None or made == spec.robot:
+        return
+    why = f"and {env_name!r} makes its own robot {made.name!r}"
+    allowed = "the robot that base makes, or a base with an argument robot"
+    raise TypeError(message("robot", spec.robot, allowed, why=why))
 
 
 def _require_keywords(

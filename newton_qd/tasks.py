@@ -351,3 +351,6 @@ ENVIRONMENTS: dict[str, EnvironmentSpec] = {
         Quadruped, "quadruped", (0.14, None), _YARD, NoForwardRewardWrapper
     ),
 }
+
+SUITE = frozenset(ENVIRONMENTS)
+"""Names of the suite. ``register`` adds names, and may replace these others only."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import runpy
 import sys
 from pathlib import Path
@@ -327,9 +328,17 @@ def test_registered_algorithms_have_names_of_their_own() -> None:
     me = algorithm_named("me")
     with pytest.raises(ValueError, match=r"spec\.name: got 'me', which is taken"):
         register_algorithm(me)
+    with pytest.raises(ValueError, match=r"spec\.name: got 'me', which is taken"):
+        register_algorithm(me, replace=True)
     with pytest.raises(TypeError, match="spec: got 'me'; allowed: an AlgorithmSpec"):
         register_algorithm("me")  # type: ignore[arg-type]
     assert algorithms() == ALGORITHMS
+    register_algorithm(dataclasses.replace(me, name="mine"))
+    with pytest.raises(ValueError, match="'mine', which is taken; allowed: a new name"):
+        register_algorithm(dataclasses.replace(me, name="mine"))
+    newer = dataclasses.replace(me, name="mine")
+    register_algorithm(newer, replace=True)
+    assert algorithm_named("mine") is newer
 
 
 def test_help_has_the_options_of_an_algorithm(

@@ -129,6 +129,11 @@ def test_register(rows: None) -> None:
             r"wrappers\[0\].wrapper: got 3; allowed: a class or a function",
         ),
         (
+            {"wrappers": [tasks.WrapperSpec(Hopper)]},
+            TypeError,
+            r"wrappers\[0\].wrapper: got <class .*Hopper'>; allowed: wrappers, such",
+        ),
+        (
             {"wrappers": [tasks.WrapperSpec(FeetContactWrapper, 3)]},  # pyright: ignore
             TypeError,
             r"wrappers\[0\].options: got 3; allowed: a mapping",
@@ -165,6 +170,8 @@ def test_a_base_makes_an_environment(rows: None) -> None:
             newton_qd.register("mine", base)  # pyright: ignore
     with pytest.raises(TypeError, match=f"^base: got .*, which makes 3; {allowed}"):
         newton_qd.register("mine", lambda **k: 3)  # pyright: ignore
+    with pytest.raises(TypeError, match=f"^base: got .*, which makes 4; {allowed}"):
+        newton_qd.register("mine", lambda size: size, size=4)  # pyright: ignore
     assert "mine" not in newton_qd.registered_envs()
     newton_qd.register("later", lambda size: size)  # needs an argument of create
     with pytest.raises(
@@ -220,3 +227,28 @@ def test_a_registered_wrapper_takes_the_name() -> None:
         words = rf"arguments of {wrapper.__name__}: got .*; allowed: \(env, env_name"
         with pytest.raises(TypeError, match=words):
             newton_qd.register("unnamed", Hopper, wrappers=(spec,))
+
+
+def test_own_names_can_be_replaced(rows: None) -> None:
+    newton_qd.register("mine", Ant)
+    with pytest.raises(ValueError, match="'mine', which is taken; allowed: a new name"):
+        newton_qd.register("mine", Hopper)
+    newton_qd.register("mine", Hopper, replace=True)
+    assert newton_qd.create("mine").observation_size == 11
+    with pytest.raises(
+        ValueError, match="'ant', which is taken; allowed: any name but"
+    ):
+        newton_qd.register("ant", Hopper, replace=True)
+    with pytest.raises(TypeError, match="replace: got 2; allowed: True, False"):
+        newton_qd.register("other", Hopper, replace=2)  # type: ignore[arg-type]
+
+
+def test_a_robot_that_the_base_does_not_take_is_refused(rows: None) -> None:
+    weak = dataclasses.replace(
+        ANT, actuators=tuple((joint, 0.5 * gear) for joint, gear in ANT.actuators)
+    )
+    newton_qd.register("weak_ant", Ant, robot=weak)  # Ant has no argument robot
+    with pytest.raises(TypeError, match=r"robot: got .*makes its own robot 'ant'"):
+        newton_qd.create("weak_ant")
+    newton_qd.register("same_ant", Ant, robot=ANT)
+    newton_qd.create("same_ant")

@@ -67,12 +67,14 @@ def algorithms() -> tuple[AlgorithmSpec[Any], ...]:
     return (*ALGORITHMS, *_REGISTERED.values())
 
 
-def register_algorithm(spec: AlgorithmSpec[Any]) -> None:
+def register_algorithm(spec: AlgorithmSpec[Any], *, replace: bool = False) -> None:
     """Adds an algorithm to ``evolve``.
 
     Args:
         spec: The algorithm: a name, a function that makes an emitter for QDax, and a
             dataclass of its options.
+        replace: Whether the name may be one that was registered before, as in a
+            notebook whose cells run again. Algorithms of the library stay.
 
     Raises:
         TypeError: ``spec`` is not an ``AlgorithmSpec``, or a field of its options has a
@@ -82,9 +84,12 @@ def register_algorithm(spec: AlgorithmSpec[Any]) -> None:
     checks.instance("spec", spec, AlgorithmSpec, "an AlgorithmSpec")
     checks.text("spec.name", spec.name)
     check_fields(spec.options)
-    taken = [known.name for known in algorithms()]
-    if spec.name in taken:
-        allowed = f"any name but {listed(taken)}"
+    checks.flag("replace", replace)
+    library = [known.name for known in ALGORITHMS]
+    if spec.name in library or (spec.name in _REGISTERED and not replace):
+        allowed = "a new name, or replace=True"
+        if spec.name in library:
+            allowed = f"any name but {listed(library)}"
         why = "which is taken"
         raise ValueError(message("spec.name", spec.name, allowed, why=why))
     _REGISTERED[spec.name] = spec
