@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -142,6 +143,11 @@ def test_the_price_of_scatter() -> None:
     sides = np.asarray(task.limits[1]) - np.asarray(task.limits[0])
     assert np.isclose(chosen.width, 0.5 * np.sqrt(sides.prod() / 16))
     assert chosen.offset == task.reward_offset * config.episode_length
+    # that of one of eight cells in a cube of side 4
+    cube = np.zeros(3), np.full(3, 4.0)
+    task = dataclasses.replace(task, limits=cube, labels=("x", "y", "z"))
+    chosen = scatter_of(config.replace(grid=None, centroids=8), task)
+    assert chosen is not None and np.isclose(chosen.width, 0.5 * 2.0)
     assert scatter_of(SMALL, task) is None
 
 

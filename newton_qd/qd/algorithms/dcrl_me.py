@@ -63,7 +63,8 @@ def _make(context: EmitterContext, options: DCRLMEOptions) -> Any:
     """DCRL-ME: critic and actor depend on the descriptor (Faldor et al. 2024).
 
     Raises:
-        ConfigError: The options do not fit the size of a generation.
+        ConfigError: The options do not fit the size of a generation, or the descriptor
+            has another length than the state descriptor.
     """
     import jax
     import jax.numpy as jnp
@@ -79,6 +80,7 @@ def _make(context: EmitterContext, options: DCRLMEOptions) -> Any:
     from newton_qd.qd.algorithms.network_emitter import OfParameters
 
     config, task = context.config, context.task
+    task.require_length()
     require_buffer(config, options.replay_buffer_size)
     actor = MLPDC(
         layer_sizes=(*config.hidden, task.env.action_size),

@@ -57,6 +57,19 @@ class Task:
     network: Any = None
     episode_length: int = 16
 
+    def __post_init__(self) -> None:
+        """Checks that limits and labels are of the same descriptor.
+
+        Raises:
+            ConfigError: They are not.
+        """
+        shapes = tuple(np.shape(limit) for limit in self.limits)
+        length = len(self.labels)
+        if shapes != ((length,), (length,)):
+            given = Fact(f"{length} names, and limits of shapes {listed(shapes)}")
+            allowed = "one name, one lowest and one highest value for each component"
+            raise ConfigError(message("labels", given, allowed))
+
     @property
     def descriptor_length(self) -> int:
         """Number of components of the descriptor."""
@@ -67,10 +80,29 @@ class Task:
         """Whether the descriptor depends on the end of an episode alone.
 
         Another one counts as a mean over the episode.
+
+        Raises:
+            ConfigError: It has another length than the state descriptor.
         """
+        self.require_length()
         return reads_last(
             self.descriptor_extractor, self.episode_length, self.descriptor_length
         )
+
+    def require_length(self) -> None:
+        """Checks that descriptors are as long as state descriptors.
+
+        An algorithm that compares the two, or steers along them, needs this.
+
+        Raises:
+            ConfigError: They are not.
+        """
+        length = getattr(self.env, "state_descriptor_length", self.descriptor_length)
+        if length != self.descriptor_length:
+            given = Fact(f"descriptors of length {self.descriptor_length}")
+            allowed = f"length {length}, that of the state descriptor, for this "
+            allowed += "algorithm; me, me-gradient and omg-mega take any length"
+            raise ConfigError(message("descriptor_extractor", given, allowed))
 
 
 def make_task(config: EvolveConfig) -> Task:

@@ -1,0 +1,63 @@
+"""Tasks made by hand: names, limits and length of the descriptor."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from point_runs import SMALL, point_task
+
+from newton_qd.qd import ConfigError, EvolveConfig, Task, evolve, make_task
+
+CONFIG = EvolveConfig(
+    env_name="pointmaze",
+    iterations=1,
+    batch_size=16,
+    episode_length=5,
+    hidden=(4,),
+    centroids=8,
+    reevaluations=1,
+)
+
+
+def latent(data: Any, mask: Any) -> Any:
+    """A descriptor (N, 3) of whole episodes of exactly five steps."""
+    seen = (data.state_desc * (1 - mask)[..., None]).reshape(len(mask), -1)
+    return jnp.tanh(seen @ jnp.ones((10, 3)))
+
+
+def task_of(config: EvolveConfig) -> Task:
+    return dataclasses.replace(
+        make_task(config),
+        descriptor_extractor=latent,
+        limits=(-np.ones(3, np.float32), np.ones(3, np.float32)),
+        labels=("a", "b", "c"),
+    )
+
+
+@pytest.mark.parametrize(
+    "name", ["me-actor-critic", "me-conditioned", "cma-maega-actor-critic", "dcrl-me"]
+)
+def test_steering_needs_the_length_of_the_state_descriptor(name: str) -> None:
+    with pytest.raises(ConfigError, match=r"length 3; allowed: length 2, that of"):
+        evolve(CONFIG.replace(algorithm=name), task_factory=task_of, progress=False)
+
+
+def test_map_elites_takes_any_length() -> None:
+    result = evolve(CONFIG, task_factory=task_of, progress=False)
+    assert result.archive.filled.any()
+
+
+@pytest.mark.parametrize("labels", [("left",), ("left", "right", "middle")])
+def test_a_name_for_each_component(labels: tuple[str, ...]) -> None:
+    with pytest.raises(ConfigError, match=r"labels: got \d names, and limits of shape"):
+        dataclasses.replace(point_task(SMALL), labels=labels)
+
+
+def test_limits_of_one_length() -> None:
+    limits = np.zeros(2, np.float32), np.ones(3, np.float32)
+    with pytest.raises(ConfigError, match="labels: got 2 names"):
+        dataclasses.replace(point_task(SMALL), limits=limits)
