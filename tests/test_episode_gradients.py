@@ -352,6 +352,15 @@ def test_an_episode_has_steps(length: Any) -> None:
         make_episode(Line(1.0), None, None, episode_length=length)
 
 
+def test_an_episode_is_no_longer_than_those_of_its_environment() -> None:
+    env = newton_qd.create("pointmaze", 10, action_repeat=3, auto_reset=False)
+    with pytest.raises(ValueError, match="episode_length: got 5; allowed: at most 4"):
+        Episode(env, episode_length=5)
+    Episode(env, episode_length=4)
+    endless = newton_qd.create("pointmaze", None, auto_reset=False)
+    Episode(endless, episode_length=5)
+
+
 def test_what_no_episode_can_be_made_of() -> None:
     """Each error names the argument and what is allowed."""
     line: Any = Line(1.0)

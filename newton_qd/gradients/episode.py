@@ -19,7 +19,7 @@ from newton_qd.envs.inputs import require_key
 from newton_qd.envs.state import select
 from newton_qd.extractors import check_extractor
 from newton_qd.gradients.compiled import compiled_once, without_compiled
-from newton_qd.gradients.episode_input import check_first, check_weights
+from newton_qd.gradients.episode_input import check_first, check_length, check_weights
 from newton_qd.gradients.exact import EpisodeGradient, EpisodeGradients, differentiate
 from newton_qd.gradients.flow import EXACT, GradientOptions, passed_back, scan_keeping
 from newton_qd.gradients.mixed import (
@@ -114,8 +114,8 @@ class Episode:
 
     Raises:
         TypeError: An argument has the wrong type.
-        ValueError: ``episode_length`` is not an integer from 1, or the extractor is for
-            another state descriptor than that of the environment.
+        ValueError: ``episode_length`` is not an integer from 1, or above that of the
+            environment, or the extractor is for another state descriptor.
     """
 
     env: Environment
@@ -139,6 +139,7 @@ class Episode:
             optional = name != "unravel"
             checks.function(name, getattr(self, name), needed, optional=optional)
         check_extractor(self.env, self.descriptor_extractor)
+        check_length(self.env, self.episode_length)
         checks.instance("options", self.options, GradientOptions, "GradientOptions")
         checks.flag("transitions", self.transitions)
 

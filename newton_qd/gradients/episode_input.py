@@ -10,7 +10,9 @@ import numpy as np
 
 from newton_qd.checks import Fact, message
 from newton_qd.envs.base import Env
-from newton_qd.types import Genotype
+from newton_qd.types import Environment, Genotype
+from newton_qd.wrappers.base import outermost
+from newton_qd.wrappers.episode import EpisodeWrapper
 
 
 def check_first(env: Any, first: Any, described: bool) -> None:
@@ -42,6 +44,21 @@ def check_first(env: Any, first: Any, described: bool) -> None:
             "QD tasks, as ant_uni, or descriptor_extractor=None without transitions"
         )
         raise ValueError(message("env", given, allowed))
+
+
+def check_length(env: Environment, episode_length: int) -> None:
+    """Checks that the environment does not end episodes before.
+
+    Raises:
+        ValueError: It does.
+    """
+    limit = outermost(env, EpisodeWrapper) if isinstance(env, Env) else None
+    if limit is None:
+        return
+    most = -(-limit.episode_length // limit.action_repeat)
+    if episode_length > most:
+        allowed = f"at most {most}, the steps after which the environment ends"
+        raise ValueError(message("episode_length", episode_length, allowed))
 
 
 def check_weights(genotypes: Genotype, weights: Any) -> None:
