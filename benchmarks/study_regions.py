@@ -24,8 +24,8 @@ from newton_qd.qd.run import quality
 
 
 @functools.cache
-def places(task_name: str, seed: int) -> np.ndarray:
-    """Returns the mean of the components of each cell's centre (cells,), in 0 to 1."""
+def cells_of(task_name: str, seed: int) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
+    """Returns the centres of a run's cells (cells, D), and the limits, two of (D,)."""
     from newton_qd.qd import EvolveConfig, make_task
     from newton_qd.qd.run.search import Search
 
@@ -33,8 +33,12 @@ def places(task_name: str, seed: int) -> np.ndarray:
     config = EvolveConfig(env_name=task_name, algorithm="me", seed=seed, **settings)
     task = make_task(config)
     search = Search(config.resolve(task.descriptor_length), task)
-    low, high = np.asarray(task.limits)
-    centres = np.asarray(search.empty().repertoire.centroids)
+    return np.asarray(search.empty().repertoire.centroids), task.limits
+
+
+def places(task_name: str, seed: int) -> np.ndarray:
+    """Returns the mean of the components of each cell's centre (cells,), in 0 to 1."""
+    centres, (low, high) = cells_of(task_name, seed)
     return ((centres - low) / (high - low)).mean(axis=1)
 
 
