@@ -33,15 +33,17 @@ from newton_qd.tasks import ENVIRONMENTS
 PAGE = Path(__file__).with_name("environments.md")
 EVOLVE_PAGE = Path(__file__).with_name("evolve.md")
 
+SEEN = "entries of the observation", "meaning"
+
 HEAD = """# Environments
 
 This page lists the observation, actions, reward, metrics and options of every
 environment of `newton_qd.create`. It is generated from the code by `docs/generate.py`.
 
 A dash means that there is no state descriptor. The first table of an environment is
-its `observation_layout`: the entries of the observation. Options are keyword arguments
-of `create`. [Differences](differences.md) compares these environments with those of
-QDax.
+its `observation_layout`: the entries of the observation. A task without such a table
+has the observation of its robot. Options are keyword arguments of `create`.
+[Differences](differences.md) compares these environments with those of QDax.
 
 | name | robot or task | observation | action | step [s] | state descriptor |
 |---|---|---|---|---|---|
@@ -82,7 +84,7 @@ def _options(base: type) -> list[tuple[object, ...]]:
     return rows
 
 
-def _observation(env: PhysicsEnv | PointMaze) -> list[tuple[object, ...]]:
+def _observation(env: Any) -> list[tuple[object, ...]]:
     rows, first = [], 0
     for block, size in env.observation_layout:
         last = first + size - 1
@@ -204,7 +206,7 @@ def _metrics(env: PhysicsEnv | PointMaze) -> str:
 def _tables(env: PhysicsEnv | PointMaze) -> str:
     """What all environments of one base share."""
     options = _table(("option", "default", "meaning"), _options(type(env)))
-    seen = _table(("entries of the observation", "meaning"), _observation(env))
+    seen = _table(SEEN, _observation(env))
     return "".join(
         "\n" + text for text in (seen, _actions(env), _metrics(env), options)
     )
@@ -214,6 +216,7 @@ def page() -> str:
     """Returns the text of the page."""
     summary, sections = [], ""
     described: dict[type, str] = {}
+    layouts: dict[str, object] = {}
     for name in newton_qd.registered_envs():
         env = newton_qd.create(name, auto_reset=False)
         base = env.unwrapped
@@ -228,6 +231,9 @@ def page() -> str:
             sections += _descriptor(name, cast(QDEnv, env))
         if known == name and isinstance(base, PhysicsEnv | PointMaze):
             sections += _tables(base)
+            layouts[known] = base.observation_layout
+        elif layouts.get(known) != getattr(env, "observation_layout", None):
+            sections += f"\n{_table(SEEN, _observation(env))}"
     rows = "".join(_table(row, []).splitlines(keepends=True)[0] for row in summary)
     return HEAD + rows + sections
 

@@ -42,6 +42,8 @@ def test_nearest_points(x64: None, folder: Path) -> None:
     exact = nearest(at, along, half)
     # about touching: deeper inside, the distance is regularised more
     near = np.abs(exact - radius - system.contact_radius[foot]) < 0.1
+    reach = radius + system.contact_radius[foot]
+    touching = exact < reach
     found = Measured(folder, system, foot, at, along)
     excess = (found.distance + radius - exact)[near]
     smoothing = system.robot.material.smoothing
@@ -51,6 +53,9 @@ def test_nearest_points(x64: None, folder: Path) -> None:
     assert near.sum() > 300
     assert excess.min() > -1e-6  # grid of the brute force, SHORTEST
     assert excess.max() < 0.3 * smoothing
+    deep = (found.distance + radius - exact)[touching]
+    report("the same where the axes nearly cross [m]", deep.max())
+    assert 0.3 * smoothing < deep.max() < 1.4 * smoothing
     assert np.median(excess) < 1e-5
     np.testing.assert_allclose(np.linalg.norm(found.normal, axis=1)[near], 1, atol=1e-9)
     assert np.abs(found.share).max() <= 1.0
