@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import os
 import stat
 from collections.abc import Callable, Iterator
@@ -44,8 +45,10 @@ def builds(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
 
 def load(robot: RobotSpec) -> System:
     """What ``load_system`` returns in a new process."""
-    build._cached_system.cache_clear()
-    return build.load_system(robot)
+    with pytest.MonkeyPatch.context() as patch:  # other tests hold systems of this one
+        empty = functools.cache(build._cached_system.__wrapped__)
+        patch.setattr(build, "_cached_system", empty)
+        return build.load_system(robot)
 
 
 def assert_equal(left: System, right: System) -> None:
