@@ -171,7 +171,8 @@ def test_values_inside_of_a_window_count() -> None:
 def test_the_age_of_a_world_begins_again_after_a_fall() -> None:
     right = jnp.array([1.0, 0.0])
     settings = dataclasses.replace(SETTINGS, window=10, noise=0.0)
-    way = ActorCritic(PointEnv(), lambda *_: right, reading, LENGTH, settings)
+    beyond = 2 * right  # clipped to 1
+    way = ActorCritic(PointEnv(), lambda *_: beyond, reading, LENGTH, settings)
     first = jax.vmap(PointEnv().reset)(jax.random.split(jax.random.key(0), 4))
     start = way.begin(jax.random.key(1), jnp.zeros(SIZE), jnp.ones(3), first)
     assert start.age.tolist() == [0, 5, 10, 15]
@@ -181,6 +182,22 @@ def test_the_age_of_a_world_begins_again_after_a_fall() -> None:
     assert not failed and after.age.tolist() == [3, 3, 3, 3]
     place = first.pipeline_state + 3 * 0.3 * right
     np.testing.assert_allclose(after.worlds.pipeline_state, place, atol=1e-5)
+
+
+class Blind(PointEnv):
+    """Its observations are no numbers right of the middle."""
+
+    def _state(self, position: jax.Array, reward: jax.Array) -> Any:
+        state = super()._state(position, reward)
+        seen = jnp.where(position[0] > 0.5, jnp.nan, state.obs)
+        return dataclasses.replace(state, obs=seen)
+
+
+def test_the_scale_is_that_of_observations_that_are_numbers() -> None:
+    way = dataclasses.replace(method(), env=Blind())
+    first = jax.vmap(Blind().reset)(jax.random.split(jax.random.key(0), 4))
+    for found in compiled(way.scale)(jax.random.key(2), first):
+        assert np.isfinite(found).all()
 
 
 @pytest.mark.slow
@@ -296,7 +313,9 @@ def test_a_single_copy_is_the_actor_itself() -> None:
 
 
 def test_steered_actors_begin_again() -> None:
-    aims = np.stack([state.learners.aim for state, *_ in generations(6)])
+    states = [state for state, *_ in generations(6)]
+    assert max(state.learners.age.max() for state in states) < LENGTH
+    aims = np.stack([state.learners.aim for state in states])
     # one of three climbs and keeps its aim; the others follow directions in turn
     np.testing.assert_array_equal(aims[:, 0], np.tile([1.0, 0.0, 0.0], (6, 1)))
     np.testing.assert_allclose(np.linalg.norm(aims[:, 1:, 1:], axis=2), 1, rtol=1e-6)
@@ -333,6 +352,7 @@ def test_lost_gradients_are_told() -> None:
     state, offspring, told = generations(2, broken)[-1]
     np.testing.assert_array_equal(told["overflowed"], 4)
     assert np.isfinite(offspring).all() and np.isfinite(state.snapshots).all()
+    assert not state.learners.age.any(), "worlds restart"
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from qdax.core.containers.mapelites_repertoire import compute_euclidean_centroids
+from qdax.core.emitters.emitter import Emitter
 
+from newton_qd.qd.emitters.annealed import OnAnnealedRepertoire
 from newton_qd.qd.emitters.annealed_repertoire import AnnealedRepertoire
 
 CELLS = (4, 3)
@@ -104,6 +106,32 @@ def test_agrees_with_pyribs(x64: None) -> None:
     np.testing.assert_array_equal(np.asarray(found.genotypes)[cells], held["solution"])
 
 
+class Watching(Emitter):
+    """Its state is the archive that it was shown last."""
+
+    batch_size: Any = 12
+    init: Any = staticmethod(lambda key, repertoire, *rest: repertoire)
+    emit: Any = staticmethod(lambda repertoire, state, key: (repertoire.genotypes, {}))
+    state_update: Any = staticmethod(lambda state, repertoire, *rest: repertoire)
+
+
+def test_an_emitter_is_shown_the_annealed_archive(x64: None) -> None:
+    first, second = batches(2, 20)
+    emitter = OnAnnealedRepertoire(Watching(), learning_rate=RATE, threshold_min=FLOOR)
+    loop, expected = repertoire([first]), repertoire([first, second])
+    genotypes, descriptors, fitnesses = first
+    begun = emitter.init(
+        jax.random.key(0), loop.result, genotypes, fitnesses, descriptors, {}
+    )
+    genotypes, descriptors, fitnesses = second
+    after = emitter.state_update(begun, None, genotypes, fitnesses, descriptors, {})
+    for shown, held in ((begun, loop), (after, expected)):
+        for found in (shown.emitter, shown.repertoire):
+            np.testing.assert_array_equal(found.thresholds, held.thresholds)
+        emitted, _ = emitter.emit(None, shown, jax.random.key(0))
+        np.testing.assert_array_equal(emitted, held.genotypes)
+
+
 def test_what_is_not_finite_never_enters() -> None:
     bad = np.array([np.nan, np.inf, 1.0, 2.0, -np.inf])
     descriptors = np.full((5, 2), 0.1)
@@ -127,6 +155,22 @@ def test_with_rate_one_the_threshold_is_the_mean_of_what_enters() -> None:
         np.array([[0.25], [0.75]], np.float32),
     )
     np.testing.assert_array_equal(found.thresholds, [3, -1])
+
+
+def test_both_archives_can_be_donated() -> None:
+    one = jnp.ones((1, 2))
+    found = AnnealedRepertoire.init(
+        one, one[0, :1], one, one, learning_rate=RATE, threshold_min=FLOOR
+    )
+    leaves = jax.tree.leaves(found)
+    assert len({id(leaf) for leaf in leaves}) == len(leaves)
+
+
+def test_a_fitness_at_the_threshold_does_not_enter() -> None:
+    fitness = np.array([FLOOR])
+    found = repertoire([(np.ones((1, 2)), np.full((1, 2), 0.1), fitness)])
+    assert not (found.fitnesses > -np.inf).any()
+    assert (found.result.fitnesses == FLOOR).sum() == 1
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ import pytest
 from emitter_problems import begin, compiled, values
 from point_runs import SMALL, PointEnv, point_task, run
 
-from newton_qd.gradients import Episode
+from newton_qd.gradients import Episode, EpisodeGradients
 from newton_qd.qd.algorithms.me_ascent import MEAscentOptions
 from newton_qd.qd.algorithms.options import read_options
 from newton_qd.qd.config import ConfigError
@@ -81,6 +81,24 @@ def test_the_gradient_is_that_of_the_mean_return() -> None:
     expected = (shares[..., None] * found.gradients[:, :, 0]).mean(0)
     np.testing.assert_allclose(slopes, expected, rtol=1e-5, atol=1e-6)
     assert list(lost) == [False, False, True] and not slopes[2].any()
+
+
+def test_a_gradient_that_overflowed_does_not_count(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    key = jax.random.key(1)
+    drawn = jax.vmap(jax.random.uniform)(jax.random.split(key, 2))
+
+    def gradient(self: Episode, weights: jax.Array, key: jax.Array) -> EpisodeGradients:
+        lost = (jax.random.uniform(key) > drawn.mean())[None]
+        slopes = jnp.where(lost, 0, jnp.array([3.0, 4.0]))[None, None]
+        return EpisodeGradients(weights, weights, slopes, ~lost & lost, lost[:, None])
+
+    monkeypatch.setattr(Episode, "gradient", gradient)
+    episode = Episode(PointEnv(), policy, episode_length=4)
+    slopes, lost = mean_slope(episode, 2)(jnp.zeros((1, 2)), key)
+    np.testing.assert_allclose(slopes, [[3.0, 4.0]], rtol=1e-6)
+    assert not lost.any()
 
 
 def test_a_climber_makes_steps_of_one_length_with_momentum() -> None:

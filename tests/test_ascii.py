@@ -95,7 +95,7 @@ def defined_preference(own: Behavior, other: Behavior) -> np.ndarray:
     return found
 
 
-@pytest.mark.parametrize(("own", "other"), [(0, 2), (1, 0), (0, 1)])
+@pytest.mark.parametrize(("own", "other"), [(0, 2), (1, 0), (1, 2), (0, 1)])
 def test_preference_is_similarity_times_the_gain_in_return(
     own: int, other: int
 ) -> None:
@@ -238,6 +238,7 @@ def test_better_actions_follow_the_derivative() -> None:
     cosine = np.sum(found * slopes / np.abs(slopes).max((1, 2), keepdims=True), -1)
     assert (cosine >= 0).all() and np.isfinite(found).all()
     np.testing.assert_array_equal(found[1, 5:], 0)
+    np.testing.assert_array_equal(np.abs(improve(own, slopes, 50.0)[0, 3]), [1, 1])
     nothing = jnp.zeros((2, LENGTH, 2))
     np.testing.assert_array_equal(improve(own, nothing, 0.05), own.actions)
 

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compat_helpers import setup
+from line_env import Line
 
 import newton_qd
 import newton_qd.compat
@@ -82,6 +83,10 @@ def test_voronoi_plots_of_qdax_run_with_numpy_2() -> None:
     centroids = np.random.default_rng(0).uniform(size=(5, 2))
     regions, _ = plotting.get_voronoi_finite_polygons_2d(centroids)
     assert len(regions) == 5
+    mended = plotting.get_voronoi_finite_polygons_2d
+    newton_qd.compat.uninstall()
+    newton_qd.compat.install()
+    assert plotting.get_voronoi_finite_polygons_2d is mended  # not once more
 
 
 def test_pareto_plots_of_qdax_run_with_new_matplotlib() -> None:
@@ -133,6 +138,8 @@ def test_functions_of_jumpy() -> None:
     np.testing.assert_allclose(slope, [[0.6, 0.8], [0, 0]], rtol=1e-6)
     assert jp.safe_norm(x[1]) == 0
     assert jp.take({"x": x}, [1, 0])["x"].tolist() == [[0, 0], [3, 4]]
+    assert jp.take(x, 5).tolist() == [0, 0]  # as the last: JAX would give NaN
+    assert jp.random_uniform(jp.random_prngkey(0), (9,), -1.0, 0.0).max() <= 0
     assert jp.index_update(x, (1, 0), 7).tolist() == [[3, 4], [7, 0]]
     assert 2 <= jp.randint(jp.random_prngkey(0), low=2, high=4) < 4
 
@@ -247,6 +254,31 @@ def test_no_fault_pays_in_a_scoring_function() -> None:
     actions = np.array([[0.1, 0.1], [np.nan, 0.0]], np.float32)
     found = scores(jax.random.split(jax.random.key(0), 2), actions)
     assert np.isfinite(found[0][0]) and found[0][1] == -np.inf
+
+
+def test_policies_have_random_numbers_of_their_own() -> None:
+    def play(state: Any, policy: jax.Array, key: jax.Array) -> tuple:
+        key, own = jax.random.split(key)
+        steps = Steps(jax.random.uniform(own), jnp.zeros(()), state.obs)
+        return state, policy, key, steps
+
+    module: Any = importlib.import_module("newton_qd.compat.env_creators")
+    described: Any = lambda data, _: data.obs[:, 0]  # noqa: E731
+    fitnesses, *_ = module.scoring_function_brax_envs(
+        jnp.zeros((3, 1)), jax.random.key(0), 2, Line().reset, play, described
+    )
+    assert len(set(fitnesses.tolist())) == 3
+
+
+def test_only_one_start_for_all_takes_a_key() -> None:
+    module: Any = importlib.import_module("newton_qd.compat.brax_envs")
+    described: Any = lambda data, _: data.state_desc[:, 0]  # noqa: E731
+    key = jax.random.key(0)
+    for one_start in (True, False):
+        left = module.create_brax_scoring_fn(
+            Line(), None, described, key, deterministic=one_start
+        )[1]
+        assert bool(jnp.all(left == key)) != one_start
 
 
 def test_a_fault_after_the_end_costs_nothing() -> None:

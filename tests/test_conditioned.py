@@ -81,8 +81,9 @@ def test_rewards_add_up_to_the_distance_of_the_descriptor(final: bool) -> None:
     start, last, (places, plain, rewards) = compiled(episode)()
     reached = scaled(places)[-1] if final else scaled(places).mean(axis=0)
     np.testing.assert_allclose(last.error, reached - target, atol=1e-5)
+    placed = scaled(first.info["state_descriptor"]) - target
+    np.testing.assert_allclose(start.error, placed if final else [0, 0], atol=1e-6)
     begun = np.linalg.norm(start.error)
-    assert begun > 0.1 if final else begun == 0
     nearer = begun - np.linalg.norm(reached - target)
     expected = 0.25 * np.sum(plain) + 0.5 * LENGTH * nearer
     assert float(np.sum(rewards)) == pytest.approx(float(expected), abs=0.02)
@@ -98,7 +99,8 @@ def test_a_fall_does_not_come_nearer() -> None:
     state = env.aimed(first, jnp.zeros(2), weights)
     inside, outside = (env.step(state, jnp.float32([0, x])) for x in (0.0, 1.0))
     assert float(inside.done) == 0 and float(outside.done) == 1
-    assert float(outside.reward) < float(inside.reward) - 0.5 * 30
+    steps_away = 30 * 2**0.5  # each of them as far as a corner
+    assert float(outside.reward) < float(inside.reward) - 0.5 * steps_away
 
 
 def test_an_actor_is_a_policy_of_the_archive_for_each_target() -> None:
@@ -234,6 +236,37 @@ def test_multipliers_stay_within_bounds() -> None:
     places = held.centroids.at[:3].add(5.0)  # the last one hits
     found = made._multipliers(state, held, places)
     np.testing.assert_allclose(found, [6.0, 6.0, 0.3, -6.0], rtol=1e-6)
+
+
+def test_a_return_of_one_unit_weighs_as_much_as_half_of_the_extent() -> None:
+    made: Any = emitter()
+    held, key, logits = grid(2), jax.random.key(0), jnp.array([0.5, -1.0, 2.0, 0.0])
+    worlds = compiled(made._worlds)(held, logits, jnp.float32(3.0), key)
+    cells = np.asarray(made._targets(held, key, 6))
+    share = 1 / (1 + np.exp(-np.asarray(logits)[cells]))
+    expected = [(1 - share) * LENGTH / 3, share]
+    np.testing.assert_allclose(worlds.weights.T, expected, rtol=1e-5)
+    # targets are from -1 to 1, whatever random actions show of them
+    made._method = types.SimpleNamespace(scale=lambda *_: (jnp.ones(8), jnp.ones(8)))
+    for found, known in zip(made._scale(key, worlds), (0, 0.5), strict=True):
+        assert found.tolist() == [1] * 3 + [known] * 5
+
+
+def test_offspring_lie_between_an_elite_and_the_policy_for_its_descriptor() -> None:
+    made = emitter(copies=0, spread=(1e-9, 1e-9))
+    elite, place = jnp.ones(policy().size), jnp.float32([0.9, -0.3])
+    actor = jax.random.normal(jax.random.key(0), (made._policy.size,))
+    held = grid(2).replace(  # the place is not the centre of its cell
+        genotypes=jnp.tile(elite, (4, 1)), descriptors=jnp.tile(place, (4, 1))
+    )
+    learner, none = types.SimpleNamespace(weights=actor), jnp.zeros(0, jnp.int32)
+    state = types.SimpleNamespace(learner=learner, scale=None, cells=none, failed=None)
+    found = np.asarray(made.emit(held, state, jax.random.key(1))[0])
+    told = np.asarray(made._policy.specialized(actor, jnp.float32(scaled(place))))
+    way = np.asarray(elite) - told
+    parts = (found - told) @ way / (way @ way)
+    assert ((parts > 0) & (parts < 1)).all() and len(set(parts)) == 3
+    np.testing.assert_allclose(found, told + parts[:, None] * way, atol=1e-5)
 
 
 def test_empty_targets_are_near_elites() -> None:

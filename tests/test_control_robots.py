@@ -6,19 +6,23 @@ capsule's length includes its caps. Every inertia is 1 kg m^2 about every axis.
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+import urdf_text
 from physics_helpers import variant
 
 from newton_qd import physics
 from newton_qd.assets import find_urdf
 from newton_qd.brax_views import BraxViewsWrapper
 from newton_qd.envs import Acrobot
+from newton_qd.envs.joints import joint_chains
 from newton_qd.physics import reference
 from newton_qd.physics.model.description import read_description
 from newton_qd.physics.model.elements import Shape
+from newton_qd.physics.model.rest import raising_coordinate
 from newton_qd.physics.model.xml_reader import RobotDescriptionError
 from newton_qd.physics.system import JointKind
 from newton_qd.robots import HUMANOID_STANDUP, REACHERANGLE, ROBOTS
@@ -254,3 +258,27 @@ def test_the_humanoid_lies_on_its_back() -> None:
         RobotDescriptionError, match=r"rest_rotation: got .*no free root"
     ):
         variant(REACHERANGLE, "float32", rest_rotation=(1.0, 0.0, 0.0))
+
+
+def test_a_hinge_of_the_world_is_a_joint_and_a_slide_is_none() -> None:
+    acrobot, cart = (
+        physics.load_system(ROBOTS[name])
+        for name in ("acrobot", "inverted_double_pendulum")
+    )
+    assert joint_chains(acrobot) == [[0], [1]]
+    assert joint_chains(cart) == [[1], [2]]
+    chains = joint_chains(physics.load_system(ROBOTS["humanoid"]))
+    assert max(map(len, chains)) == 3  # of a hip, whose parents are first
+    assert all(chain == sorted(chain) for chain in chains)
+
+
+def test_the_nearest_vertical_slide_raises_the_torso(tmp_path: Path) -> None:
+    limit = '<axis xyz="0 0 -1"/><limit lower="-1" upper="1"/>'
+    text = urdf_text.robot_text(
+        *('<link name="world"/>', urdf_text.link("lift"), urdf_text.link("fork")),
+        urdf_text.joint("far", "prismatic", "world", "lift", limit),
+        urdf_text.joint("near", "prismatic", "lift", "fork", limit),
+    )
+    for torso, coordinate in (("lift", 0), ("fork", 1)):
+        system = urdf_text.built(tmp_path, text, torso)
+        assert raising_coordinate(system) == (coordinate, -1.0)

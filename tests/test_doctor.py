@@ -9,6 +9,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import line_env
 import numpy as np
 import pytest
 
@@ -18,6 +19,7 @@ from newton_qd.envs.state import State
 from newton_qd.errors import FaultError
 from newton_qd.gradients import GradientReport, diagnose_gradients
 from newton_qd.gradients.doctor_input import checked_genotypes
+from newton_qd.gradients.measurements import Subject
 from newton_qd.gradients.report import HorizonRow
 
 
@@ -360,3 +362,18 @@ def test_an_environment_without_precision(
     newton_qd.register("single_only", lambda: newton_qd.create("pointmaze").unwrapped)
     assert cli.main(["doctor", "gradients", "single_only"]) == cli.BAD_ARGUMENTS
     assert "error: dtype: got 'float64', which is not" in capsys.readouterr().err
+
+
+def test_a_fault_after_the_end_is_none() -> None:
+    class Breaking(line_env.Line):
+        def step(self, state: State, action: jax.Array, params: Any = None) -> State:
+            after = super().step(state, action, params)
+            fault = (after.pipeline_state > 3).astype(np.int32)
+            return after.replace(info={**after.info, "fault": fault})
+
+    for end, long in ((1.5, False), (9.0, True)):
+        subject = Subject(Breaking(end), None, 4, line_env.KEY)
+        rewards, (alive, _, faults) = subject.rewards(jnp.ones((4, 1)))
+        assert alive.tolist() == [True, True, long, long]
+        assert faults.tolist() == [False, False, long, long]
+        assert ((rewards > 0) == alive).all()

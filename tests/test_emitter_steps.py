@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -25,6 +26,7 @@ from qdax.core.containers.mapelites_repertoire import (
     get_cells_indices,
 )
 
+from newton_qd.gradients import EpisodeGradients
 from newton_qd.qd.emitters import (
     CMAMEGAEmitter,
     GradientLineEmitter,
@@ -33,7 +35,8 @@ from newton_qd.qd.emitters import (
     RestartRule,
     SteeringEmitter,
 )
-from newton_qd.qd.emitters.ranking import best_of
+from newton_qd.qd.emitters.gradient_line import _units
+from newton_qd.qd.emitters.ranking import IMPROVED, NEW, WORSE, best_of
 from newton_qd.qd.scoring.gradient_scores import normalize
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
@@ -106,6 +109,26 @@ def test_without_known_gradients_steering_starts_from_elites() -> None:
     same = np.all(np.asarray(genotypes)[:, None] == changed.genotypes, axis=-1)
     filled = np.asarray(changed.fitnesses[:, 0]) > -np.inf
     assert np.all(np.any(same & filled, axis=1))
+    chosen = compiled(lambda: state.select(changed, jax.random.key(2), 16))()
+    assert filled[chosen].all()
+    # with one known elite, this one alone moves, along means of halves
+    (cell, *_) = np.flatnonzero(filled)
+    known = jnp.where(jnp.arange(len(filled)) == cell, state.fitnesses, -jnp.inf)
+    found = emit(emitter, repertoire, state.replace(fitnesses=known))
+    halves = (found - repertoire.genotypes[cell]).reshape(-1, 2, SIZE // 2)
+    np.testing.assert_allclose(halves, halves[..., :1] + 0 * halves, atol=1e-5)
+
+
+def test_a_later_step_of_unknown_scores_is_none() -> None:
+    def unknown(genotypes: jax.Array, key: jax.Array) -> tuple:
+        fitnesses, descriptors, extra = score(genotypes, key)
+        return fitnesses, descriptors + jnp.nan, extra
+
+    one = SteeringEmitter(4, max_step=0.1)
+    two = SteeringEmitter(4, max_step=0.1, steps=2, scoring_function=unknown)
+    repertoire, state = begin(one)
+    found, expected = (emit(emitter, repertoire, state) for emitter in (two, one))
+    np.testing.assert_array_equal(found, expected)
 
 
 def test_lines_climb_and_steer() -> None:
@@ -127,6 +150,24 @@ def test_lines_climb_and_steer() -> None:
         np.testing.assert_allclose(way, np.broadcast_to(way[0], way.shape), atol=1e-5)
         halves = way[0].reshape(2, -1)
         np.testing.assert_allclose(halves, halves[:, :1] * np.ones(10), atol=1e-5)
+
+
+def test_lines_without_a_gradient_have_random_directions() -> None:
+    rows = jnp.array([[np.inf, 1.0], [np.nan, 1.0], [0.0, 0.0], [3.0, 4.0]])
+    ways = compiled(_units)(rows, jax.random.key(0))
+    np.testing.assert_allclose(np.linalg.norm(ways, axis=1), 1, rtol=1e-6)
+    np.testing.assert_allclose(ways[3], [0.6, 0.8], rtol=1e-6)
+
+    def faulty(genotypes: Any, directions: Any, key: Any) -> EpisodeGradients:
+        found = along(score)(genotypes, directions, key)
+        return dataclasses.replace(found, faulty=~found.faulty)
+
+    emitter = GradientLineEmitter(
+        faulty, parents=4, branches=3, shortest=0.1, longest=0.8
+    )
+    repertoire, state = begin(emitter, count=1)
+    told = compiled(emitter.emit)(repertoire, state, jax.random.key(1))[1]
+    assert told["overflowed"].tolist() == [True] * 4
 
 
 def unbeatable(genotypes: jax.Array, key: jax.Array) -> tuple:
@@ -160,14 +201,15 @@ def test_points_restart_from_elites(
             carry, _ = search.scan_update(carry, None)
             repertoire, state, _ = carry
             elite = jnp.any(jnp.all(state.points[0] == repertoire.genotypes, axis=-1))
-            return carry, (state.age[0], elite, state.cma_es.mean[0])
+            return carry, (state.age[0], elite, state.cma_es.mean[0], state.restarts)
 
         return jax.lax.scan(step, carry, None, length=6)[1]
 
-    ages, elite, mean = compiled(run)(start())
+    ages, elite, mean, restarts = compiled(run)(start())
     assert ages.tolist() == expected
     restarted = np.asarray(ages) == 0
     assert np.all(np.asarray(elite)[restarted])
+    np.testing.assert_array_equal(restarts, np.cumsum(restarted))
     np.testing.assert_array_equal(np.all(np.asarray(mean) == 0, axis=1), restarted)
 
 
@@ -177,13 +219,26 @@ def test_failed_offspring_do_not_move_the_distribution() -> None:
     coefficients = jnp.full((4, 3), 100.0).at[0].set(0.5)
     finite = jnp.array([True, False, False, False])
     scores = jnp.float32([1, 0, 0, 0]), jnp.full(4, -jnp.inf)
-    after, improved, _ = compiled(emitter._adapt)(begun, coefficients, *scores, finite)
+    adapt = compiled(emitter._adapt)
+    after, improved, _ = adapt(begun, coefficients, *scores, finite)
     assert improved and 0 < after.mean.max() <= 0.5
+    # their fitness is no number, so it is above no bar
+    none = jnp.zeros(4), jnp.full(4, -5.0), finite & ~finite
+    assert not adapt(begun, coefficients, *none)[1]
+
+
+def test_an_equal_fitness_is_no_improvement() -> None:
+    ranked = CMAMEGAEmitter(score, sigma_g=0.5, batch_size=5)._rank(
+        jnp.array([1.0, 2.0, -3.0]), jnp.array([1.0, 1.0, -jnp.inf])
+    )
+    assert [found.tolist() for found in ranked] == [[WORSE, IMPROVED, NEW], [0, 1, -3]]
 
 
 def test_offspring_that_all_failed_are_equally_good() -> None:
     values = jnp.array([jnp.nan, 1.0, -jnp.inf])
     assert best_of(jnp.ones(3), values, jnp.zeros(3, bool))[1]
+    # equal values of two classes are not
+    assert not best_of(jnp.array([1, 0, 1]), jnp.zeros(3), jnp.ones(3, bool))[1]
 
 
 class Watched(CMAMEGAEmitter):
@@ -239,16 +294,19 @@ def test_no_two_draws_share_a_key(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_emitting_and_updating_agree() -> None:
     # What QDax 0.5.0 gets wrong: the point must move by what was emitted.
-    emitter = CMAMEGAEmitter(score, sigma_g=0.5, batch_size=9)
+    far = np.full(SIZE, 0.9, np.float32)
+    emitter = CMAMEGAEmitter(score, sigma_g=0.5, batch_size=9, start=far)
     search = algorithm(emitter)
     repertoire, state = begin(emitter)
     genotypes = emit(emitter, repertoire, state)
     fitnesses, descriptors, _ = compiled(score)(genotypes, jax.random.key(2))
-    _, after, _ = compiled(search.tell)(
-        genotypes, fitnesses, descriptors, repertoire, state
-    )
-    cells = np.asarray(compiled(get_cells_indices)(descriptors, centroids()))[1:]
+    tell = compiled(search.tell)
+    _, after, _ = tell(genotypes, fitnesses, descriptors, repertoire, state)
+    own, *cells = np.asarray(compiled(get_cells_indices)(descriptors, centroids()))
     bars = np.asarray(state.bars)[cells]
+    # offspring must beat the point too, which no archive has had
+    assert repertoire.fitnesses[own] == -np.inf
+    np.testing.assert_allclose(state.bars[own], fitnesses[0], rtol=1e-6)
     new = bars == -np.inf
     worth = np.asarray(fitnesses)[1:] - np.where(new, 0, bars)
     order = np.lexsort((-worth, -np.where(new, 2, worth > 0)))
@@ -257,3 +315,9 @@ def test_emitting_and_updating_agree() -> None:
     expected = (weights / weights.sum()) @ parents
     assert int(after.restarts) == 0
     np.testing.assert_allclose(after.points[0], expected, atol=1e-5)
+    # what is not finite is counted; a point without gradients begins again
+    assert int(after.rejected) == 0
+    lost = fitnesses.at[3].set(jnp.nan)
+    state = state.replace(finite=~state.finite)
+    _, after, _ = tell(genotypes, lost, descriptors, repertoire, state)
+    assert [int(x) for x in (after.rejected, after.restarts, after.age[0])] == [1, 1, 0]

@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import line_env
 import numpy as np
 import pytest
 from contract import same
@@ -158,6 +159,64 @@ def test_transitions_need_no_wrapper() -> None:
     episode = newton_qd.Episode(env, None, episode_length=3, transitions=True)
     found = episode(jnp.zeros((3, 2)), jax.random.key(0)).transitions
     assert found["truncations"].tolist() == [0, 0, 0]
+
+
+class Failing(line_env.Line):
+    """A line with a fault beyond 1."""
+
+    def step(self, state: State, action: jax.Array, params: Any = None) -> State:
+        after = super().step(state, action, params)
+        fault = (after.pipeline_state > 1).astype(np.int32)
+        return after.replace(info={**after.info, "fault": fault})
+
+
+def test_a_faulty_episode_has_no_gradient() -> None:
+    """Also of its descriptor, which is known."""
+    episode = Episode(
+        Failing(), None, lambda data, _: data.state_desc[:, -1], episode_length=3
+    )
+    plans = jnp.array([[[0.1]] * 3, [[1.0]] * 3])
+    found = episode.gradient(plans, KEY)
+    assert found.faulty.tolist() == [False, True] and not found.overflowed.any()
+    assert found.gradients[0, 1].any() and not found.gradients[1].any()
+    assert np.isfinite(found.descriptors).all()
+
+
+def test_a_gradient_that_one_leaf_has_lost_is_lost() -> None:
+    def policy(tree: Any, obs: jax.Array) -> jax.Array:
+        del obs
+        return tree["a"] + 0 * jnp.sqrt(tree["b"])
+
+    episode = Episode(line_env.Line(), policy, episode_length=2)
+    genotypes = {"a": jnp.ones((2, 1)), "b": jnp.array([[0.0], [1.0]])}
+    found = episode.gradient(genotypes, KEY)
+    assert found.overflowed.tolist() == [[True], [False]]
+    assert found.gradients["a"].ravel().tolist() == [0, 3]
+
+
+def test_transitions_go_on_with_another_episode() -> None:
+    episode = Episode(line_env.Line(end=2.0), episode_length=5, transitions=True)
+    found = episode(jnp.ones((5, 1)), KEY)
+    steps = {name: np.ravel(x) for name, x in found.transitions.items()}
+    start = steps["obs"][0]
+    assert 0 < start < 0.5
+    np.testing.assert_allclose(steps["obs"] - start, [0, 1, 0, 1, 0], atol=1e-6)
+    np.testing.assert_allclose(steps["next_obs"] - start, [1, 2, 1, 2, 1], atol=1e-6)
+    assert steps["dones"].tolist() == [0, 1, 0, 1, 0]
+    assert not steps["truncations"].any()
+    assert found.fitness == pytest.approx(2 * start + 3, rel=1e-6)
+
+
+def test_transitions_need_a_state_descriptor() -> None:
+    class Bare(line_env.Line):
+        def reset(self, rng: jax.Array) -> State:
+            return super().reset(rng).replace(info={})
+
+    episode = Episode(Bare(), episode_length=2, transitions=True)
+    with pytest.raises(
+        ValueError, match="states with no state descriptor; allowed: QD"
+    ):
+        episode(jnp.ones((2, 1)), KEY)
 
 
 def test_a_fault_may_be_a_python_number() -> None:

@@ -92,6 +92,13 @@ def test_no_fault_pays_in_an_evaluation(wrapper: type[Wrapper]) -> None:
         assert float(sums["reward"]) == total and np.isfinite(sums["moved"])
 
 
+def test_a_fault_after_the_first_episode_costs_nothing() -> None:
+    env = EvalWrapper(EpisodeWrapper(Fragile(), 3, 1))
+    last = play(env, 7)[-1]
+    assert last.info["fault"] == 1
+    assert last.info["eval_metrics"].episode_metrics["reward"] == -3
+
+
 class Unmeasured(Line):
     """A line whose metric is not known beyond 1.6."""
 

@@ -251,7 +251,8 @@ def test_a_run_in_which_everything_is_faulty_ends() -> None:
     [
         (
             "reward",
-            "return is not finite in 16, the descriptor is not finite in 0,",
+            "return is not finite in 16, the descriptor is not finite in 0, "
+            "and the physics had a fault in 0",
         ),
         ("descriptor", "return is not finite in 0, the descriptor is not finite in 1"),
     ],

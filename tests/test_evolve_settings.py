@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from point_runs import SMALL, run
 from newton_qd.errors import MissingExtra, UnknownEnvironment
 from newton_qd.qd.config import ConfigError, EvolveConfig, read_config
 from newton_qd.qd.scoring.task import make_task
+from newton_qd.robots import HOPPER
 
 # QDax and what it imports warn about their own use of other packages.
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
@@ -127,3 +129,13 @@ def test_names_that_are_no_task() -> None:
         make_task(EvolveConfig(env_name="ant_unicorn"))
     with pytest.raises(ConfigError, match=r"'ant', which has no descriptor.*ant_uni"):
         make_task(EvolveConfig(env_name="ant"))
+
+
+def test_a_material_changes_what_it_names_and_a_final_place_is_named_so() -> None:
+    options: Any = {"material": {"friction": 0.5}}
+    task = make_task(EvolveConfig(env_name="hopper_uni", env_options=options))
+    expected = dataclasses.replace(HOPPER.material, friction=0.5)
+    assert task.env.unwrapped.robot.material == expected
+    assert task.labels == ("foot contact",)
+    task = make_task(EvolveConfig(env_name="pointmaze"))
+    assert task.labels == ("final x", "final y")

@@ -12,6 +12,7 @@ from point_runs import SMALL, PointEnv, PointState, point_task
 
 from newton_qd.extractors import get_final_xy_position
 from newton_qd.gradients import GradientOptions
+from newton_qd.gradients.scores import unit_rows
 from newton_qd.qd import make_policy, make_scoring_function
 from newton_qd.qd.scoring.gradient_scoring import make_gradient_scoring_function
 from newton_qd.qd.scoring.task import Task
@@ -97,6 +98,9 @@ def test_pytree_genotypes_and_plans() -> None:
         np.square(x).reshape(5, -1, 3).sum(1) for x in jax.tree.leaves(extra[name])
     ]
     np.testing.assert_allclose(sum(squares), 1.0, 1e-5)
+    # a leaf without numbers has no length
+    found = unit_rows({**extra["gradients"], "none": jnp.zeros((5, 0, 3))})
+    np.testing.assert_array_equal(found["a"], extra["normalized_grads"]["a"])
     # a plan of actions, in any shape of as many numbers
     score = jax.jit(make_gradient_scoring_function(task, None, STEPS))
     plans = jax.random.normal(key, (5, STEPS, 2), jnp.float32)

@@ -214,6 +214,15 @@ def test_a_world_that_was_reset_goes_on() -> None:
     assert many.step(pressed(of=2))[0][:, 1].tolist() == [1, 0]
 
 
+def test_a_reset_of_all_worlds_is_not_followed_by_another() -> None:
+    many = make_gymnasium_vector(limited(1), 2, autoreset_mode=NEXT)
+    many.reset(seed=0)
+    assert many.step(pressed(of=2))[3].all()
+    begun, _ = many.reset()
+    after = many.step(pressed(of=2))[0]
+    assert after[:, 1].tolist() == [1, 1] and (after[:, 0] == begun[:, 0]).all()
+
+
 @pytest.mark.slow
 @pytest.mark.optimized
 def test_a_reset_in_a_step_has_no_reward() -> None:
@@ -251,6 +260,7 @@ def test_the_numbers_are_those_of_env_step() -> None:
                 assert np.array_equal(found[4][name], value)
             described = wanted.info["state_descriptor"]
             assert np.array_equal(found[4]["state_descriptor"], described)
+            assert found[4]["state_descriptor"].flags.writeable  # nobody else's
 
 
 @pytest.mark.parametrize("number", [None, pytest.param(2, marks=pytest.mark.slow)])
@@ -316,6 +326,13 @@ def test_every_environment_is_registered() -> None:
             lambda: make_gymnasium(newton_qd.create("pointmaze", batch_size=2)),
             ValueError,
             "env: got an environment with auto-reset; allowed: one world",
+        ),
+        (
+            lambda: make_gymnasium(
+                newton_qd.create("pointmaze", auto_reset=False, batch_size=2)
+            ),
+            ValueError,
+            "env: got an environment with a batch; allowed: one world",
         ),
         (
             lambda: make_gymnasium_vector(Clock(), 2, autoreset_mode="Never"),

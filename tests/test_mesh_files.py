@@ -116,3 +116,6 @@ def test_a_colour_is_checked(folder: Path) -> None:
     with pytest.raises(RobotDescriptionError, match="<color>: rgba: got '1 red 0 1'"):
         newton_builder(path, True, 9.81)
     assert newton_builder(path, True, 9.81, False).body_count == 1
+    opaque = colour.replace("1 red 0 1", "1 0 0")
+    path = write(folder, robot_text(opaque, link("a")))
+    assert newton_builder(path, True, 9.81).body_count == 1

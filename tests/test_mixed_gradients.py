@@ -15,6 +15,7 @@ import pytest
 from newton_qd.envs.state import State
 from newton_qd.extractors import get_final_xy_position
 from newton_qd.gradients import Episode, MixedGradients, make_mixed_gradient
+from newton_qd.gradients.mixed import mixture
 
 
 class Landscape:
@@ -97,6 +98,61 @@ def test_gradients_have_the_form_of_genotypes() -> None:
         episode.mixed({"w": jnp.zeros((2, 3), int)}, key)
 
 
+class Scaled(Landscape):
+    """A landscape that parameters multiply."""
+
+    def step(self, state: State, action: jax.Array, params: Any = 1.0) -> State:
+        del state
+        return self._state(self.reward(action) * params)
+
+
+def test_samples_and_centre_have_the_parameters() -> None:
+    env: Any = Scaled(lambda a: 1.0 + a @ WEIGHTS)
+    episode, scale = Episode(env, episode_length=1), jnp.float32(3)
+    found = episode.mixed(jnp.zeros((1, 1, 3)), jax.random.key(0), scale, samples=2)
+    np.testing.assert_allclose(found.fitnesses, [3.0])
+    np.testing.assert_allclose(found.gradients[0, 0, 0], 3 * WEIGHTS, rtol=1e-5)
+
+
+def test_orders_are_weighted_by_their_formulas() -> None:
+    """Row 0 has both orders, row 1 only the zeroth, row 2 only the first."""
+    rng, sigma, pairs = np.random.default_rng(0), 0.5, 6
+    shapes = ((pairs, 2, 3), (pairs, 2, 3, 4), (pairs, 4))
+    values, slopes, noise = (rng.normal(size=x).astype(np.float32) for x in shapes)
+    # one pair more, which does not count; and a row of values that is not finite
+    given: list[Any] = [
+        *(np.concatenate([x, np.full_like(x[:1], np.nan)]) for x in (values, slopes)),
+        *(np.concatenate([noise, noise[:1]]), np.arange(pairs + 1) < pairs),
+    ]
+    given[0][3, 0, 2] = np.inf
+    given += [np.array([False, True, False])]  # whose first order is lost
+    weighted = jax.jit(lambda most: mixture(*given, sigma=sigma, tolerance=most))
+
+    slope = (values[:, 0] - values[:, 1]) / (2 * sigma**2)
+    samples = slopes.mean(axis=1), slope[:, :, None] * noise[:, None]
+    (first, zeroth), (rough, rougher) = (
+        [function(x) for x in samples]
+        for function in (
+            lambda x: x.mean(axis=0),
+            lambda x: x.var(axis=0, ddof=1).sum(axis=1),
+        )
+    )
+    apart = np.linalg.norm(first[0] - zeroth[0])
+    explained = (samples[0] - samples[1])[:, 0].var(axis=0, ddof=1).sum() / pairs
+    for tolerance in (1.0, 3.0, math.inf):
+        found = weighted(tolerance)
+        bound = max(tolerance - np.sqrt(rougher[0] / pairs), 0) / apart
+        order = min(rougher[0] / (rough[0] + rougher[0]), bound)
+        np.testing.assert_allclose(found.order, [order, 0, 1], rtol=1e-5)
+        both = order * first[0] + (1 - order) * zeroth[0]
+        expected = [both, zeroth[1], first[2]]
+        np.testing.assert_allclose(found.gradients, expected, rtol=1e-4, atol=1e-6)
+    biases = [np.sqrt(max(apart**2 - explained, 0)), np.linalg.norm(zeroth[1])]
+    np.testing.assert_allclose(found.bias[:2], biases, rtol=1e-4)
+    np.testing.assert_allclose(found.first_variance, [rough[0], np.inf, rough[2]], 1e-5)
+    np.testing.assert_allclose(found.zeroth_variance, [*rougher[:2], np.inf], 1e-5)
+
+
 def test_tolerance_finds_a_jump() -> None:
     """A step: its first order is 0 without any variance, and wrong."""
 
@@ -133,6 +189,19 @@ def test_samples_that_are_not_finite_are_left_out() -> None:
     # the third's first order has samples that are not finite: the zeroth alone
     assert result.order[2, 0] == 0 and np.isinf(result.first_variance[2, 0])
     np.testing.assert_allclose(result.gradients[2, 0, 0, 0], 1.0, atol=0.6)
+
+
+def test_slopes_of_pairs_that_do_not_count_may_be_lost() -> None:
+    """Ahead is a fault, behind the slope is not finite: only slopes of 1 are left."""
+
+    def reward(action: jax.Array) -> jax.Array:
+        x = action[0]
+        behind = jnp.where(x < -0.1, jnp.sqrt(jnp.where(x < -0.1, 0 * x, 1)), 0)
+        return x + behind + jnp.where(x > 0.1, jnp.nan, 0)
+
+    result = estimate(reward, np.zeros((1, 1, 3)), sigma=0.1, samples=64)
+    assert not result.overflowed.any() and np.isfinite(result.first_variance).all()
+    np.testing.assert_allclose(result.gradients[0, 0, 0, 0], 1.0, rtol=1e-5)
 
 
 def test_one_sound_pair_is_too_few() -> None:
@@ -177,6 +246,7 @@ def test_noise_whose_square_is_no_number(sigma: float) -> None:
         ("sigma", 0.0),
         ("sigma", math.inf),
         ("tolerance", -1.0),
+        ("tolerance", 0.0),
         ("tolerance", math.nan),
     ],
 )

@@ -105,6 +105,11 @@ def test_scores_that_are_never_finite(task: Task) -> None:
             r"'own': got genotypes of shape \(3, \d+\)",
         ),
         (
+            lambda genotypes, extra: (genotypes[:, 1:], extra),
+            ConfigError,
+            r"'own': got genotypes of shape \(\d+, \d+\); allowed: \(\d+, \d+\)",
+        ),
+        (
             lambda genotypes, extra: genotypes,
             TypeError,
             r"Changed.emit: got .*; allowed: genotypes and a dictionary",

@@ -347,3 +347,26 @@ def test_roots_move_as_each_alone(x64: None, tmp_path: Path) -> None:
         at = [together.body_names.index(link) for link in alone.body_names]
         apart = rollout(alone)(q[at], v[at], passive(alone, 50))
         np.testing.assert_allclose(path.q[:, at], apart.q, rtol=1e-10, atol=1e-10)
+
+
+# Tables
+
+
+def test_the_sides_of_a_pair_stay_together(x64: None, tmp_path: Path) -> None:
+    """Rows are sorted by body; a ball is before a rod, which has a length."""
+    names = ("a", "b", "c")
+    bodies = body("a", rod(0.1, 0.4)), body("b", ball(0.1)), body("c", ball(0.1))
+    pairs = ("ca", "bc")
+    system = world(
+        tmp_path,
+        *bodies,
+        pairs=tuple((Contact(first), Contact(second)) for first, second in pairs),
+    )
+    links = [system.body_names[body] for body in system.contact_body]
+    assert [name for name in links if name in names] == ["a", "b", "c", "c"]
+    assert ["".join(links[row] for row in pair) for pair in system.contact_pairs] == [
+        *pairs
+    ]
+    other = world(tmp_path, *bodies, pairs=((Contact("a"), Contact("b")),))
+    first, second = other.contact_segment[other.contact_pairs[0]]
+    assert not first.any() and second.any()

@@ -69,6 +69,9 @@ def test_worlds_that_reset_themselves_step_one_by_one() -> None:
     env = newton_qd.create("hopper_uni", episode_length=4)
     assert _order(env) == RolloutOrder.ONE_BY_ONE
     check(env)
+    options: Any = {"auto_reset": False, "action_repeat": 2}
+    repeating = newton_qd.create("hopper_uni", episode_length=4, **options)
+    assert _order(repeating) == RolloutOrder.ONE_BY_ONE
 
 
 def test_a_batched_environment_rolls_out_each_world() -> None:

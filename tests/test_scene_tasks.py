@@ -53,6 +53,8 @@ def test_observation(task: str) -> None:
     rows = ROWS[task]
     assert env.observation_size == 2 + 27 + 6 * rows
     assert sum(size for _, size in env.observation_layout) == env.observation_size
+    around = TASKS[task](EpisodeWrapper(Ant(), 5, 1), "ant")
+    assert around.observation_layout == env.observation_layout
     start = placed(env, [3.0, -1.5, 0.6])
     after = jax.jit(env.step)(start, action_of(env, 0.3))
     plain = jax.jit(ant.step)(placed(ant, [3.0, -1.5, 0.6]), action_of(ant, 0.3))
@@ -243,6 +245,8 @@ def test_other_environments_are_refused(task: str) -> None:
     )
     with pytest.raises(NotImplementedError, match=message):
         TASKS[task](PointMaze(), "pointmaze")
+    with pytest.raises(ValueError, match="env: got ant in the scene 'trap'; allowed: "):
+        TASKS[task](TrapWrapper(Ant(), "ant"), "ant")
     with pytest.raises(NotImplementedError, match="pointmaze is not a simulated robot"):
         PointMaze().with_scene(TRAP)
     with pytest.raises(TypeError, match="scene: got 'maze'; allowed: None, or a Scene"):

@@ -286,3 +286,10 @@ def test_contact_tables_of_different_lengths_are_refused() -> None:
     message = "contact_segment: got 1 rows; allowed: 20, as many as contact_body has"
     with pytest.raises(ValueError, match=message):
         dataclasses.replace(system, contact_segment=np.zeros((1, 3)))
+
+
+def test_a_scene_without_walls_touches_nothing(tmp_path: Path) -> None:
+    path = write(tmp_path, '<robot name="s"><link name="target"/></robot>')
+    with pytest.warns(RobotDescriptionWarning, match="no link has a collider"):
+        system = build_system(ANT, "float32", Scene("s", path))
+    assert len(system.obstacle_kind) == 1 and not system.contact_obstacle.any()

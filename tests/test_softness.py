@@ -41,6 +41,14 @@ def test_soft_to_stiff() -> None:
     assert env.unwrapped.robot is HOPPER
 
 
+def test_every_scale_of_softness_changes() -> None:
+    scales = {"static_penetration", "smoothing", "slip_velocity"}
+    scales |= {"limit_overshoot", "limit_smoothing"}
+    soft = softened(HOPPER.material, 3.0)
+    for name, value in vars(HOPPER.material).items():
+        assert getattr(soft, name) == (3 * value if name in scales else value), name
+
+
 def test_bad_softness() -> None:
     for factor in (0.0, -1.0, float("nan"), float("inf")):
         with pytest.raises(ValueError, match=f"factor: got {factor}"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import warnings
 from pathlib import Path
 
@@ -14,7 +15,7 @@ import pytest
 from hexapod import GEAR, hexapod
 from physics_helpers import report
 from subjects import ACTIONS, from_system
-from urdf_text import joint, robot_text, row, sphere, write
+from urdf_text import joint, link, robot_text, row, sphere, write
 
 from newton_qd import physics
 from newton_qd.physics import reference
@@ -23,6 +24,7 @@ from newton_qd.physics.model.substeps import (
     LARGEST_PHASE,
     LARGEST_TURN,
     contact_masses,
+    inner_torques,
     iterates,
     joint_speeds,
     needed_substeps,
@@ -91,6 +93,18 @@ def test_joint_without_motor(tmp_path: Path) -> None:
     assert speeds[driven] > 0
     free = build_system(hexapod(tmp_path, 0.0), "float32")
     assert (joint_speeds(free)[:6] == 0).all() and (joint_speeds(free)[6:] > 0).all()
+
+
+def test_a_hinge_behind_links_without_mass_is_turned(tmp_path: Path) -> None:
+    """Two axes in a row, as of a hip: a mass before both of them carries both."""
+    chain = ("trunk", "axis", "leg")
+    text = robot_text(
+        *(link("trunk"), '<link name="axis"/>', link("leg")),
+        *(joint(f"to_{b}", "continuous", a, b) for a, b in itertools.pairwise(chain)),
+    ).replace('<child link="leg"/>', '<child link="leg"/><axis xyz="0 1 0"/>')
+    robot = row(write(tmp_path, text), "trunk", actuators=(("to_leg", 4.0),))
+    torques = inner_torques(build_system(robot, "float32"))
+    assert torques.tolist() == [0.0] * 6 + [4.0, 4.0]
 
 
 def test_mass_of_a_contact(tmp_path: Path) -> None:
@@ -230,6 +244,10 @@ def test_a_body_that_tumbles_keeps_its_energy(tmp_path: Path, x64: None) -> None
 
 
 def test_a_ball_does_not_tumble(tmp_path: Path) -> None:
-    path = write(tmp_path, STICK.format(y=4e-4, z=4e-4))
-    robot = row(path, "stick", contacts=(Contact("stick"),))
+    text = STICK.format(y=4e-4, z=4e-4)
+    robot = row(write(tmp_path, text), "stick", contacts=(Contact("stick"),))
     assert not iterates(build_system(robot, "float32"))
+    # about the origin of its frame, the moments are not equal
+    text = text.replace("<inertial>", '<inertial><origin xyz="2e-3 0 0"/>')
+    robot = dataclasses.replace(robot, urdf=write(tmp_path, text))
+    assert iterates(build_system(robot, "float32"))

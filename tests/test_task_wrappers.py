@@ -200,6 +200,7 @@ def test_clip_reward() -> None:
     assert rewards(ClipRewardWrapper(PointMaze(), clip_min=-0.5)) == (0.0, -0.5)
     assert rewards(ClipRewardWrapper(PointMaze(), clip_max=-0.5)) == (-0.5, plain)
     assert rewards(ClipRewardWrapper(PointMaze(), -0.5, -0.25)) == (-0.25, -0.5)
+    assert rewards(ClipRewardWrapper(PointMaze(), -0.5, -0.5)) == (-0.5, -0.5)
     with pytest.raises(ValueError, match=r"clip_min, clip_max: got \(1.0, 0.0\)"):
         ClipRewardWrapper(PointMaze(), 1.0, 0.0)
     with pytest.raises(

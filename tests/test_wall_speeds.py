@@ -15,7 +15,7 @@ from urdf_text import joint, row, sphere, write
 
 from newton_qd import physics, robots
 from newton_qd.physics import reference
-from newton_qd.physics.model import build_system
+from newton_qd.physics.model import build_system, wall_speeds
 from newton_qd.physics.stepping import substep_solves
 from newton_qd.physics.system import System
 from newton_qd.robots import ANT, HUMANOID, WALKER2D, Contact, Material
@@ -313,6 +313,20 @@ def test_walls_of_the_suite_hold() -> None:
         report(f"{robot.name} in {place.name}", np.unique(np.round(speeds, 1)))
         for wall in range(1, len(system.obstacle_kind)):
             assert speeds[system.contact_obstacle == wall].max() > 20.0
+
+
+def test_the_link_that_a_wall_holds_best_counts(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The other links stay with it."""
+    system = build_system(ANT, "float32", TRAP)
+    speeds = np.where(system.contact_obstacle > 0, 1.0, np.inf)
+    monkeypatch.setattr(wall_speeds, "wall_speeds", lambda system: speeds)
+    walls = range(1, len(system.obstacle_kind))
+    assert len(wall_speeds.soft_walls(system)) == len(walls) == 3
+    for wall in walls:
+        speeds[np.flatnonzero(system.contact_obstacle == wall)[-1]] = 20.0
+    assert wall_speeds.soft_walls(system) == ()
 
 
 def test_soft_wall_gives_a_warning(tmp_path: Path) -> None:

@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from point_runs import PointEnv
+from qdax.core.containers.mapelites_repertoire import (
+    MapElitesRepertoire,
+    compute_euclidean_centroids,
+)
 
+from newton_qd.qd.emitters import ActorCriticEmitter
 from newton_qd.qd.emitters.whitening import Whitening
 from newton_qd.qd.scoring.networks import policy_of
 from newton_qd.qd.scoring.rollout import make_policy
@@ -58,3 +66,49 @@ def test_a_network_without_a_known_first_layer_stays_as_it_is() -> None:
     scale = jnp.zeros(9), 2 * jnp.ones(9)
     assert white.plain(weights, scale) is weights
     assert white.whitened(weights, scale) is weights
+
+
+def test_elites_are_whitened_before_actors_learn_from_them() -> None:
+    """The conversion is linear, so what lies between whitened weights does so plain."""
+    white = Whitening(np.arange(6).reshape(3, 2), np.array([6, 7]))
+    scale = jnp.array([1.0, -2.0, 3.0]), jnp.array([0.5, 2.0, 4.0])
+    nothing: Any = SimpleNamespace(whitening=white)
+    made: Any = ActorCriticEmitter(
+        nothing,
+        nothing,
+        actors=2,
+        branches=1,
+        copies=2,
+        updates=1,
+        spread=(1e-9, 1e-9),
+        steered=1.0,
+        lifetime=1,
+        measures=2,
+    )
+    made._begun = lambda key, weights, aims: weights
+    cells = compute_euclidean_centroids((2, 2), [0.0, 0.0], [1.0, 1.0])
+    elite = jax.random.normal(jax.random.key(0), (8,))
+    held: Any = MapElitesRepertoire.init_default(elite, cells)
+    held = held.replace(
+        genotypes=jnp.tile(elite, (4, 1)), fitnesses=jnp.zeros_like(held.fitnesses)
+    )
+    actors = jax.random.normal(jax.random.key(1), (2, 8))
+    state = SimpleNamespace(
+        learners=actors,
+        scale=scale,
+        snapshots=actors[None],
+        failed=None,
+        generation=jnp.ones((), jnp.int32),
+    )
+
+    def run(key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        renewed = made._renewed(state, held, key)
+        return made.emit(held, state, key)[0], white.plain(renewed, scale)
+
+    found, renewed = jax.device_get(jax.jit(run)(jax.random.key(2)))
+    np.testing.assert_allclose(renewed, held.genotypes[:2], rtol=1e-5, atol=1e-5)
+    own, between = found[:2], found[2:]
+    parts = (between - own)[:, 0] / (elite - own)[:, 0]
+    assert ((parts > 0) & (parts < 1)).all()
+    expected = own + parts[:, None] * (elite - own)
+    np.testing.assert_allclose(between, expected, rtol=1e-4, atol=1e-5)

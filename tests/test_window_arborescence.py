@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import inspect
 import itertools
+import types
 from typing import Any
 
 import jax
@@ -17,6 +19,8 @@ from test_actor_critic import SIZE, compiled, method, play
 
 from newton_qd.qd.emitters import WindowArborescenceEmitter
 from newton_qd.qd.emitters.annealed_repertoire import AnnealedRepertoire
+from newton_qd.qd.emitters.whitening import Whitening
+from newton_qd.qd.emitters.window_arborescence import Climbers
 
 POINTS, EACH, PERIOD = 2, 8, 4
 
@@ -99,6 +103,36 @@ def test_actors_walk_where_the_best_offspring_lie() -> None:
         # probes begin at the point again, and keep their critics
         away = np.abs(after.optimizer.probes.weights - after.points[:, None])
         assert 0 < away.max() < 3 * 0.05 * 1.5
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass
+class Probes:
+    """Actors of which the weights alone count."""
+
+    weights: jax.Array
+
+
+def test_gradients_have_length_one_for_whitened_observations() -> None:
+    made: Any = emitter()
+    white = Whitening(np.arange(6).reshape(3, 2), np.array([6, 7]))
+    made._method = types.SimpleNamespace(
+        whitening=white, moved=lambda probe, weights: Probes(weights)
+    )
+    ways = jax.random.normal(jax.random.key(0), (POINTS * 3, 8))
+    made._updated = lambda probes, *_: Probes(probes.weights + ways)
+    made._scoring_function = lambda points, key: (points[:, 0], points[:, :2], {})
+    scale = jnp.array([[1.0, -2.0, 3.0]] * 2), jnp.array([[0.5, 2.0, 4.0]] * 2)
+    points, probes = jnp.zeros((POINTS, 8)), Probes(jnp.zeros((POINTS, 3, 8)))
+    climbers = Climbers(probes, None, scale)  # pyright: ignore[reportArgumentType]
+
+    def gradients(points: jax.Array) -> jax.Array:
+        found = made._scored(points, climbers, jax.random.key(0))[0].gradients
+        return jax.vmap(white.whitened)(found, scale)
+
+    found = compiled(gradients)(points)
+    expected = ways / jnp.linalg.norm(ways, axis=1, keepdims=True)
+    np.testing.assert_allclose(found.reshape(-1, 8), expected, rtol=1e-4, atol=1e-5)
 
 
 def test_points_begin_again_from_elites() -> None:

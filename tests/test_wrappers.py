@@ -21,6 +21,7 @@ from newton_qd.types import Params
 from newton_qd.wrappers import (
     AutoResetWrapper,
     CompletedEvalWrapper,
+    DescriptorWrapper,
     EpisodeWrapper,
     EvalWrapper,
     FeetContactWrapper,
@@ -195,6 +196,51 @@ def test_auto_reset_clears_the_fault_at_the_next_step() -> None:
     assert int(healed.info["fault"]) == 0
     assert healed.info["fault"].dtype == np.int32
     assert float(healed.info["steps"]) == 1.0
+
+
+class Sticky(Line):
+    """A line on which what is done stays done."""
+
+    def step(self, state: State, action: jax.Array, params: Params = None) -> State:
+        after = super().step(state, action, params)
+        return after.replace(done=jnp.maximum(after.done, state.done))
+
+
+def test_auto_reset_clears_the_end_at_the_next_step() -> None:
+    states = play(AutoResetWrapper(EpisodeWrapper(Sticky(), 2, 1)), 4)
+    assert [float(state.done) for state in states] == [0, 0, 1, 0, 1]
+
+
+class Corners(DescriptorWrapper):
+    """A descriptor of whole numbers."""
+
+    limits = ((0, 0), (1, 1))
+
+    def describe(self, state: State) -> Any:
+        return [0, 1]
+
+
+def test_a_descriptor_has_the_type_of_its_environment() -> None:
+    found = Corners(Line(), "line").reset(KEY).info["state_descriptor"]
+    assert found.dtype == np.float32 and found.tolist() == [0, 1]
+
+
+class Place(Corners):
+    """A descriptor that is the observation itself."""
+
+    limits = ((0,), (1,))
+
+    def describe(self, state: State) -> Any:
+        return state.obs
+
+
+@pytest.mark.parametrize(
+    "env", [StateDescriptorResetWrapper(Line()), Place(Line(), "line")]
+)
+def test_wrappers_store_copies(env: Wrapper) -> None:
+    """A state with one buffer twice cannot be donated to a jitted step."""
+    leaves = jax.tree.leaves(env.reset(KEY))
+    assert len({id(leaf) for leaf in leaves}) == len(leaves)
 
 
 def test_state_descriptor_reset_touches_only_the_descriptor() -> None:

@@ -1,0 +1,82 @@
+"""What a URDF file may just say, and what just not."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from urdf_text import built, joint, link, refusal, robot_text, sphere
+
+from newton_qd.physics import reference
+from newton_qd.physics.model.elements import is_real
+from newton_qd.physics.model.verify import _same_frame
+from newton_qd.robots import Contact
+
+TWO = link("a"), link("b")
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "expected"),
+    [
+        ("-1e9", "1e9", (-math.inf, math.inf)),
+        ("-9.99e8", "9.99e8", (-9.99e8, 9.99e8)),
+        ("0", "0", (0.0, 0.0)),
+    ],
+)
+def test_limits_of_a_joint(
+    lower: str, upper: str, expected: tuple[float, float], tmp_path: Path
+) -> None:
+    limit = f'<limit lower="{lower}" upper="{upper}"/>'
+    system = built(
+        tmp_path, robot_text(*TWO, joint("j", "prismatic", "a", "b", limit)), "a"
+    )
+    assert (system.limit_lower[6], system.limit_upper[6]) == expected
+
+
+@pytest.mark.parametrize(("excess", "real"), [(1e-6, True), (1e-5, False)])
+def test_moments_may_be_rounded(excess: float, real: bool) -> None:
+    assert is_real(1.0, np.diag([1.0, 1.0, 2.0 + excess])) == real
+
+
+def test_opposite_quaternions_are_one_frame() -> None:
+    frame = np.array([1.0, 2.0, 3.0, 0.6, 0.0, 0.0, 0.8])
+    assert _same_frame(frame, frame * [1, 1, 1, -1, -1, -1, -1])
+    assert not _same_frame(frame, frame * [1, 1, 1, -1, 1, 1, 1])
+
+
+def test_a_turned_box_touches_with_its_corners(tmp_path: Path) -> None:
+    origin = '<origin xyz="0.1 0.2 0.3" rpy="0.3 -0.2 0.5"/>'
+    box = f'<collision>{origin}<geometry><box size="2 4 6"/></geometry></collision>'
+    system = built(tmp_path, robot_text(link("a", box)), "a", contacts=(Contact("a"),))
+    turn = reference.rotation_matrix(reference.rpy_quaternion(0.3, -0.2, 0.5))
+    local = (system.contact_position - [0.1, 0.2, 0.3]) @ turn
+    np.testing.assert_allclose(np.abs(local), np.tile([1.0, 2.0, 3.0], (8, 1)))
+    assert len(np.unique(np.sign(local), axis=0)) == 8
+
+
+REFUSED = {
+    "two shapes": (
+        link("a", sphere(0.1).replace("</geometry>", "<cone/></geometry>")),
+        "<geometry>: shape: got sphere, cone; allowed: exactly one",
+    ),
+    "two origins of a collider": (
+        link("a", sphere(0.1).replace("<geometry>", "<origin/><geometry>")),
+        "second <origin> of this collision",
+    ),
+    "a number whose square overflows": (
+        link("a", mass=1.1e9),
+        "value: got '1100000000.0'; allowed: 1 finite number(s) up to 1e+09",
+    ),
+    "a world of mass": (
+        link("world") + link("a") + joint("j", "continuous", "world", "a"),
+        "link: got a collider or a mass; allowed: neither on a robot's world link",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_refused_elements(name: str, tmp_path: Path) -> None:
+    text, message = REFUSED[name]
+    assert message in refusal(tmp_path, robot_text(text), "a")
