@@ -24,9 +24,9 @@ from newton_qd.physics.system import System
 
 TASK = "antmaze"
 WORST = -9000.0
-"""Fitness of the darkest points: near the start and far from the target."""
+"""Fitness of the darkest points: whole episodes far from the target."""
 BEST = -3000.0
-"""Fitness of the brightest points."""
+"""Fitness of the brightest points: episodes that end early, or near the target."""
 
 
 def draw(axes: Any, system: System, places: np.ndarray, found: np.ndarray) -> None:

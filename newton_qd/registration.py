@@ -97,6 +97,11 @@ def _refuse_robot(name: str, wrapper: object) -> None:
 
 
 def takes_robot(base: Callable[..., Env]) -> bool:
+    """Returns whether ``base`` has an argument ``robot``."""
+    return "robot" in inspect.signature(base).parameters
+
+
+def needs_robot(base: Callable[..., Env]) -> bool:
     """Returns whether ``base`` has an argument ``robot`` without a value."""
     parameter = inspect.signature(base).parameters.get("robot")
     return parameter is not None and parameter.default is parameter.empty

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import inspect
 from collections.abc import Callable, Mapping, Sequence
@@ -24,6 +25,7 @@ from newton_qd.registration import (
     check_names,
     check_wrappers,
     descriptor_specs,
+    needs_robot,
     takes_robot,
 )
 from newton_qd.robots import Material, RobotSpec
@@ -244,7 +246,7 @@ def _base(
     allowed = "newton_qd.robots.Material"
     checks.instance("material", material, Material, allowed, optional=True)
     _require_keywords(env_name, spec.base, options)
-    if "robot" not in options and takes_robot(spec.base):
+    if "robot" not in options and needs_robot(spec.base):
         why = f"and {getattr(spec.base, '__name__', 'base')} needs a robot"
         allowed = "a newton_qd.robots.RobotSpec, as robot=... of register or of create"
         raise TypeError(message("robot", None, allowed, why=why))
@@ -253,23 +255,27 @@ def _base(
         why = f"which {env_name!r} makes"
         raise TypeError(message("base", env, ENVIRONMENT, why=why))
     check_methods(env)
-    if "robot" not in options:
-        _require_robot(env_name, spec, env)
+    if not takes_robot(spec.base):
+        _require_robot(env_name, spec.robot, env)
     return env if material is None else env.with_material(material)
 
 
-def _require_robot(env_name: str, spec: EnvironmentSpec, env: Env) -> None:
+def _require_robot(env_name: str, robot: RobotSpec | None, env: Env) -> None:
     """Checks that the robot of ``register`` is the one inside the environment.
+
+    The base may have chosen another softness, and the number of substeps.
 
     Raises:
         TypeError: The base makes another robot, so it does not take the given one.
     """
     made = getattr(env.unwrapped, "robot", None)
-    if spec.robot is None or made is None or made == spec.robot:
+    if robot is None or not isinstance(made, RobotSpec):
         return
-    why = f"and {env_name!r} makes its own robot {made.name!r}"
-    allowed = "the robot that base makes, or a base with an argument robot"
-    raise TypeError(message("robot", spec.robot, allowed, why=why))
+    chosen = {"material": robot.material, "substeps": robot.substeps}
+    if dataclasses.replace(made, **chosen) != robot:
+        why = f"and {env_name!r} makes its own robot {made.name!r}"
+        allowed = "the robot that base makes, or a base with an argument robot"
+        raise TypeError(message("robot", robot, allowed, why=why))
 
 
 def _require_keywords(

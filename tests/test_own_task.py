@@ -46,6 +46,14 @@ def test_steering_needs_the_length_of_the_state_descriptor(name: str) -> None:
         evolve(CONFIG.replace(algorithm=name), task_factory=task_of, progress=False)
 
 
+def test_a_run_is_no_longer_than_the_episodes_of_its_environment() -> None:
+    longer = CONFIG.replace(episode_length=6)
+    with pytest.raises(
+        ConfigError, match=r"^episode_length: got 6; allowed: at most 5"
+    ):
+        evolve(longer, task_factory=lambda _: task_of(CONFIG), progress=False)
+
+
 def test_map_elites_takes_any_length() -> None:
     result = evolve(CONFIG, task_factory=task_of, progress=False)
     assert result.archive.filled.any()

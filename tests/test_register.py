@@ -19,7 +19,7 @@ from newton_qd.envs.pointmaze import PointMaze
 from newton_qd.extractors import (
     get_feet_contact_proportion,
 )
-from newton_qd.robots import ANT
+from newton_qd.robots import ANT, Material, RobotSpec
 from newton_qd.wrappers import (
     FeetContactWrapper,
     OffsetRewardWrapper,
@@ -252,3 +252,18 @@ def test_a_robot_that_the_base_does_not_take_is_refused(rows: None) -> None:
         newton_qd.create("weak_ant")
     newton_qd.register("same_ant", Ant, robot=ANT)
     newton_qd.create("same_ant")
+
+    def softer(**options: Any) -> newton_qd.Env:
+        return Ant(**options).with_material(Material(friction=0.3))
+
+    newton_qd.register("softer_ant", softer, robot=ANT)
+    newton_qd.create("softer_ant")
+
+    class OnLegs(Hopper):
+        def __init__(self, robot: RobotSpec = ANT, dtype: str = "float32") -> None:
+            super().__init__(dtype=dtype)
+            self.given = robot
+
+    newton_qd.register("on_legs", OnLegs, robot=weak)
+    made: Any = newton_qd.create("on_legs").unwrapped
+    assert made.given is weak

@@ -74,7 +74,7 @@ def _import(name: str) -> None:
         try:
             spec.loader.exec_module(module)
         except BaseException:  # as Python's import does
-            del sys.modules[path.stem]
+            sys.modules.pop(path.stem, None)
             raise
         return
     try:

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from newton_qd.checks import Fact, message
+from newton_qd.checks import Error, Fact, message
 from newton_qd.envs.base import Env
 from newton_qd.types import Environment, Genotype
 from newton_qd.wrappers.base import outermost
@@ -46,8 +46,15 @@ def check_first(env: Any, first: Any, described: bool) -> None:
         raise ValueError(message("env", given, allowed))
 
 
-def check_length(env: Environment, episode_length: int) -> None:
+def check_length(
+    env: Environment, episode_length: int, error: Error = ValueError
+) -> None:
     """Checks that the environment does not end episodes before.
+
+    Args:
+        env: The environment.
+        episode_length: Control steps of an episode.
+        error: Class to raise instead.
 
     Raises:
         ValueError: It does.
@@ -58,7 +65,7 @@ def check_length(env: Environment, episode_length: int) -> None:
     most = -(-limit.episode_length // limit.action_repeat)
     if episode_length > most:
         allowed = f"at most {most}, the steps after which the environment ends"
-        raise ValueError(message("episode_length", episode_length, allowed))
+        raise error(message("episode_length", episode_length, allowed))
 
 
 def check_weights(genotypes: Genotype, weights: Any) -> None:

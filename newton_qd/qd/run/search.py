@@ -14,6 +14,7 @@ from jax.sharding import Mesh
 
 from newton_qd.checks import message
 from newton_qd.errors import require_extra
+from newton_qd.gradients.episode_input import check_length
 from newton_qd.qd.algorithms import AlgorithmSpec, algorithm_named
 from newton_qd.qd.algorithms.options import refused_options
 from newton_qd.qd.config import ConfigError, EvolveConfig, settings_text
@@ -92,9 +93,11 @@ class Search:
         Raises:
             MissingExtra: QDax is not installed.
             ConfigError: The algorithm or one of its options does not exist, or it
-                does not run with these settings.
+                does not run with these settings, or the environment of ``task`` ends
+                episodes before.
         """
         require_extra("qdax", "qd")
+        check_length(task.env, config.episode_length, error=ConfigError)
         self._algorithm = _runnable(config)
         self.options = self._algorithm.read_options(config)
         self._config = config

@@ -101,7 +101,7 @@ class Task:
         if length != self.descriptor_length:
             given = Fact(f"descriptors of length {self.descriptor_length}")
             allowed = f"length {length}, that of the state descriptor, for this "
-            allowed += "algorithm; me, me-gradient and omg-mega take any length"
+            allowed += "algorithm; others, such as me, take any length"
             raise ConfigError(message("descriptor_extractor", given, allowed))
 
 
