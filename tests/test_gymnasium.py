@@ -145,6 +145,9 @@ def test_worlds_of_a_vector_begin_as_single_ones() -> None:
     for kind in (np.int32, np.uint8):
         observations, _ = many.reset(seed=np.array([9, 1, 4], kind))  # pyright: ignore[reportArgumentType]
         assert np.array_equal(observations, [one.reset(seed=n)[0] for n in (9, 1, 4)])
+    for large in (2**70, [2**63 + 1, 2, 3]):
+        first = large if isinstance(large, int) else large[0]
+        assert np.array_equal(many.reset(seed=large)[0][0], one.reset(seed=first)[0])
     for seeds in ([1.5, 2, 3], [None, 1, 2], [1, 2]):
         with pytest.raises(ValueError, match=r"seed: got .*; allowed: an integer, or"):
             many.reset(seed=seeds)  # pyright: ignore[reportArgumentType]

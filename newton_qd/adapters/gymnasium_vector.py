@@ -141,16 +141,9 @@ class GymnasiumVectorEnv(Pickled, gymnasium.vector.VectorEnv):
                 integer.
             gymnasium.error.ResetNeeded: There is a mask, and there was no reset.
         """
-        seeds = None
-        if seed is not None:
-            several = not isinstance(seed, (int, np.integer))
-            seeds = (
-                np.asarray(seed) if several else int(seed) + np.arange(self.num_envs)
-            )
-            if seeds.shape != (self.num_envs,) or seeds.dtype.kind not in "iu":
-                allowed = f"an integer, or {self.num_envs} integers"
-                raise ValueError(message("seed", seed, allowed))
-            super().reset(seed=int(seeds[0]))
+        seeds = None if seed is None else self._seeds(seed)
+        if seeds is not None:
+            super().reset(seed=seeds[0])
             self._spare = None
         mask = (options or {}).get("reset_mask")
         if mask is not None:
@@ -214,7 +207,7 @@ class GymnasiumVectorEnv(Pickled, gymnasium.vector.VectorEnv):
             for n, eye in enumerate(self._eyes)
         )
 
-    def _reset_some(self, mask: np.ndarray, seeds: np.ndarray | None) -> None:
+    def _reset_some(self, mask: np.ndarray, seeds: Sequence[int] | None) -> None:
         """Resets the worlds of a mask.
 
         Raises:
@@ -233,11 +226,28 @@ class GymnasiumVectorEnv(Pickled, gymnasium.vector.VectorEnv):
             self.state = self._place(self.state, self._fresh(seeds), mask, own)
         self._ended = self._ended & ~mask
 
-    def _fresh(self, seeds: np.ndarray | None) -> State:
+    def _seeds(self, seed: int | Sequence[int]) -> list[int]:
+        """Returns the seed of each world.
+
+        Raises:
+            ValueError: They have the wrong shape, or one is not an integer.
+        """
+        if isinstance(seed, (int, np.integer)):
+            return [int(seed) + n for n in range(self.num_envs)]
+        seeds = np.asarray(seed, object)  # integers of any size and kind
+        whole = [isinstance(one, (int, np.integer)) for one in seeds.flat]
+        if seeds.shape != (self.num_envs,) or not all(whole):
+            allowed = f"an integer, or {self.num_envs} integers"
+            raise ValueError(message("seed", seed, allowed))
+        return [int(one) for one in seeds]
+
+    def _fresh(self, seeds: Sequence[int] | None) -> State:
         """Returns first states of all worlds, from seeds or from random numbers."""
         if seeds is None:
-            seeds = self.np_random.integers(2**32, size=self.num_envs)
-        return self._reset(self._keys(seeds.astype(np.uint32)))  # modulo 2**32
+            drawn = self.np_random.integers(2**32, size=self.num_envs)
+        else:
+            drawn = np.array([seed % 2**32 for seed in seeds])
+        return self._reset(self._keys(drawn.astype(np.uint32)))
 
     def _begun(self, state: State, begins: np.ndarray) -> State:
         """Returns the state with new episodes in some worlds.

@@ -1,4 +1,4 @@
-"""Whether numbers are within limits, with or without a gradient, and what it means."""
+"""Whether a number is within limits: 0 or 1, with or without a gradient."""
 
 from __future__ import annotations
 
