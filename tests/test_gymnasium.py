@@ -148,7 +148,7 @@ def test_worlds_of_a_vector_begin_as_single_ones() -> None:
     for large in (2**70, [2**63 + 1, 2, 3]):
         first = large if isinstance(large, int) else large[0]
         assert np.array_equal(many.reset(seed=large)[0][0], one.reset(seed=first)[0])
-    for seeds in ([1.5, 2, 3], [None, 1, 2], [1, 2]):
+    for seeds in ([1.5, 2, 3], [None, 1, 2], [1, 2], [True, 2, 3]):
         with pytest.raises(ValueError, match=r"seed: got .*; allowed: an integer, or"):
             many.reset(seed=seeds)  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="num_envs: got 0; allowed: integers from 1"):

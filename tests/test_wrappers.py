@@ -148,11 +148,17 @@ def test_worlds_that_cannot_fit_are_refused(monkeypatch: pytest.MonkeyPatch) -> 
     assert VectorWrapper(Line(), 200_000).batch_size == 200_000
 
 
-def test_memory_is_that_of_the_device_of_new_arrays() -> None:
-    where = jax.devices()[0]
-    with jax.default_device(where):
-        found = jax.jit(lambda x: x + (memory.limit_here() == memory.limit(where)))(0)
-    assert found == 1
+def test_memory_is_that_of_the_device_of_new_arrays(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Not that of the first device, also while a function is traced."""
+    asked = []
+    monkeypatch.setattr(memory, "limit", asked.append)
+    (where,) = jax.device_put(0.0).devices()
+    monkeypatch.setattr(jax, "devices", None)
+    jax.eval_shape(lambda: memory.limit_here())
+    VectorWrapper(Line(), 200_000)
+    assert asked == [where, where]
 
 
 def test_vector_makes_worlds_and_steps_any_number() -> None:

@@ -235,7 +235,10 @@ class GymnasiumVectorEnv(Pickled, gymnasium.vector.VectorEnv):
         if isinstance(seed, (int, np.integer)):
             return [int(seed) + n for n in range(self.num_envs)]
         seeds = np.asarray(seed, object)  # integers of any size and kind
-        whole = [isinstance(one, (int, np.integer)) for one in seeds.flat]
+        whole = [
+            isinstance(one, (int, np.integer)) and not isinstance(one, bool)
+            for one in seeds.flat
+        ]
         if seeds.shape != (self.num_envs,) or not all(whole):
             allowed = f"an integer, or {self.num_envs} integers"
             raise ValueError(message("seed", seed, allowed))
