@@ -1,4 +1,4 @@
-"""Actors that learn over short horizons, on a point that is pushed about."""
+"""Actors that learn over short windows, on a point that is pushed about."""
 
 from __future__ import annotations
 

@@ -100,7 +100,7 @@ def _evaluations(config: EvolveConfig, options: ArborescenceActorOptions) -> int
 CMA_MAEGA_ACTOR_CRITIC = AlgorithmSpec(
     name="cma-maega-actor-critic",
     summary="CMA-MAEGA for large policies: gradients of the solution points come from "
-    "actors that learn over short horizons, and such actors move the points",
+    "actors that learn over short windows, and such actors move the points",
     make=_make,
     options=ArborescenceActorOptions,
     tuned={

@@ -19,7 +19,7 @@ if TYPE_CHECKING:  # importing a list of algorithms imports no JAX
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LearningOptions(DifferentiableOptions, ActorCriticSettings):
-    """Options of an algorithm whose actors learn over short horizons."""
+    """Options of an algorithm whose actors learn over short windows."""
 
 
 def learning_method(

@@ -1,4 +1,4 @@
-"""MAP-Elites with actors that learn over short horizons."""
+"""MAP-Elites with actors that learn over short windows."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ _ACTORS = {"ant_omni": _LONG, **dict.fromkeys(MAZES, _STEERED)}
 
 
 def _make(context: EmitterContext, options: ActorCriticOptions) -> Any:
-    """MAP-Elites with the policies of actors that learn over short horizons.
+    """MAP-Elites with the policies of actors that learn over short windows.
 
     Raises:
         ConfigError: The actors have more offspring than a generation can contain.
@@ -108,7 +108,7 @@ def _evaluations(config: EvolveConfig, options: ActorCriticOptions) -> int:
 
 ME_ACTOR_CRITIC = AlgorithmSpec(
     name="me-actor-critic",
-    summary="MAP-Elites with actors that learn over short horizons from gradients of "
+    summary="MAP-Elites with actors that learn over short windows from gradients of "
     "the physics; some actors increase fitness, others move along directions of the "
     "descriptor; a part of the offspring lies between actors and elites",
     make=_make,

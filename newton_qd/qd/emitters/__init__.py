@@ -1,6 +1,6 @@
 """Emitters for QDax that use exact gradients.
 
-- ``ActorCriticEmitter``: policies of actors that learn over short horizons with
+- ``ActorCriticEmitter``: policies of actors that learn over short windows with
   ``ActorCritic``, and then from whole episodes with ``EpisodeLearning``
 - ``ConditionedActorEmitter``: policies of one such actor that is told the descriptor
 - ``AscentEmitter``: elites that climb along the gradient of their return, step by step

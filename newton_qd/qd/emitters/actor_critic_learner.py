@@ -1,4 +1,4 @@
-"""Actors that learn over short horizons with gradients of the physics."""
+"""Actors that learn over short windows with gradients of the physics."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Settings of actors that learn over short horizons; this module imports no JAX."""
+"""Settings of actors that learn over short windows; this module imports no JAX."""
 
 from __future__ import annotations
 

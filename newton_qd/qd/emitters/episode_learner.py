@@ -17,7 +17,7 @@ from newton_qd.types import Environment, PyTree
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class EpisodeLearning:
-    r"""How actors go on after they have learnt over short horizons.
+    r"""How actors go on after they have learnt over short windows.
 
     An actor follows the exact gradient of whole episodes, without a critic and without
     a limit of the adjoint. With the aim :math:`w`, it maximizes the mean over its
