@@ -311,7 +311,7 @@ def contact_impulses(
 
 
 def to_jax(array: wp.array) -> jax.Array:
-    """View a Warp array as a JAX array without a copy.
+    """Views a Warp array as a JAX array without a copy.
 
     The view must not be written to. It shows what Warp writes to the memory later.
 
@@ -328,7 +328,7 @@ def to_jax(array: wp.array) -> jax.Array:
 
 
 def from_jax(array: jax.Array, dtype: type | None = None) -> wp.array:
-    """View a JAX array as a Warp array without a copy.
+    """Views a JAX array as a Warp array without a copy.
 
     JAX arrays are immutable: never write to the view.
 

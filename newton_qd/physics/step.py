@@ -125,7 +125,7 @@ def step(
     control: jax.Array,
     params: PhysicsParams | Foreseen | None = None,
 ) -> tuple[PhysicsState, jax.Array]:
-    """Advance one world by one control step.
+    """Advances one world by one control step.
 
     Args:
         system: The system.
@@ -165,7 +165,7 @@ def rollout(
     controls: jax.Array,
     params: PhysicsParams | None = None,
 ) -> Foreseen:
-    """Advance one world by a plan of controls.
+    """Advances one world by a plan of controls.
 
     The results equal those of :func:`step` in ``jax.lax.scan``, bit by bit. On a CPU
     all steps are one call, and so is their gradient, which stores one state for each

@@ -1,6 +1,6 @@
 """Quality-Diversity with the environments: settings, loop and results.
 
-- ``evolve(EvolveConfig(...), out=...)``: MAP-Elites on a registered environment
+- ``evolve(EvolveConfig(...), out=...)``: an archive for a registered environment
 - ``study_config("ant_uni", "me-actor-critic")``: the settings of the study
 - ``register_algorithm(AlgorithmSpec(...))``: an algorithm of your own for ``evolve``
 - ``newton_qd.qd.emitters``: emitters for QDax that use exact gradients, and

@@ -354,8 +354,9 @@ def load_system(
     """Returns the system of a robot. It is built once for the same arguments and files.
 
     A wall that does not hold the robot at 10 m/s gives a ``SoftWallWarning``:
-    :func:`~newton_qd.physics.wall_speeds`. Substeps in which a joint can turn too far
-    give a ``FewSubstepsWarning``: :func:`~newton_qd.physics.recommended_substeps`.
+    :func:`~newton_qd.physics.wall_speeds`. Too long substeps give a
+    ``FewSubstepsWarning``: :func:`~newton_qd.physics.recommended_substeps`. A joint
+    that carries much more than its limits hold gives a ``SoftLimitWarning``.
 
     Args:
         robot: The robot.

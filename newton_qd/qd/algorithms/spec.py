@@ -28,7 +28,7 @@ class EmitterContext:
         score: Scoring function of genotypes (N, size) and a key. The key has no effect
             unless each generation has new start states: all evaluations of a run begin
             in the same states.
-        reset_key: Key of the reset to this state.
+        reset_key: Key of the reset to these states.
         centroids: (cells, D) centres of the cells.
     """
 

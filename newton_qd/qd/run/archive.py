@@ -32,7 +32,7 @@ class Archive:
 
     Attributes:
         genotypes: (cells, parameters) policy weights, zero in empty cells.
-        fitnesses: (cells,) returns, ``-inf`` in empty cells.
+        fitnesses: (cells,) fitnesses, ``-inf`` in empty cells.
         descriptors: (cells, D) descriptors, zero in empty cells.
         centroids: (cells, D) centres of the cells.
     """

@@ -55,7 +55,7 @@ class Checkpoint:
         settings: Settings of the run as JSON, to detect files of another run.
         iteration: Generations that are finished.
         genotypes: (cells, parameters) policy weights, zero in empty cells.
-        fitnesses: (cells,) returns, ``-inf`` in empty cells.
+        fitnesses: (cells,) fitnesses, ``-inf`` in empty cells.
         descriptors: (cells, D) descriptors, zero in empty cells.
         centroids: (cells, D) centres of the cells.
         metrics: (iteration + 1, columns) rows of ``metrics.csv``.

@@ -45,7 +45,7 @@ class EvolveResult:
 
     Attributes:
         config: Settings with a grid or a number of centroids.
-        archive: The individuals, one row per cell.
+        archive: The elites, one row per cell.
         metrics: Name of each column of ``metrics.csv`` to its values
             (iteration + 1,).
         iteration: Generations that are finished; -1 if a signal came before the

@@ -221,7 +221,7 @@ class Run:
         return archive_figure(self.archive, self.config, self.task, self.iteration)
 
     def plot_curves(self) -> Figure:
-        """Draws QD score, coverage and best fitness over the generations.
+        """Draws QD score, coverage and best fitness over the evaluations.
 
         Raises:
             MissingExtra: matplotlib is not installed.

@@ -45,8 +45,8 @@ class Task:
             score only.
         network: Network of the policies, as for ``policy_of``; ``None``: a perceptron
             with the hidden layers of the settings.
-        episode_length: Control steps of an episode. An own ``descriptor_extractor`` is
-            tried with so many steps, see ``reads_end``.
+        episode_length: Control steps of an episode; with so many, ``reads_end`` tries a
+            ``descriptor_extractor`` of your own.
     """
 
     env: Any
