@@ -24,6 +24,7 @@ from newton_qd.qd.emitters.actor_critic_learner import (
     ActorCriticSettings,
     measure_of,
 )
+from newton_qd.qd.emitters.restarts import due_for_restart
 
 # These programs run for milliseconds: they need no optimizer.
 compiled = functools.partial(
@@ -324,6 +325,14 @@ def test_steered_actors_begin_again() -> None:
     assert not (changed[:, 1] & changed[:, 2]).any()
 
 
+def test_a_long_life_is_counted_in_64_bits() -> None:
+    # 63 * 2**30 has more than 32 bits
+    for generation in (1, 2**24, 2**30 - 1):
+        due = due_for_restart(jnp.int32(generation), 2**30, 64)
+        ages = (generation + np.arange(64) * 2**24) % 2**30
+        np.testing.assert_array_equal(due, ages == 0)
+
+
 @pytest.mark.parametrize("share", [0.0, 1.0])
 def test_directions_can_lead_to_empty_cells(share: float) -> None:
     archive: Any
@@ -361,6 +370,7 @@ def test_lost_gradients_are_told() -> None:
         ({"actors": 0}, "actors: got 0; allowed: .* from 1"),
         ({"copies": 0}, "copies: got 0; allowed: .* from 1"),
         ({"lifetime": 0}, "lifetime: got 0; allowed: .* from 1"),
+        ({"lifetime": 2**31}, "lifetime: got 2147483648; allowed: .* 1073741824"),
         ({"spread": (0.1, 0.01)}, r"spread: got \(0.1, .*; .*0 < smallest <= largest"),
         ({"steered": -0.1}, "steered: got -0.1; .* from 0 to 1"),
         ({"to_empty": 1.1}, "to_empty: got 1.1; .* from 0 to 1"),

@@ -17,6 +17,7 @@ from newton_qd.envs.state import select
 from newton_qd.qd.emitters.actor_critic_learner import ActorCritic, Learner
 from newton_qd.qd.emitters.cells import draw_cells, empty_targets
 from newton_qd.qd.emitters.episode_learner import EpisodeLearning
+from newton_qd.qd.emitters.restarts import LONGEST_LIFE, due_for_restart
 from newton_qd.types import (
     ExtraScores,
     Genotype,
@@ -119,8 +120,9 @@ class ActorCriticEmitter(Emitter):
         """
         counts = {"actors": actors, "branches": branches, "copies": copies}
         counts = {**counts, "updates": updates}
-        for name, value in {**counts, "lifetime": lifetime}.items():
+        for name, value in counts.items():
             checks.integer(name, value, most=None)
+        checks.integer("lifetime", lifetime, most=LONGEST_LIFE)
         if not 0 < spread[0] <= spread[1]:
             raise ValueError(message("spread", spread, "0 < smallest <= largest"))
         for name, share in {"steered": steered, "to_empty": to_empty}.items():
@@ -341,10 +343,7 @@ class ActorCriticEmitter(Emitter):
             empty_key = jax.random.fold_in(aim_key, 1)
             aims = self._toward_empty(aims, repertoire, cells, empty_key)
         new = self._begun(critic_key, weights, aims)
-        number = jnp.arange(self._actors)
-        # one after the other, so that there are actors of all ages
-        turn = number * self._lifetime // max(self._actors, 1)
-        due = (state.generation + turn) % self._lifetime == 0
-        steered = number >= self._actors - self._steered
+        due = due_for_restart(state.generation, self._lifetime, self._actors)
+        steered = jnp.arange(self._actors) >= self._actors - self._steered
         begun = state.generation > 0
         return select(due & steered & begun, new, state.learners)

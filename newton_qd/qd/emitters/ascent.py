@@ -8,20 +8,17 @@ from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from qdax.core.emitters.emitter import Emitter
 
 from newton_qd import checks
 from newton_qd.envs.state import select
 from newton_qd.gradients.episode import Episode
 from newton_qd.qd.emitters.cells import draw_cells
+from newton_qd.qd.emitters.restarts import LONGEST_LIFE, due_for_restart
 from newton_qd.types import ExtraScores, Genotype, PyTree, Repertoire, RNGKey
 
 Slope: TypeAlias = Callable[[jax.Array, RNGKey], tuple[jax.Array, jax.Array]]
 """Maps weights (N, size) and a key to gradients (N, size), and whether each is lost."""
-
-MOST_STEPS = 2**30
-"""Largest lifetime of a climber: JAX counts in 32 bits."""
 
 LOST = "climbers_overflowed"
 """Name of what tells which gradients are lost; other emitters have ``overflowed``."""
@@ -152,7 +149,7 @@ class AscentEmitter(Emitter):
         """
         checks.function("slope", slope, "a function of weights and a key")
         checks.integer("climbers", climbers)
-        checks.integer("lifetime", lifetime, most=MOST_STEPS)
+        checks.integer("lifetime", lifetime, most=LONGEST_LIFE)
         checks.number("shortest", shortest, above=0)
         checks.number("longest", longest, least=shortest)
         checks.number("momentum", momentum, least=0, below=1)
@@ -203,10 +200,8 @@ class AscentEmitter(Emitter):
         del genotypes, fitnesses, descriptors, extra_scores
         state = emitter_state
         key, begin_key, slope_key = jax.random.split(state.key, 3)
-        # one after the other, so that there are climbers of all ages
-        turn = np.arange(self._climbers) * self._lifetime // self._climbers
-        age = state.generation % self._lifetime + turn.astype(np.int32)
-        due = (age % self._lifetime == 0) | state.lost
+        due = due_for_restart(state.generation, self._lifetime, self._climbers)
+        due |= state.lost
         own = state.weights, state.motion, state.steps
         weights, motion, steps = select(due, self._begun(repertoire, begin_key), own)
         slopes, lost = self._slope(weights, slope_key)

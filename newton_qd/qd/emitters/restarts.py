@@ -1,8 +1,14 @@
-"""Rules for the restart of a solution point from an elite."""
+"""Rules for the restart of a solution point, an actor or a climber from an elite."""
 
 from __future__ import annotations
 
 import enum
+
+import jax
+import numpy as np
+
+LONGEST_LIFE = 2**30
+"""Largest lifetime [generations]: JAX counts in 32 bits."""
 
 
 class RestartRule(enum.Enum):
@@ -16,3 +22,18 @@ class RestartRule(enum.Enum):
 
     NO_IMPROVEMENT = "no_improvement"
     BASIC = "basic"
+
+
+def due_for_restart(generation: jax.Array, lifetime: int, count: int) -> jax.Array:
+    """Returns which of several actors are at the end of their lifetime (count,).
+
+    They restart one after the other, so that there are actors of all ages.
+
+    Args:
+        generation: () number of generations so far.
+        lifetime: Generations between two restarts of an actor, at most 2^30.
+        count: Number of actors.
+    """
+    # with 64 bits, because the product may have more than 32
+    turn = (np.arange(count, dtype=np.int64) * lifetime // count).astype(np.int32)
+    return (generation % lifetime + turn) % lifetime == 0
