@@ -35,6 +35,8 @@ def test_arguments_of_an_arborescence() -> None:
         CMAMEGAEmitter(NOTHING, sigma_g=0.1)
     with pytest.raises(ValueError, match=r"batch_size: got 2; allowed: .* from 3"):
         CMAMEGAEmitter(score, sigma_g=0.1, batch_size=2)
+    with pytest.raises(ValueError, match="restart_period: got 2147483648; allowed: "):
+        CMAMEGAEmitter(score, sigma_g=0.1, restart_period=2**31)
     with pytest.raises(TypeError, match="optimizer: got 'nope'; allowed: one of optax"):
         CMAMEGAEmitter(score, sigma_g=0.1, optimizer=wrong)
     with pytest.raises(ValueError, match="got 'nope'; allowed: no_improvement, basic"):

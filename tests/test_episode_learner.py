@@ -212,6 +212,7 @@ def test_a_run_counts_the_longer_of_both() -> None:
     ("changes", "text"),
     [
         ({"after": -1}, "after: got -1; allowed: .* from 0"),
+        ({"after": 2**31}, "after: got 2147483648; allowed: .* from 0 to 2147483647"),
         ({"updates": 0}, "updates: got 0; allowed: .* from 1"),
         ({"weight_noise": -0.1}, "weight_noise: got -0.1; allowed: .* from 0"),
     ],

@@ -107,7 +107,7 @@ class ArborescenceEmitter(Emitter, abc.ABC):
             ("num_emitters", num_emitters, 1),
             ("restart_period", 1 if restart_period is None else restart_period, 1),
         ):
-            checks.integer(name, value, least=low, most=None)
+            checks.integer(name, value, least=low)
         checks.number("sigma_g", sigma_g, above=0)
         self._scoring_function = scoring_function
         self._sigma_g = sigma_g

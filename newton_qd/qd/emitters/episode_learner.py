@@ -64,7 +64,7 @@ class EpisodeLearning:
             TypeError: A number has a wrong type.
             ValueError: A number is out of its range.
         """
-        checks.integer("after", self.after, least=0, most=None)
+        checks.integer("after", self.after, least=0)
         checks.integer("updates", self.updates, most=None)
         checks.number("weight_noise", self.weight_noise, least=0)
 
