@@ -103,6 +103,29 @@ def test_a_fall_does_not_come_nearer() -> None:
     assert float(outside.reward) < float(inside.reward) - 0.5 * steps_away
 
 
+class Counted(Placed):
+    """An episode that is over by its length alone."""
+
+    def step(self, state: Any, action: jax.Array) -> Any:
+        after, one = super().step(state, action), jnp.ones((), jnp.float32)
+        info = {**after.info, "truncation": one - after.done}
+        return dataclasses.replace(after, done=one, info=info)
+
+
+def test_the_length_of_an_episode_is_no_fall() -> None:
+    env: Any = Counted()
+    weights, action = jnp.float32([0, 0.5]), jnp.float32([0, 0])
+    first = env._state(jnp.float32([0, 1.9]), jnp.float32(0))
+    rewards = []
+    for world in (env, Placed()):
+        aimed = AimedEnv(dataclasses.replace(task(), env=world), LENGTH)
+        state = aimed.aimed(first, jnp.zeros(2), weights)
+        rewards.append(aimed.step(state, action).reward)
+        fallen = aimed.step(state, jnp.float32([0, 1.0]))
+        assert float(fallen.reward) < float(rewards[-1]) - 0.5 * 30 * 2**0.5
+    assert float(rewards[0]) == float(rewards[1])
+
+
 def test_an_actor_is_a_policy_of_the_archive_for_each_target() -> None:
     """The perceptron of observation and target, written out."""
     own = ConditionedPolicy(policy(), 2)

@@ -139,7 +139,9 @@ class AimedEnv:
         error = reached if self._final else state.error + reached / self.episode_length
         nearer = self.episode_length * (_length(state.error) - _length(error))
         fall = _FALL * self.task.descriptor_length**0.5
-        paid = nearer - jnp.where(after.done > 0, fall, 0).astype(nearer.dtype)
+        # an episode that reaches its length is done, and did not fall
+        fell = after.done > after.info.get("truncation", 0)
+        paid = nearer - jnp.where(fell, fall, 0).astype(nearer.dtype)
         reward = state.weights[0] * after.reward + state.weights[1] * paid
         return AimedState(after, state.target, error, state.weights, reward)
 
