@@ -3,13 +3,26 @@
 from __future__ import annotations
 
 import contextlib
+import glob
 import os
+import secrets
+from collections.abc import Iterator
 from pathlib import Path
 
 
 def temporary_name(path: Path) -> Path:
-    """Returns the name of the temporary file that later replaces ``path``."""
-    return path.with_name(f".{path.name}.tmp")
+    """Returns a new name of a temporary file that later replaces ``path``.
+
+    Two writers of one file must not share it: one would rename what the other has not
+    completed.
+    """
+    return path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+
+
+def temporary_files(path: Path) -> Iterator[Path]:
+    """Yields the temporary files of ``path``: of killed writers, or of one at work."""
+    # an earlier version had one name for all writers: .NAME.tmp
+    return path.parent.glob(f".{glob.escape(path.name)}*.tmp")
 
 
 def write_atomically(path: Path, content: bytes) -> None:

@@ -27,6 +27,7 @@ from newton_qd import cli, files
 from newton_qd.qd.config import read_config
 from newton_qd.qd.run.archive import Archive, ArchiveError, archive_bytes, load_archive
 from newton_qd.qd.run.checkpoint import CheckpointError, load_checkpoint
+from newton_qd.qd.run.folder import RunFolder
 from newton_qd.qd.run.search import Search
 
 __all__ = ["compile_once", "reference"]  # fixtures
@@ -160,6 +161,36 @@ def test_a_full_disk_loses_nothing(
         assert not [entry for entry in out.iterdir() if entry.name.endswith(".tmp")]
         run(config, out=out, resume=True)
         assert_same_results(out, expected)
+
+
+def test_two_writers_of_one_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second one begins and ends while the first one writes."""
+    path, sync = tmp_path / "archive.png", os.fsync
+
+    def meanwhile(number: int) -> None:
+        monkeypatch.setattr(files.os, "fsync", sync)
+        files.write_atomically(path, b"second")
+        assert path.read_bytes() == b"second"
+
+    monkeypatch.setattr(files.os, "fsync", meanwhile)
+    files.write_atomically(path, b"first")
+    assert path.read_bytes() == b"first"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_unfinished_files_of_a_killed_run_are_removed(tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path)
+    left = [files.temporary_name(tmp_path / "checkpoint.bin") for _ in range(2)]
+    left.append(tmp_path / ".metrics.csv.tmp")  # of an earlier version
+    drawn = files.temporary_name(tmp_path / "archive.png")
+    for part in (*left, drawn):
+        part.touch()
+    folder.check(resume=False)
+    with folder.lock():
+        # newton-qd plot may write it now
+        assert list(tmp_path.iterdir()) == [drawn]
 
 
 def test_a_read_only_folder_is_named(

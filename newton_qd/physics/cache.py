@@ -36,6 +36,4 @@ def keep(path: Path, content: bytes) -> None:
     """Keeps bytes for later processes, if the folder can be written."""
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        # Another process may write the same file now, under the same temporary name.
-        # It writes the same bytes, and who reads a part of them sees it by the digest.
         write_atomically(path, hashlib.sha256(content).digest() + content)

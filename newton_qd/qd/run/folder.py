@@ -19,7 +19,7 @@ import numpy as np
 
 from newton_qd import checks
 from newton_qd.checks import Fact, message
-from newton_qd.files import temporary_name, write_atomically
+from newton_qd.files import temporary_files, write_atomically
 from newton_qd.qd.algorithms import algorithm_named
 from newton_qd.qd.config import (
     ConfigError,
@@ -47,7 +47,8 @@ PICTURE = "archive.png"
 REEVALUATED = "corrected.json"  # a name that earlier versions know
 START = "start.npz"
 EVENTS = "tensorboard"
-_FILES = (CONFIG, CHECKPOINT, METRICS, ARCHIVE, PICTURE, REEVALUATED, START)
+_OWN_FILES = (CONFIG, CHECKPOINT, METRICS, ARCHIVE, REEVALUATED, START)
+_FILES = (*_OWN_FILES, PICTURE)  # newton-qd plot writes the picture, too
 
 COLUMNS = (
     "iteration",
@@ -122,10 +123,14 @@ class RunFolder:
         """Whether the folder has other files than unfinished files of a killed run."""
         if not self.path.exists():
             return False
-        ignored = {temporary_name(Path(name)).name for name in _FILES}
+        ignored = {part.name for part in self._unfinished(*_FILES)}
         if not self.has_config:  # killed between this file and the settings
             ignored.add(START)
         return any(entry.name not in ignored for entry in self.path.iterdir())
+
+    def _unfinished(self, *names: str) -> list[Path]:
+        """Returns the unfinished files of a killed run."""
+        return [part for name in names for part in temporary_files(self.path / name)]
 
     @contextlib.contextmanager
     def lock(self) -> Iterator[None]:
@@ -152,6 +157,8 @@ class RunFolder:
             except BlockingIOError as error:
                 why = "and another process is writing to it"
                 raise self._refused(why, "a folder for each run") from error
+            for part in self._unfinished(*_OWN_FILES):
+                part.unlink(missing_ok=True)
             yield
         finally:
             os.close(descriptor)
