@@ -144,6 +144,25 @@ def test_options_out_of_range_are_refused(
         run(SMALL.replace(algorithm=name, options=options))
 
 
+@pytest.mark.parametrize(
+    ("options", "grid", "message"),
+    [
+        ({}, (2, 2), "explore_num_cell_sample: got 5; allowed: at most 4: the cells"),
+        (
+            {"exploit_num_cell_sample": 6},
+            (4, 4),
+            "exploit_num_cell_sample: got 6; allowed: at most 5: .* last_updated_size",
+        ),
+    ],
+)
+def test_parents_of_an_evolution_strategy_are_elites(
+    options: dict[str, Any], grid: tuple[int, ...], message: str
+) -> None:
+    config = SMALL.replace(algorithm="me-es", options=options, grid=grid)
+    with pytest.raises(ConfigError, match=message):
+        run(config)
+
+
 @pytest.mark.parametrize("name", ["cma-me", "pga-me", "me-es"])
 def test_one_individual_is_too_few(name: str) -> None:
     config = SMALL.replace(algorithm=name, batch_size=1)

@@ -79,6 +79,7 @@ def _make(context: EmitterContext, options: MEESOptions) -> Any:
     if options.sample_mirror and samples % 2:
         allowed = "even numbers for 'me-es' with sample_mirror"
         raise ConfigError(message("batch_size", samples, allowed))
+    _check_parents(options, len(context.centroids))
     emitter = MEESEmitter(
         MEESConfig(**{**dataclasses.asdict(options), "sample_number": samples}),
         # The novelty archive has one descriptor for each generation.
@@ -89,6 +90,24 @@ def _make(context: EmitterContext, options: MEESOptions) -> Any:
         num_descriptors=context.task.descriptor_length,
     )
     return _FromOne(emitter)
+
+
+def _check_parents(options: MEESOptions, cells: int) -> None:
+    """Checks that parents are chosen from as many elites as there can be.
+
+    Raises:
+        ConfigError: They are not.
+    """
+    newest = min(cells, options.last_updated_size)
+    # JAX traces both ways to choose a parent, also the one that is not used
+    for name, most, why in (
+        ("explore_num_cell_sample", cells, "the cells"),
+        ("exploit_num_cell_sample", newest, "the cells, and last_updated_size"),
+    ):
+        given = getattr(options, name)
+        if given > most:
+            allowed = f"at most {most}: {why}"
+            raise ConfigError(message(f"options: {name}", given, allowed))
 
 
 def _evaluations(config: EvolveConfig, options: MEESOptions) -> int:
