@@ -7,11 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from newton_qd.envs.base import PhysicsEnv
-from newton_qd.envs.contacts import angular_changes, linear_changes
+from newton_qd.envs.contacts import angular_changes, linear_changes, padded
 from newton_qd.envs.limits import survival, within
 from newton_qd.envs.options import checked_options
 from newton_qd.envs.vectors import length, ordered_sum, rounded
-from newton_qd.physics.explicit_mesh import split_as
 from newton_qd.physics.system import PhysicsState
 from newton_qd.robots import ANT
 from newton_qd.types import Action, Metrics
@@ -109,8 +108,8 @@ class Ant(PhysicsEnv):
             still = ("ground", *self.system.scene_links)
             names = ", ".join(("bodies", *still[:-1])) + f" and {still[-1]}"
             blocks |= {
-                f"contact velocity changes, {names} [m/s]": _rows(linear, len(still)),
-                f"contact angular velocity changes, {names} [rad/s]": _rows(
+                f"contact velocity changes, {names} [m/s]": padded(linear, len(still)),
+                f"contact angular velocity changes, {names} [rad/s]": padded(
                     angular, len(still)
                 ),
             }
@@ -152,10 +151,3 @@ class Ant(PhysicsEnv):
 
 def _clipped(changes: jax.Array) -> jax.Array:
     return jnp.clip(changes, -_CONTACT_CLIP, _CONTACT_CLIP)
-
-
-def _rows(changes: jax.Array, still: int) -> jax.Array:
-    """Returns the rows of bodies (nb, 3), then zeros for obstacles, as one vector."""
-    # Ground and walls never move. Their zeros keep the layout that policies expect.
-    zeros = split_as([changes], jnp.zeros((still, 3), changes.dtype))
-    return jnp.concatenate([changes, zeros]).reshape(-1)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from newton_qd.checks import message
-from newton_qd.physics.explicit_mesh import rows_of
+from newton_qd.physics.explicit_mesh import rows_of, split_as
 from newton_qd.physics.system import PhysicsState, System
 
 
@@ -47,6 +48,13 @@ def angular_changes(
     inertia = isotropic_inertia(system, bodies, reader)
     turned = rows_of(state.impulse, bodies, slice(3, 6))
     return turned / np.asarray(inertia, system.dtype)[:, None]
+
+
+def padded(changes: jax.Array, still: int) -> jax.Array:
+    """Returns the rows of bodies (n, 3), then zeros for obstacles, as one vector."""
+    # Ground and walls never move. Their zeros keep the layout that policies expect.
+    zeros = split_as([changes], jnp.zeros((still, 3), changes.dtype))
+    return jnp.concatenate([changes, zeros]).reshape(-1)
 
 
 def isotropic_inertia(system: System, bodies: np.ndarray, reader: str) -> np.ndarray:

@@ -5,11 +5,10 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from newton_qd.envs.contacts import angular_changes, linear_changes
+from newton_qd.envs.contacts import angular_changes, linear_changes, padded
 from newton_qd.envs.humanoid import Humanoid
 from newton_qd.envs.options import checked_options
 from newton_qd.envs.vectors import rounded
-from newton_qd.physics.explicit_mesh import split_as
 from newton_qd.physics.system import PhysicsState
 from newton_qd.scenes import HUMANOID_TRAP
 from newton_qd.types import Action, Metrics
@@ -83,16 +82,14 @@ class HumanoidTrap(Humanoid):
         bodies = self._bodies
         linear = linear_changes(self.system, state, bodies)
         angular = angular_changes(self.system, state, bodies, "contact changes")
+        still = 1 + len(self.system.scene_links)
         names = ", ".join(("bodies", "ground", *self.system.scene_links))
         return super().observe(state, action) | {
-            f"contact velocity changes, {names} [m/s]": self._rows(linear),
-            f"contact angular velocity changes, {names} [rad/s]": self._rows(angular),
+            f"contact velocity changes, {names} [m/s]": padded(linear, still),
+            f"contact angular velocity changes, {names} [rad/s]": padded(
+                angular, still
+            ),
         }
-
-    def _rows(self, changes: jax.Array) -> jax.Array:
-        """Returns the rows of bodies (n, 3), ground and walls as one vector."""
-        still = jnp.zeros((1 + len(self.system.scene_links), 3), changes.dtype)
-        return jnp.concatenate([changes, split_as([changes], still)]).reshape(-1)
 
     def _inertia_about_centre(
         self, mass: jax.Array, arm: jax.Array, square: jax.Array
