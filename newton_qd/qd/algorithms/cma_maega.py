@@ -8,12 +8,11 @@ from typing import Any
 from newton_qd.qd.algorithms.cma_mega import (
     TUNED,
     CMAMEGAOptions,
-    evaluations,
     gradients,
     make_search,
 )
 from newton_qd.qd.algorithms.gradient_options import initial_scale
-from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext
+from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext, batch_and
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -46,7 +45,7 @@ CMA_MAEGA = AlgorithmSpec(
     make=_make,
     options=CMAMAEGAOptions,
     tuned=TUNED,
-    evaluations=evaluations,
+    evaluations=batch_and(gradients),
     gradients=gradients,
     takes_faulty=True,
     initial_scale=initial_scale,

@@ -13,7 +13,7 @@ from newton_qd.qd.algorithms.gradient_options import (
     initial_scale,
     on_robots_that_fall,
 )
-from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext
+from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext, batch_and
 from newton_qd.qd.config import ConfigError, EvolveConfig
 
 if TYPE_CHECKING:
@@ -91,11 +91,6 @@ def gradients(config: EvolveConfig, options: CMAMEGAOptions) -> int:
     return options.points * options.episodes
 
 
-def evaluations(config: EvolveConfig, options: CMAMEGAOptions) -> int:
-    """Returns the number of episodes of a generation."""
-    return config.batch_size + gradients(config, options)
-
-
 def _make(context: EmitterContext, options: CMAMEGAOptions) -> Any:
     """CMA-MEGA: CMA-ES searches for steps along the gradients of solution points."""
     from newton_qd.qd.emitters import CMAMEGAEmitter
@@ -110,7 +105,7 @@ CMA_MEGA = AlgorithmSpec(
     make=_make,
     options=CMAMEGAOptions,
     tuned=TUNED,
-    evaluations=evaluations,
+    evaluations=batch_and(gradients),
     gradients=gradients,
     takes_faulty=True,
     initial_scale=initial_scale,

@@ -13,7 +13,7 @@ from newton_qd.qd.algorithms.episode_learning import (
 )
 from newton_qd.qd.algorithms.gradient_options import MAZES, initial_scale
 from newton_qd.qd.algorithms.learning import LearningOptions, learning_method
-from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext
+from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext, batch_and
 from newton_qd.qd.algorithms.variation import with_isoline
 from newton_qd.qd.config import ConfigError, EvolveConfig
 
@@ -102,10 +102,6 @@ def _gradients(config: EvolveConfig, options: ActorCriticOptions) -> int:
     return options.episodes(config)
 
 
-def _evaluations(config: EvolveConfig, options: ActorCriticOptions) -> int:
-    return config.batch_size + options.episodes(config)
-
-
 ME_ACTOR_CRITIC = AlgorithmSpec(
     name="me-actor-critic",
     summary="MAP-Elites with actors that learn over short windows from gradients of "
@@ -117,7 +113,7 @@ ME_ACTOR_CRITIC = AlgorithmSpec(
         name: {**_ACTORS.get(name, {}), **CLIMBING.get(name, {})}
         for name in (*_ACTORS, "halfcheetah_uni")
     },
-    evaluations=_evaluations,
+    evaluations=batch_and(_gradients),
     gradients=_gradients,
     initial_scale=initial_scale,
 )

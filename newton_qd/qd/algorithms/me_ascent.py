@@ -7,7 +7,7 @@ from typing import Any
 
 from newton_qd import checks
 from newton_qd.qd.algorithms.climbing import CLIMBING, ClimbingOptions, ascent_emitter
-from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext
+from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext, batch_and
 from newton_qd.qd.algorithms.variation import with_isoline
 from newton_qd.qd.config import EvolveConfig
 
@@ -48,10 +48,6 @@ def _gradients(config: EvolveConfig, options: MEAscentOptions) -> int:
     return options.climbing_episodes
 
 
-def _evaluations(config: EvolveConfig, options: MEAscentOptions) -> int:
-    return config.batch_size + options.climbing_episodes
-
-
 ME_ASCENT = AlgorithmSpec(
     name="me-ascent",
     summary="MAP-Elites; a part of the offspring are elites that climb along exact "
@@ -59,6 +55,6 @@ ME_ASCENT = AlgorithmSpec(
     make=_make,
     options=MEAscentOptions,
     tuned=CLIMBING,
-    evaluations=_evaluations,
+    evaluations=batch_and(_gradients),
     gradients=_gradients,
 )

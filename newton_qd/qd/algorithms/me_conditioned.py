@@ -15,7 +15,7 @@ from newton_qd.qd.algorithms.gradient_options import (
     on_robots_that_fall,
 )
 from newton_qd.qd.algorithms.learning import LearningOptions
-from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext
+from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext, batch_and
 from newton_qd.qd.algorithms.variation import with_isoline
 from newton_qd.qd.config import ConfigError, EvolveConfig
 
@@ -113,10 +113,6 @@ def _gradients(config: EvolveConfig, options: ConditionedOptions) -> int:
     return options.episodes(config)
 
 
-def _evaluations(config: EvolveConfig, options: ConditionedOptions) -> int:
-    return config.batch_size + options.episodes(config)
-
-
 ME_CONDITIONED = AlgorithmSpec(
     name="me-conditioned",
     summary="MAP-Elites with one actor for the whole archive that is told the target "
@@ -125,7 +121,7 @@ ME_CONDITIONED = AlgorithmSpec(
     make=_make,
     options=ConditionedOptions,
     tuned={"halfcheetah_uni": SHORT, **on_robots_that_fall(rate=3e-4)},
-    evaluations=_evaluations,
+    evaluations=batch_and(_gradients),
     gradients=_gradients,
     initial_scale=initial_scale,
 )

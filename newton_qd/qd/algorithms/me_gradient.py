@@ -14,7 +14,7 @@ from newton_qd.qd.algorithms.gradient_options import (
     initial_scale,
     on_robots_that_fall,
 )
-from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext
+from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext, batch_and
 from newton_qd.qd.algorithms.variation import with_isoline
 from newton_qd.qd.config import ConfigError, EvolveConfig
 
@@ -81,10 +81,6 @@ def _gradients(config: EvolveConfig, options: MEGradientOptions) -> int:
     return options.parents(config)
 
 
-def _evaluations(config: EvolveConfig, options: MEGradientOptions) -> int:
-    return config.batch_size + options.parents(config)
-
-
 ME_GRADIENT = AlgorithmSpec(
     name="me-gradient",
     summary="MAP-Elites; half of the offspring are steps along exact gradients of "
@@ -95,7 +91,7 @@ ME_GRADIENT = AlgorithmSpec(
         "halfcheetah_uni": {**CHAOTIC, "longest": 1.0},
         **on_robots_that_fall(shortest=0.0005, longest=0.02),
     },
-    evaluations=_evaluations,
+    evaluations=batch_and(_gradients),
     gradients=_gradients,
     initial_scale=initial_scale,
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, Generic
+from typing import TYPE_CHECKING, Any, Generic, TypeAlias
 
 from newton_qd.qd.algorithms.options import OptionsT, read_options
 from newton_qd.qd.config import EvolveConfig
@@ -15,6 +15,9 @@ if TYPE_CHECKING:  # importing a list of algorithms imports no JAX
     from newton_qd.qd.scoring.rollout import Policy
     from newton_qd.qd.scoring.task import Task
     from newton_qd.types import ScoringFunction
+
+Evaluations: TypeAlias = Callable[[EvolveConfig, Any], int]
+"""Maps settings and options to a number of episodes of one generation."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,6 +51,11 @@ def _batch_size(config: EvolveConfig, options: Any) -> int:
 def _unscaled(options: Any) -> float:
     del options
     return 1.0
+
+
+def batch_and(gradients: Evaluations) -> Evaluations:
+    """Returns the function that adds a batch to differentiated episodes beside it."""
+    return lambda config, options: config.batch_size + gradients(config, options)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
