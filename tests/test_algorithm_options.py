@@ -71,7 +71,7 @@ def test_shares_of_a_batch_that_do_not_fit_are_refused() -> None:
         (
             "me-gradient",
             {"branches": 9},
-            "share: got .* holds a parent with branches = 9",
+            "share: got .* at least 9 / batch_size = 9 / 16, the offspring of a",
         ),
         (
             "me-gradient",
@@ -101,7 +101,7 @@ def test_shares_of_a_batch_that_do_not_fit_are_refused() -> None:
         (
             "ascii-me-exact",
             {"branches": 9},
-            "share: got .* holds a parent with branches = 9",
+            "share: got .* at least 9 / batch_size = 9 / 16, the offspring of a",
         ),
         ("ascii-me-exact", {"slowest": 1.0}, r"rates: got \(1.0, 0.003\); allowed"),
         ("me-actor-critic", {"fitness": float("nan")}, "fitness: got nan; allowed"),

@@ -5,13 +5,11 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from newton_qd import checks
-from newton_qd.checks import message
 from newton_qd.qd.algorithms.gradient_options import SHORT, WINDOW
 from newton_qd.qd.algorithms.options import Options
 from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext
-from newton_qd.qd.algorithms.variation import with_isoline
-from newton_qd.qd.config import ConfigError, EvolveConfig
+from newton_qd.qd.algorithms.variation import parents_in, with_isoline
+from newton_qd.qd.config import EvolveConfig
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -50,12 +48,7 @@ class InterpolationOptions(Options):
         Raises:
             ConfigError: The share is out of its range, or too small.
         """
-        checks.number("options: share", self.share, above=0, most=1, error=ConfigError)
-        number = int(self.share * config.batch_size)
-        if number < 1:
-            allowed = f"at least 1 / batch_size = 1 / {config.batch_size}"
-            raise ConfigError(message("options: share", self.share, allowed))
-        return number
+        return parents_in(config, self.share, 1)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -126,15 +119,7 @@ class ExactAsciiMEOptions(InterpolationOptions):
         Raises:
             ConfigError: A generation is too small, or a value is out of its range.
         """
-        checks.integer("options: branches", self.branches, most=None, error=ConfigError)
-        parents = self.offspring(config) // self.branches
-        if parents < 1:
-            allowed = (
-                f"a share of batch_size = {config.batch_size} that holds a parent with "
-                f"branches = {self.branches} offspring"
-            )
-            raise ConfigError(message("options: share", self.share, allowed))
-        return parents
+        return parents_in(config, self.share, self.branches)
 
 
 def _make_exact(context: EmitterContext, options: ExactAsciiMEOptions) -> Any:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from newton_qd import checks
-from newton_qd.checks import message
 from newton_qd.qd.algorithms.gradient_options import (
     CHAOTIC,
     FlowOptions,
@@ -15,8 +13,8 @@ from newton_qd.qd.algorithms.gradient_options import (
     on_robots_that_fall,
 )
 from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext, batch_and
-from newton_qd.qd.algorithms.variation import with_isoline
-from newton_qd.qd.config import ConfigError, EvolveConfig
+from newton_qd.qd.algorithms.variation import parents_in, with_isoline
+from newton_qd.qd.config import EvolveConfig
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -45,16 +43,7 @@ class MEGradientOptions(FlowOptions):
         Raises:
             ConfigError: A generation is too small, or a value is out of its range.
         """
-        checks.number("options: share", self.share, above=0, most=1, error=ConfigError)
-        checks.integer("options: branches", self.branches, most=None, error=ConfigError)
-        parents = int(self.share * config.batch_size) // self.branches
-        if parents < 1:
-            allowed = (
-                f"a share of batch_size = {config.batch_size} that holds a parent with "
-                f"branches = {self.branches} offspring"
-            )
-            raise ConfigError(message("options: share", self.share, allowed))
-        return parents
+        return parents_in(config, self.share, self.branches)
 
 
 def _make(context: EmitterContext, options: MEGradientOptions) -> Any:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import functools
 from typing import TYPE_CHECKING
 
-from newton_qd.qd.config import EvolveConfig
+from newton_qd import checks
+from newton_qd.checks import message
+from newton_qd.qd.config import ConfigError, EvolveConfig
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -74,6 +76,27 @@ def with_own_isoline(emitter: MultiEmitter, config: EvolveConfig) -> MultiEmitte
     *others, last = emitter.emitters
     emitter.emitters = (*others, isoline_emitter(config, last.batch_size))
     return emitter
+
+
+def parents_in(config: EvolveConfig, share: float, branches: int) -> int:
+    """Returns the number of parents whose offspring are a share of a generation.
+
+    Args:
+        config: Settings of the run.
+        share: Option of this name: the share [-].
+        branches: Option of this name: offspring of each parent.
+
+    Raises:
+        ConfigError: A generation is too small, or a value is out of its range.
+    """
+    checks.number("options: share", share, above=0, most=1, error=ConfigError)
+    checks.integer("options: branches", branches, most=None, error=ConfigError)
+    parents = int(share * config.batch_size) // branches
+    if parents < 1:
+        least = f"{branches} / batch_size = {branches} / {config.batch_size}"
+        allowed = f"at least {least}, the offspring of a parent"
+        raise ConfigError(message("options: share", share, allowed))
+    return parents
 
 
 def _no_mutation(genotypes: Genotype, key: RNGKey) -> Genotype:
