@@ -159,6 +159,24 @@ def test_ranges_are_added_to_those_of_a_config(tmp_path: Path) -> None:
     assert dict(config.randomize) == {**ranges, "gravity": (9.0, 10.0)}
 
 
+def test_options_are_written_as_in_json_or_in_python(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    parser = argparse.ArgumentParser()
+    add_arguments(parser.add_subparsers(), lambda *_: 0)
+    given = ("conditioned=false", "whiten=False", "critic=[8,8]", "rate=1e-3")
+    arguments = ["evolve", "pointmaze"]
+    for option in given:
+        arguments += ["--option", option]
+    config, _ = settle(parser.parse_args(arguments))
+    expected = {"conditioned": False, "whiten": False, "critic": (8, 8), "rate": 1e-3}
+    assert dict(config.options) == expected
+    for wrong in ("conditioned", "=1", "conditioned=no", "conditioned='no'"):
+        with pytest.raises(SystemExit):
+            parser.parse_args(["evolve", "pointmaze", "--option", wrong])
+        assert "allowed: a name and a value like" in capsys.readouterr().err
+
+
 def test_wrong_options_of_the_environment(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

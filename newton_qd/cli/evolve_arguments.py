@@ -226,11 +226,9 @@ def _add_start_arguments(group: argparse._ArgumentGroup) -> None:
 
 def _option(text: str) -> tuple[str, Any]:
     name, separator, value = text.partition("=")
-    try:
-        if name and separator:
-            return name, ast.literal_eval(value)
-    except (SyntaxError, ValueError):
-        pass
+    found = _value(value)
+    if name and separator and not isinstance(found, str):
+        return name, found
     raise argparse.ArgumentTypeError(
         f"got {text!r}; allowed: a name and a value like discount=0.95"
     )
@@ -253,10 +251,15 @@ def _env_option(text: str) -> tuple[str, Any]:
         raise argparse.ArgumentTypeError(
             f"got {text!r}; allowed: a name and a value like healthy_reward=0.5"
         )
+    return name, _value(value)
+
+
+def _value(text: str) -> Any:
+    """Returns a value that JSON or Python writes so; other text, as in scene=maze."""
     for parse in (json.loads, ast.literal_eval):
         with contextlib.suppress(SyntaxError, ValueError):
-            return name, parse(value)
-    return name, value  # text, as in scene=maze
+            return parse(text)
+    return text
 
 
 def _grid(text: str) -> tuple[int, ...]:
