@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from newton_qd.envs.base import PhysicsEnv
 from newton_qd.envs.limits import survival, within
 from newton_qd.envs.vectors import ordered_sum, rounded, wrapped
 from newton_qd.physics.system import PhysicsState
@@ -118,3 +119,26 @@ class UprightRun:
         high_enough = within(state.q[Z], self.healthy_z_range, width)
         pitch = euler_pitch(state.q[PITCH])
         return high_enough * within(pitch, self.healthy_angle_range, width)
+
+
+class UprightRunner(PhysicsEnv):
+    """A robot with the task :class:`UprightRun`, which a subclass sets."""
+
+    forward_reward_name = "reward_forward"
+    _task: UprightRun
+    _omit_x: bool  # whether the observation omits the position along x
+
+    def observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
+        """Returns the blocks of the observation."""
+        del action
+        pitch = euler_pitch(state.q[PITCH])
+        orientation = {"torso pitch [rad]": pitch[None]}
+        return blocks(state, orientation, omit_x=self._omit_x)
+
+    def outcome(
+        self, before: PhysicsState, after: PhysicsState, action: Action
+    ) -> tuple[jax.Array, jax.Array, Metrics]:
+        """Returns reward, done and metrics of a step."""
+        return self._task.outcome(
+            before, after, action, self.dt, self.termination_width
+        )

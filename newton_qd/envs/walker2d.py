@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import jax
-
 from newton_qd.envs import planar
-from newton_qd.envs.base import PhysicsEnv
 from newton_qd.envs.options import checked_options
-from newton_qd.physics.system import PhysicsState
 from newton_qd.robots import WALKER2D
 from newton_qd.scenes import Scene
-from newton_qd.types import Action, Metrics
 
 
-class Walker2d(PhysicsEnv):
+class Walker2d(planar.UprightRunner):
     """A torso on two legs of three joints each, rewarded for velocity along x.
 
     Reward: velocity along x, plus a bonus for being healthy, minus a cost of control.
@@ -26,8 +21,6 @@ class Walker2d(PhysicsEnv):
         x_position: x of the torso [m].
         x_velocity: Its velocity along x [m/s].
     """
-
-    forward_reward_name = "reward_forward"
 
     @checked_options
     def __init__(
@@ -77,19 +70,4 @@ class Walker2d(PhysicsEnv):
         self._omit_x = exclude_current_positions_from_observation
         super().__init__(
             WALKER2D, reset_noise_scale=reset_noise_scale, dtype=dtype, scene=scene
-        )
-
-    def observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
-        """Returns the blocks of the observation."""
-        del action
-        pitch = planar.euler_pitch(state.q[planar.PITCH])
-        orientation = {"torso pitch [rad]": pitch[None]}
-        return planar.blocks(state, orientation, omit_x=self._omit_x)
-
-    def outcome(
-        self, before: PhysicsState, after: PhysicsState, action: Action
-    ) -> tuple[jax.Array, jax.Array, Metrics]:
-        """Returns reward, done and metrics of a step."""
-        return self._task.outcome(
-            before, after, action, self.dt, self.termination_width
         )
