@@ -278,6 +278,14 @@ def test_elites_begin_where_their_run_began() -> None:
     np.testing.assert_allclose(record_elites(run, run.cells[:1]).q[0, 0], start[:2])
 
 
+def test_elites_begin_at_a_start_that_counted() -> None:
+    run = opened("grid", 2, (5, 4))
+    run = dataclasses.replace(run, config=run.config.replace(starts=3))
+    first = jax.random.split(run.start_key, 3)[0]
+    start = run.task.env.reset(first).obs
+    np.testing.assert_allclose(record_elites(run, run.cells[:1]).q[0, 0], start[:2])
+
+
 def test_wrong_runs_are_named(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(ValueError, match="runs: got 0 runs; allowed: one run or two"):
         explorer_html([])

@@ -31,6 +31,8 @@ def record_elites(
 ) -> Trajectory:
     """Records elites of a run, each from the start of the run's evaluations.
 
+    If an evaluation of the run has several start states, it is the first of them.
+
     Args:
         run: The run, from ``newton_qd.qd.load_run(DIR)``.
         cells: (N,) rows of the archive, with at least one; or a row.
@@ -51,6 +53,9 @@ def record_elites(
         allowed = f"None, or integers from 1 to {length}, the length of an episode"
         raise ValueError(message("steps", steps, f"{allowed} of the run"))
     steps = length if steps is None else steps
+    from newton_qd.qd.scoring.robust import start_keys
+
+    start = start_keys(run.start_key, run.config.starts)[0]
     policy = run.policy
     record = Recorder(run.task.env, policy.apply, steps, contacts=contacts)
     unravel = jax.jit(jax.vmap(policy.unravel))
@@ -62,7 +67,7 @@ def record_elites(
         filled = [*some, *[some[-1]] * (size - len(some))]
         genotypes = jnp.asarray(np.stack([elite.genotype for elite in filled]))
         labels = [f"cell {e.cell}, fitness {short(e.fitness)}" for e in filled]
-        part = record(unravel(genotypes), run.start_key, labels)
+        part = record(unravel(genotypes), start, labels)
         parts.append(part.select(list(range(len(some)))))
         if progress is not None:
             progress(min(begin + size, len(elites)), len(elites))

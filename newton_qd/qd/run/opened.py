@@ -87,6 +87,7 @@ class Run:
         reevaluated: Metrics of re-evaluated elites; ``None`` if there are none.
         start_key: Key of the reset that all evaluations of the run start with. It
             follows from the seed. With ``new_starts``, generations have other keys.
+            Several start states have the keys ``jax.random.split(start_key, starts)``.
     """
 
     path: Path

@@ -64,7 +64,7 @@ def robust_scoring(
     def scored(
         genotypes: Genotype, key: RNGKey
     ) -> tuple[jax.Array, jax.Array, ExtraScores]:
-        keys = jax.random.split(key, starts)
+        keys = start_keys(key, starts)
         fitnesses, found, extra = jax.vmap(score, (None, 0))(genotypes, keys)
         bad = jnp.any(jnp.isneginf(fitnesses), axis=0)
         rows = jnp.concatenate([fitnesses[..., None], found], axis=-1)
@@ -84,6 +84,16 @@ def robust_scoring(
         return fitness, mixed[:, 1:], _joined(extra, weights, slopes) | beside
 
     return scored
+
+
+def start_keys(key: RNGKey, starts: int) -> RNGKey:
+    """Returns the (starts,) keys of the resets of one evaluation.
+
+    Args:
+        key: Key of the evaluation.
+        starts: Start states of each individual. A single one starts with ``key``.
+    """
+    return key[None] if starts == 1 else jax.random.split(key, starts)
 
 
 def run_scoring(
