@@ -47,6 +47,27 @@ def placed(env: Env, position: list[float]) -> State:
 
 
 @pytest.mark.parametrize("task", TASKS)
+def test_observation_has_the_same_bits_in_every_program(task: str) -> None:
+    env = TASKS[task](Ant(), "ant")
+    keys = jax.random.split(KEY, 8)
+    starts = jnp.linspace(0.1, 7.3, 8, dtype=env.dtype)
+
+    def seen(key: jax.Array, x: jax.Array) -> jax.Array:
+        state = env.reset(key)
+        physics: Any = state.pipeline_state
+        q = physics.q.at[:2].set(x)
+        state = state.replace(pipeline_state=dataclasses.replace(physics, q=q))
+        return env.step(state, action_of(env, 0.3)).obs
+
+    batch = jax.jit(jax.vmap(seen))(keys, starts)
+    one_by_one = jax.jit(lambda *x: jax.lax.map(lambda y: seen(*y), x))(keys, starts)
+    assert np.array_equal(batch, one_by_one)
+    assert np.array_equal(batch, jax.vmap(seen)(keys, starts))
+    for i in (0, 3):
+        assert np.array_equal(batch[i], seen(keys[i], starts[i]))
+
+
+@pytest.mark.parametrize("task", TASKS)
 def test_observation(task: str) -> None:
     """Scaled position, then the ant's, then contact rows of the walls too."""
     env, ant = TASKS[task](Ant(), "ant"), Ant()

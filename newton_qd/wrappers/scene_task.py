@@ -12,6 +12,7 @@ from newton_qd.checks import Fact, message
 from newton_qd.envs.base import Env, PhysicsEnv
 from newton_qd.envs.rollouts import RolloutOrder
 from newton_qd.envs.state import State
+from newton_qd.envs.vectors import rounded
 from newton_qd.physics.system import JointKind, System
 from newton_qd.scenes import Scene
 from newton_qd.types import Action, Params, RNGKey
@@ -96,8 +97,10 @@ class SceneTaskWrapper(Wrapper):
         if not self._effective:
             return state
         low, high = np.asarray(self.area, self.dtype)
-        centre, scale = (low + high) / 2, (high - low) / 2
-        place = (self._position(state)[:2] - centre) / scale
+        centre = (low + high) / 2
+        # XLA turns a division by constants into this product, but not in every program
+        share = np.asarray(2, self.dtype) / (high - low)
+        place = rounded((self._position(state)[:2] - centre) * share)
         return self._outcome(state.replace(obs=jnp.concatenate([place, state.obs])))
 
     def _outcome(self, state: State) -> State:
