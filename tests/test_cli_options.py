@@ -325,6 +325,7 @@ def test_modules_that_cannot_be_imported(
     (tmp_path / "broken_tasks.py").write_text("import newton_qd\n1 / 0\n")
     (tmp_path / "poor_tasks.py").write_text("import no_such_package\n")
     (tmp_path / "random.py").write_text("")
+    (tmp_path / "script.py").write_text("import sys\nsys.exit()\n")
     for name, text in (
         ("no_such_tasks", "got 'no_such_tasks', which cannot be found; allowed: a mod"),
         ("no.such.tasks", "got 'no.such.tasks', which cannot be found"),
@@ -333,6 +334,7 @@ def test_modules_that_cannot_be_imported(
         ("broken_tasks.py", "whose import fails with ZeroDivisionError"),
         ("poor_tasks", "ModuleNotFoundError: No module named 'no_such_package'"),
         ("random.py", "which has the name of Python's own module random"),
+        ("script.py", "whose import ends the program with code None; allowed: a mod"),
     ):
         assert cli.main(["algorithms", "--module", name]) == cli.BAD_ARGUMENTS
         assert text in capsys.readouterr().err

@@ -46,6 +46,10 @@ def import_modules(names: Sequence[str]) -> None:
             _import(name)
         except ConfigError:
             raise
+        except SystemExit as error:  # a script, whose exit code is not that of ours
+            why = f"whose import ends the program with code {error.code!r}"
+            allowed = "a module that only registers when it is imported"
+            raise ConfigError(message("--module", name, allowed, why=why)) from error
         except Exception as error:
             traceback.print_exc()
             kind = type(error).__name__
