@@ -343,6 +343,17 @@ def test_modules_that_cannot_be_imported(
     assert "registers it, add --module NAME" in capsys.readouterr().err
 
 
+def test_commands_without_modules_need_no_present_folder(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def deleted() -> str:
+        raise FileNotFoundError(2, "No such file or directory")
+
+    monkeypatch.setattr("os.getcwd", deleted)
+    assert cli.main(["algorithms", "me"]) == cli.OK
+    assert capsys.readouterr().out
+
+
 @pytest.mark.usefixtures("forgotten")
 def test_registered_algorithms_have_names_of_their_own() -> None:
     me = algorithm_named("me")

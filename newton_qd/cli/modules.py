@@ -38,8 +38,7 @@ def import_modules(names: Sequence[str]) -> None:
     Raises:
         ConfigError: A module cannot be found, or its import fails.
     """
-    folder = os.getcwd()
-    if names and folder not in sys.path:
+    if names and (folder := os.getcwd()) not in sys.path:
         sys.path.insert(0, folder)  # as python -m does
     for name in names:
         try:
