@@ -46,6 +46,16 @@ def test_evolve_reports_what_it_did(
     assert settings["iterations"] == 3 and settings["iso_sigma"] == SMALL.iso_sigma
 
 
+def test_a_hint_names_a_folder_that_looks_like_an_option(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert call(*POINT, "--out=-x") == cli.OK
+    hint = capsys.readouterr().out.rsplit("newton-qd ", 1)[1].split()
+    assert hint == ["explore", "./-x"]
+    assert call("eval", hint[1]) == cli.OK
+
+
 @pytest.mark.slow
 def test_a_config_file_reproduces_the_run(tmp_path: Path) -> None:
     first, again, other = (tmp_path / name for name in ("first", "again", "other"))

@@ -123,7 +123,7 @@ def _report(result: EvolveResult, out: Path, modules: Sequence[str]) -> None:
             )
         print(f"results in {out}")
         own = "".join(f" --module {shlex.quote(name)}" for name in modules)
-        print(f"see them: newton-qd explore {shlex.quote(str(out))}{own}")
+        print(f"see them: newton-qd explore {_argument(out)}{own}")
     if result.interrupted:
         when = "before the initial population"
         if result.iteration >= 0:
@@ -135,4 +135,10 @@ def _report(result: EvolveResult, out: Path, modules: Sequence[str]) -> None:
             when = "during the re-evaluation, the archive is saved"
         own = "".join(f" --module {shlex.quote(name)}" for name in modules)
         say(f"interrupted {when}; continue with:")
-        print(f"  newton-qd evolve --resume --out {shlex.quote(str(out))}{own}")
+        print(f"  newton-qd evolve --resume --out {_argument(out)}{own}")
+
+
+def _argument(folder: Path) -> str:
+    """Returns a folder as an argument of a shell, which is never an option."""
+    text = str(folder)
+    return shlex.quote(f"./{text}" if text.startswith("-") else text)
