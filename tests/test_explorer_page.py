@@ -200,6 +200,17 @@ def test_two_runs_filter_colour_and_hostile_names(pages: Pages, tmp_path: Path) 
     assert f'"cell":{runs[0].best()[0].cell}' in stored and '"genotype":[' in stored
 
 
+@pytest.mark.slow
+@pytest.mark.browser
+def test_a_run_of_many_generations_has_a_page(pages: Pages, tmp_path: Path) -> None:
+    """A function takes fewer arguments than such a run has generations."""
+    run = opened("grid", 2, (5, 4))
+    metrics = {name: np.arange(200_000.0) for name in run.metrics}
+    run = dataclasses.replace(run, metrics=metrics)
+    page = pages.open(write_explorer([run], tmp_path / "e.html"))
+    assert "curves over 0 \u2026 199999 evaluations" in page.inner_text(".curves")
+
+
 def test_scenes_are_not_mixed(monkeypatch: pytest.MonkeyPatch) -> None:
     """The page has one drawing: a robot would move among walls that it never had."""
     runs = [opened("grid", 2, (5, 4), seed) for seed in (0, 1)]

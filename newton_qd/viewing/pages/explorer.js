@@ -2,6 +2,10 @@
 "use strict";
 
 (function () {
+  // Ends of many numbers: a function does not take all of them as arguments.
+  const least = (values) => values.reduce((a, b) => Math.min(a, b), Infinity);
+  const most = (values) => values.reduce((a, b) => Math.max(a, b), -Infinity);
+
   const data = NQD.data();
   const section = document.getElementById("maps");
   document.getElementById("title").textContent = data.title;
@@ -46,8 +50,8 @@
   const filter = NQD.element("input", limit, { type: "range" });
   const shown = NQD.element("span", limit, { name: "clock" });
   const fitness = runs.map((run) => run.metrics[0].values.data);
-  const lowest = Math.min(...fitness.map((f) => Math.min(...f)));
-  const highest = Math.max(...fitness.map((f) => Math.max(...f)));
+  const lowest = least(fitness.map(least));
+  const highest = most(fitness.map(most));
   filter.step = "any";
   filter.min = String(lowest);
   filter.max = String(highest);
@@ -110,12 +114,12 @@
         high = Math.max(high, value);
       }
     }
-    const least = filter.value === start ? lowest : Math.min(Number(filter.value), highest);
+    const from = filter.value === start ? lowest : Math.min(Number(filter.value), highest);
     maps.forEach((map, r) => {
-      fitness[r].forEach((value, e) => { map.shown[e] = value >= least ? 1 : 0; });
+      fitness[r].forEach((value, e) => { map.shown[e] = value >= from ? 1 : 0; });
       map.colour(metric(runs[r], name).values.data, low, high);
     });
-    shown.textContent = NQD.short(least);
+    shown.textContent = NQD.short(from);
     scale.replaceChildren();
     NQD.element("span", scale, { text: NQD.short(low) });
     const strip = NQD.element("span", scale, { name: "strip" });
@@ -184,6 +188,7 @@
   // Small pictures of the columns of metrics.csv.
   function drawCurves() {
     curves.replaceChildren();
+    const end = most(runs.map((run) => most(run.curves.evaluations.data)));
     for (const name of Object.keys(runs[0].curves)) {
       if (name === "evaluations") continue;
       const part = NQD.element("div", curves, { name: "curve" });
@@ -193,15 +198,13 @@
       const pen = canvas.getContext("2d");
       const all = runs.flatMap((run) => Array.from(run.curves[name].data))
         .filter(Number.isFinite);
-      const most = Math.max(...runs.map((run) => Math.max(...run.curves.evaluations.data)));
-      const low = all.reduce((a, b) => Math.min(a, b), Infinity);
-      const high = all.reduce((a, b) => Math.max(a, b), -Infinity);
+      const low = least(all), high = most(all);
       runs.forEach((run, r) => {
         pen.strokeStyle = NQD.palette[r];
         pen.lineWidth = 1.5;
         pen.beginPath();
         run.curves[name].data.forEach((value, k) => {
-          const x = run.curves.evaluations.data[k] / most * (wide - 2) + 1;
+          const x = run.curves.evaluations.data[k] / end * (wide - 2) + 1;
           const y = tall - 3 - (value - low) / (high - low || 1) * (tall - 6);
           if (k) pen.lineTo(x, y);
           else pen.moveTo(x, y);
@@ -213,9 +216,8 @@
           + (name === "coverage" ? " %" : ""), name: "soft",
       });
     }
-    const all = runs.map((run) => Math.max(...run.curves.evaluations.data));
     NQD.element("div", curves, {
-      text: "curves over 0 \u2026 " + Math.max(...all) + " evaluations", name: "wide soft",
+      text: "curves over 0 \u2026 " + end + " evaluations", name: "wide soft",
     });
     for (const run of runs) {
       for (const line of run.reevaluated || []) {
@@ -226,7 +228,7 @@
     }
   }
 
-  const best = fitness.map((values) => values.indexOf(Math.max(...values)));
+  const best = fitness.map((values) => values.indexOf(most(values)));
   NQD.theme(player, { theme: () => { maps.forEach((map) => map.draw()); } });
   maps.forEach((map, r) => {
     map.selected = chosen[r] = best[r];
