@@ -211,6 +211,19 @@ def test_a_run_of_many_generations_has_a_page(pages: Pages, tmp_path: Path) -> N
     assert "curves over 0 \u2026 199999 evaluations" in page.inner_text(".curves")
 
 
+@pytest.mark.slow
+@pytest.mark.browser
+def test_controls_fit_a_narrow_page(pages: Pages, tmp_path: Path) -> None:
+    run = opened("grid", 2, (5, 4))
+    labels = "mean proportion of a very long name", "right"
+    run = dataclasses.replace(run, task=dataclasses.replace(run.task, labels=labels))
+    target = write_explorer([run], tmp_path / "e.html")
+    page = pages.open(target, width=320, height=500)
+    right = "Math.max(...[...document.querySelectorAll('.bar *')]"
+    right += ".map((each) => each.getBoundingClientRect().right))"
+    assert page.evaluate(right) <= 320
+
+
 def test_scenes_are_not_mixed(monkeypatch: pytest.MonkeyPatch) -> None:
     """The page has one drawing: a robot would move among walls that it never had."""
     runs = [opened("grid", 2, (5, 4), seed) for seed in (0, 1)]
