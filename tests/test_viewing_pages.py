@@ -75,6 +75,16 @@ def test_replay_page(walk: Trajectory, pages: Pages, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_the_choice_of_a_world_can_be_read_in_a_narrow_page(
+    walk: Trajectory, pages: Pages, tmp_path: Path
+) -> None:
+    target = write_replay(walk, tmp_path / "walk.html", "hopper, random actions")
+    page = pages.open(target, width=320, height=500)
+    shown = page.locator("#facts select").bounding_box()
+    assert shown is not None and shown["width"] > 180
+
+
+@pytest.mark.slow
 def test_kinematics_are_those_of_the_physics(
     walk: Trajectory, pages: Pages, tmp_path: Path
 ) -> None:
