@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 import processes
 import pytest
+from fresh_python import run_python
 
 import newton_qd
 from newton_qd import physics
@@ -212,6 +213,32 @@ def test_moments_of_a_callback(tmp_path: Path, device: jax.Device) -> None:
             check_end(process, errors)
         finally:
             process.kill()
+
+
+COMMAND = """
+import gc, os, signal, sys
+from newton_qd import cli
+
+sent = []
+
+def _xla_gc_callback(phase, info):
+    # Python drops an exception of this function, which has the name of JAX's own
+    if not sent and "newton_qd.viewing.video" in sys.modules:
+        sent.append(phase)
+        os.kill(os.getpid(), signal.SIGINT)
+
+gc.callbacks.append(_xla_gc_callback)
+code = cli.main(["render", "pointmaze", "--steps", "3", "--png"])
+assert sent and code == cli.INTERRUPTED, (sent, code)
+"""
+
+
+@pytest.mark.usefixtures("sigint")
+def test_a_command_loses_no_interrupt(tmp_path: Path) -> None:
+    root = str(Path(newton_qd.__file__).parent.parent)
+    done = run_python(COMMAND, tmp_path, PYTHONPATH=root)
+    assert done.returncode == 0, done.stderr
+    assert "ignored" not in done.stderr
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from typing import TextIO, TypeAlias
 from newton_qd.checks import message
 from newton_qd.qd.config import ConfigError
 from newton_qd.qd.facts import changed_facts, environment_facts
+from newton_qd.qd.run.interrupt import graceful_stop
 from newton_qd.qd.run.progress import for_stream
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
@@ -87,6 +88,23 @@ def require_writable(name: str, path: Path) -> None:
     if not found.is_dir() or not os.access(found, os.W_OK | os.X_OK):
         why = f"and {found} cannot be written"
         raise ConfigError(message(name, str(path), "a place that can be", why=why))
+
+
+def load_physics() -> None:
+    """Imports JAX and the physics. From then on, Ctrl-C ends a command at any moment.
+
+    Python drops an interrupt that arrives in a callback of JAX while it collects
+    garbage; the handler of the physics delays it. An interrupt during the import of an
+    extension module can crash Python, so it waits for the end of the imports.
+
+    Raises:
+        KeyboardInterrupt: A signal arrived during the imports.
+    """
+    with graceful_stop(b"\nstopping\n") as stop:
+        from newton_qd.physics import interrupts
+    if stop.requested:
+        raise KeyboardInterrupt
+    interrupts.install()
 
 
 def terminal_width() -> int:

@@ -20,6 +20,7 @@ from newton_qd.cli.arguments import (
     Commands,
     add_elite_choice,
     complain,
+    load_physics,
     say,
     warn_of_changes,
 )
@@ -81,13 +82,14 @@ def opened(folder: Path, task_factory: TaskFactory) -> Run:
     Raises:
         ConfigError: The folder does not exist, or holds no run.
     """
-    from newton_qd.qd.run.opened import load_run
-    from newton_qd.qd.scoring.task import make_task
-
     if not folder.is_dir():
         why = "which is a file" if folder.exists() else "which does not exist"
         allowed = "a results folder, as newton-qd evolve writes it"
         raise ConfigError(message("DIR", str(folder), allowed, why=why))
+    load_physics()
+    from newton_qd.qd.run.opened import load_run
+    from newton_qd.qd.scoring.task import make_task
+
     with warnings.catch_warnings(record=True) as caught:
         try:
             run = load_run(

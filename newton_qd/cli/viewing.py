@@ -16,6 +16,7 @@ from newton_qd.cli.arguments import (
     Commands,
     add_elite_choice,
     complain,
+    load_physics,
     picture_size,
     require_writable,
 )
@@ -171,6 +172,7 @@ def replay(arguments: argparse.Namespace, task_factory: TaskFactory = None) -> i
     """
     out = _target(arguments, "replay.html", ".html")
     _check_page(out)
+    load_physics()
     from newton_qd.viewing import write_replay
 
     try:
@@ -198,6 +200,7 @@ def explore(arguments: argparse.Namespace, task_factory: TaskFactory = None) -> 
         out = arguments.folders[0] / "explorer.html"
     _check_target(out, given=arguments.out is not None)
     _check_page(out)
+    load_physics()
     runs = [_drawable(folder, task_factory) for folder in arguments.folders]
     from newton_qd.viewing import write_explorer
 
@@ -224,6 +227,7 @@ def render(arguments: argparse.Namespace, task_factory: TaskFactory = None) -> i
     chosen = [kind for kind in ("png", "gif", "mp4") if getattr(arguments, kind)]
     ending = f".{chosen[0]}" if chosen else ".gif"
     out = _target(arguments, f"elites{ending}", ending)
+    load_physics()
     from newton_qd.viewing import render as write
     from newton_qd.viewing.video import FORMATS, require
 
