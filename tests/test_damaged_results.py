@@ -38,7 +38,7 @@ def test_a_run_without_some_files(reference: Path, tmp_path: Path) -> None:
     for name, column in whole.metrics.items():
         assert np.array_equal(np.float32(column), np.float32(again.metrics[name]))
     (out / "checkpoint.bin").write_bytes(b"damaged")
-    with pytest.warns(UserWarning, match=r"are read from archive\.npz instead"):
+    with pytest.warns(UserWarning, match=r"is read from archive\.npz instead"):
         opened(out)
     (out / "archive.npz").unlink()
     with pytest.raises(CheckpointError):
@@ -49,6 +49,28 @@ def test_a_run_without_some_files(reference: Path, tmp_path: Path) -> None:
     (out / "archive.npz").write_bytes(b"damaged")
     with pytest.raises(ArchiveError):
         opened(out)
+
+
+def test_metrics_are_not_newer_than_the_archive(
+    reference: Path, tmp_path: Path
+) -> None:
+    """A run goes on beyond its end and is killed; then its checkpoint is damaged."""
+    out = tmp_path / "run"
+    shutil.copytree(reference, out)
+    whole = opened(out)
+    head, *rows = (out / "metrics.csv").read_text().splitlines()
+    cells = rows[-1].split(",")
+    column = head.split(",").index("coverage")
+    cells[0], cells[column] = str(len(rows)), "99.5"
+    later = "\n".join([head, *rows, ",".join(cells)]) + "\n"
+    (out / "metrics.csv").write_text(later)
+    (out / "checkpoint.bin").write_bytes(b"damaged")
+    with pytest.warns(UserWarning, match=r"metrics up to that archive from metrics"):
+        found = opened(out)
+    assert found.iteration == whole.iteration
+    assert found.metrics["coverage"][-1] == pytest.approx(
+        100 * found.archive.filled.mean(), rel=1e-5
+    )
 
 
 def test_files_of_another_run_are_refused(reference: Path, tmp_path: Path) -> None:

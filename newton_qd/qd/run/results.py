@@ -44,7 +44,8 @@ def read_results(
     path = Path(folder)
     state = _newest(path)
     if state is None:
-        return load_archive(path), _metrics(path / METRICS)
+        archive = load_archive(path)
+        return archive, _metrics_of(archive, _metrics(path / METRICS))
     if config is not None:
         require_same_run(path / CHECKPOINT, state, config)
     columns = complete_metrics(np.asarray(state.metrics)).T
@@ -81,9 +82,37 @@ def _newest(path: Path) -> Checkpoint | None:
     except CheckpointError as error:
         if not (path / ARCHIVE).is_file():
             raise
-        text = f"{error}; its archive and metrics are read from {ARCHIVE} instead"
+        text = f"{error}; its archive is read from {ARCHIVE} instead, and its metrics "
+        text += f"up to that archive from {METRICS}"
         warnings.warn(text, stacklevel=4)
         return None
+
+
+def _metrics_of(
+    archive: Archive, metrics: dict[str, np.ndarray]
+) -> dict[str, np.ndarray]:
+    """Returns metrics up to the generation of an archive.
+
+    A run that went on and was killed has an archive of its earlier end, but metrics up
+    to its last checkpoint.
+
+    Args:
+        archive: The archive.
+        metrics: Name of each column to its values (rows,).
+
+    Returns:
+        The values up to the last row that has coverage and best fitness of the archive;
+        all of them if there is none.
+    """
+    filled = 100 * np.mean(archive.filled)
+    # the file has single precision
+    highest = np.float32(np.max(archive.fitnesses))
+    same = np.isclose(metrics["coverage"], filled, rtol=1e-5)
+    same &= np.float32(metrics["max_fitness"]) == highest
+    last = np.flatnonzero(same)[-1:]
+    return {
+        name: x[: last[0] + 1 if last.size else None] for name, x in metrics.items()
+    }
 
 
 def _metrics(path: Path) -> dict[str, np.ndarray]:
