@@ -228,6 +228,8 @@ def test_settings_from_toml(tmp_path: Path) -> None:
     assert read_config(path, "anttrap")[0].env_name == "anttrap"
     with pytest.raises(ConfigError, match=r"run\.toml: env_name: got None"):
         read_config(path)
+    path.write_text("\ufeffiterations = 2", encoding="utf-8")  # as on Windows
+    assert read_config(path, "anttrap")[0].iterations == 2
     path.write_text("env_name = ")
     with pytest.raises(ConfigError, match=r"run\.toml is not valid TOML"):
         read_config(path)

@@ -73,6 +73,17 @@ def test_metrics_are_not_newer_than_the_archive(
     )
 
 
+def test_lists_without_an_end_are_damage(reference: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    shutil.copytree(reference, out)
+    (out / "corrected.json").write_text("[" * 100_000)
+    with pytest.warns(UserWarning, match=r"corrected\.json: got other content"):
+        assert opened(out).reevaluated is None
+    (out / "config.json").write_text("[" * 100_000)
+    with pytest.raises(ConfigError, match=r"config\.json is not valid JSON"):
+        opened(out)
+
+
 def test_files_of_another_run_are_refused(reference: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     shutil.copytree(reference, out)

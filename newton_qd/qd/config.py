@@ -313,10 +313,11 @@ def read_config(
     written_by_hand = path.suffix == ".toml"
     kind, parse = ("TOML", tomllib.loads) if written_by_hand else ("JSON", json.loads)
     try:
-        document = parse(path.read_text(encoding="utf-8"))
+        # an editor of Windows may write a mark at the beginning
+        document = parse(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise ConfigError(f"cannot read {path}: {error.strerror}") from error
-    except ValueError as error:
+    except (RecursionError, ValueError) as error:  # recursion: deeply nested lists
         raise ConfigError(f"{path} is not valid {kind}: {error}") from error
     if written_by_hand:
         document = {"format": FORMAT, "settings": document}

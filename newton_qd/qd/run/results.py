@@ -150,7 +150,7 @@ def read_reevaluated(path: Path) -> Reevaluated | None:
         return None
     try:
         return _reevaluated(path.read_text(encoding="utf-8"))
-    except (TypeError, ValueError) as error:
+    except (RecursionError, TypeError, ValueError) as error:
         names = ", ".join(f.name for f in dataclasses.fields(Reevaluated))
         text = message(str(path), Fact("other content"), f"an object of {names}")
         text += f" ({error}); the run is opened without these metrics"
@@ -163,6 +163,7 @@ def _reevaluated(text: str) -> Reevaluated:
 
     Raises:
         TypeError: It has other names, or a value is not a number.
+        RecursionError: It has too many lists inside of each other.
         ValueError: It is not JSON.
     """
     found = Reevaluated(**json.loads(text))
