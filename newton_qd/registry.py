@@ -16,6 +16,7 @@ from newton_qd.checks import Fact, listed, message
 from newton_qd.envs.base import Env
 from newton_qd.envs.methods import check_methods, random_key
 from newton_qd.envs.shown import REGISTERED
+from newton_qd.envs.variants import ROBOT
 from newton_qd.errors import UnknownEnvironment
 from newton_qd.moved import moved_name
 from newton_qd.registration import (
@@ -92,8 +93,9 @@ def register(
             ``None``: the attribute of the class ``descriptor``, if there is one.
         reward_offset: Added to each step's reward to keep QD scores positive.
         robot: Spec of the robot inside. ``base`` gets it if it has an argument
-            ``robot``; ``FEET_NAMES`` and ``COG_NAMES`` use it. ``None``: the robot
-            ``base_name`` of the suite, if there is one.
+            ``robot``. Otherwise it replaces the robot that ``base`` makes, as
+            ``env.with_robot`` does. ``FEET_NAMES`` and ``COG_NAMES`` use it. ``None``:
+            the robot ``base_name`` of the suite, if there is one.
         replace: Whether ``env_name`` may be a name that was registered before, as in a
             notebook whose cells run again. Environments of the suite stay.
         **options: Keyword arguments of ``base``. ``create`` may replace them.
@@ -111,8 +113,7 @@ def register(
     checks.function(
         "descriptor_extractor", descriptor_extractor, allowed, optional=True
     )
-    allowed = "a newton_qd.robots.RobotSpec"
-    checks.instance("robot", robot, RobotSpec, allowed, optional=True)
+    checks.instance("robot", robot, RobotSpec, ROBOT, optional=True)
     checks.number("reward_offset", reward_offset, optional=True)
     check_wrappers(wrappers)
     described = descriptor_specs(descriptor)
@@ -146,6 +147,7 @@ def create(
     qdax_wrappers_kwargs: Sequence[Mapping[str, object]] | None = None,
     material: Material | None = None,
     brax_views: bool = False,
+    robot: RobotSpec | None = None,
     **kwargs: object,
 ) -> Env:
     """Builds an environment by its name.
@@ -163,6 +165,8 @@ def create(
             spec. They replace the arguments in the spec.
         material: Softness of contacts and limits; ``None``: as in the robot's spec.
         brax_views: Whether to add ``state.qp`` and ``env.sys`` for code for brax v1.
+        robot: Another robot for the task, such as a damaged one: see
+            ``env.with_robot``; ``None``: that of the environment.
         **kwargs: Options of the environment inside, such as ``dtype``.
 
     Returns:
@@ -172,8 +176,8 @@ def create(
         UnknownEnvironment: ``env_name`` is not registered.
         TypeError: An argument has the wrong type, or a keyword argument is unknown.
         ValueError: A value or a combination of values is not allowed.
-        NotImplementedError: ``material`` or ``brax_views`` is given, and the
-            environment has no physics.
+        NotImplementedError: ``material``, ``robot`` or ``brax_views`` is given, and
+            the environment has no physics.
     """
     spec = _spec(env_name)
     checks.flag("auto_reset", auto_reset)
@@ -188,7 +192,7 @@ def create(
         allowed = "an episode length, or None with 1 and False"
         raise ValueError(message("episode_length", given, allowed))
     checks.integer("batch_size", batch_size, least=0, optional=True)
-    env = _base(env_name, spec, material, kwargs)
+    env = _base(env_name, spec, robot, material, kwargs)
     if fixed_init_state:
         fixed = (
             brax.FixedInitialStateWrapper if brax_views else FixedInitialStateWrapper
@@ -232,19 +236,24 @@ def _spec(env_name: str) -> EnvironmentSpec:
 def _base(
     env_name: str,
     spec: EnvironmentSpec,
+    robot: RobotSpec | None,
     material: Material | None,
     options: Mapping[str, Any],
 ) -> Env:
     """Returns the environment inside all wrappers.
 
     Raises:
-        TypeError: ``material`` is not a ``Material``, an option is unknown, the robot
-            is missing or not the one that is made, or a method does not return an
-            array.
-        ValueError: A method returns a wrong shape.
+        TypeError: ``robot`` or ``material`` has a wrong type, an option is unknown, the
+            robot is missing, or a method does not return an array.
+        ValueError: A method returns a wrong shape, or the robot does not fit.
     """
     allowed = "newton_qd.robots.Material"
     checks.instance("material", material, Material, allowed, optional=True)
+    takes = takes_robot(spec.base)
+    if not takes:
+        checks.instance("robot", robot, RobotSpec, ROBOT, optional=True)
+    elif robot is not None:
+        options = {**options, "robot": robot}
     _require_keywords(env_name, spec.base, options)
     if "robot" not in options and needs_robot(spec.base):
         why = f"and {getattr(spec.base, '__name__', 'base')} needs a robot"
@@ -254,28 +263,28 @@ def _base(
     if not isinstance(env, Env):
         why = f"which {env_name!r} makes"
         raise TypeError(message("base", env, ENVIRONMENT, why=why))
+    if not takes:
+        env = _on_robot(env, robot, spec.robot)
     check_methods(env)
-    if not takes_robot(spec.base):
-        _require_robot(env_name, spec.robot, env)
     return env if material is None else env.with_material(material)
 
 
-def _require_robot(env_name: str, robot: RobotSpec | None, env: Env) -> None:
-    """Checks that the robot of ``register`` is the one inside the environment.
-
-    The base may have chosen another softness, and the number of substeps.
+def _on_robot(env: Env, robot: RobotSpec | None, registered: RobotSpec | None) -> Env:
+    """Returns the environment with the robot of ``create``, or else of ``register``.
 
     Raises:
-        TypeError: The base makes another robot, so it does not take the given one.
+        NotImplementedError: The environment is not a simulated robot.
+        ValueError: The robot has other joints or actuators.
     """
+    if robot is not None:
+        return env.with_robot(robot)
     made = getattr(env.unwrapped, "robot", None)
-    if robot is None or not isinstance(made, RobotSpec):
-        return
-    chosen = {"material": robot.material, "substeps": robot.substeps}
-    if dataclasses.replace(made, **chosen) != robot:
-        why = f"and {env_name!r} makes its own robot {made.name!r}"
-        allowed = "the robot that base makes, or a base with an argument robot"
-        raise TypeError(message("robot", robot, allowed, why=why))
+    if registered is None or not isinstance(made, RobotSpec):
+        return env
+    # the base may have chosen another softness, and the number of substeps
+    chosen = {"material": registered.material, "substeps": registered.substeps}
+    same = dataclasses.replace(made, **chosen) == registered
+    return env if same else env.with_robot(registered)
 
 
 def _require_keywords(

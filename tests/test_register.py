@@ -243,13 +243,13 @@ def test_own_names_can_be_replaced(rows: None) -> None:
         newton_qd.register("other", Hopper, replace=2)  # type: ignore[arg-type]
 
 
-def test_a_robot_that_the_base_does_not_take_is_refused(rows: None) -> None:
+def test_a_robot_replaces_that_of_the_base(rows: None) -> None:
     weak = dataclasses.replace(
         ANT, actuators=tuple((joint, 0.5 * gear) for joint, gear in ANT.actuators)
     )
     newton_qd.register("weak_ant", Ant, robot=weak)  # Ant has no argument robot
-    with pytest.raises(TypeError, match=r"robot: got .*makes its own robot 'ant'"):
-        newton_qd.create("weak_ant")
+    ant: Any = newton_qd.create("weak_ant").unwrapped
+    assert ant.robot is weak
     newton_qd.register("same_ant", Ant, robot=ANT)
     newton_qd.create("same_ant")
 
@@ -257,7 +257,8 @@ def test_a_robot_that_the_base_does_not_take_is_refused(rows: None) -> None:
         return Ant(**options).with_material(Material(friction=0.3))
 
     newton_qd.register("softer_ant", softer, robot=ANT)
-    newton_qd.create("softer_ant")
+    ant = newton_qd.create("softer_ant").unwrapped
+    assert ant.robot.material.friction == 0.3  # what the base chose stays
 
     class OnLegs(Hopper):
         def __init__(self, robot: RobotSpec = ANT, dtype: str = "float32") -> None:

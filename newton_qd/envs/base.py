@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import abc
-import copy
-import dataclasses
 from typing import Any
 
 import jax
@@ -19,16 +17,17 @@ from newton_qd.envs.options import checked_options
 from newton_qd.envs.renamed import keep_old_names
 from newton_qd.envs.rollouts import RolloutOrder
 from newton_qd.envs.state import State, select
+from newton_qd.envs.variants import Variants
 from newton_qd.physics.explicit_mesh import split_as
 from newton_qd.physics.system import Kinematics, PhysicsState, System
-from newton_qd.robots import Material, RobotSpec
+from newton_qd.robots import RobotSpec
 from newton_qd.scenes import Scene
 from newton_qd.types import Action, Metrics, Observation, Params, RNGKey
 
 __all__ = ["Env", "PhysicsEnv", "QDEnv"]
 
 
-class PhysicsEnv(Env):
+class PhysicsEnv(Variants):
     """A simulated robot; the base class for your own environments.
 
     A subclass overrides ``outcome``, which computes the reward of a step. It may also
@@ -96,8 +95,8 @@ class PhysicsEnv(Env):
         self._feet_tail = "exponential"
         self._load(scene)
 
-    def _load(self, scene: Scene | None) -> None:
-        system = physics.load_system(
+    def _built(self, scene: Scene | None) -> System:
+        return physics.load_system(
             self.robot,
             self._dtype.name,
             scene,
@@ -105,7 +104,9 @@ class PhysicsEnv(Env):
             feet_tail=self._feet_tail,
             reports_bodies=self.reads_bodies,
         )
-        self.system: System = system
+
+    def _load(self, scene: Scene | None) -> None:
+        self.system = system = self._built(scene)
         self._joint_q, self._joint_v = joint_indices(system)
         inputs.require_actuators(system)
         rest = jax.eval_shape(self._rest)
@@ -113,53 +114,6 @@ class PhysicsEnv(Env):
         self._layout: tuple[tuple[str, int], ...] = ()
         self._metrics: tuple[str, ...] = ()
         jax.eval_shape(self._record_names, rest, action)
-
-    def with_scene(self, scene: Scene | None) -> PhysicsEnv:
-        """Returns the same environment in another scene; this one does not change.
-
-        Args:
-            scene: Obstacles on the ground; ``None``: no obstacles.
-
-        Raises:
-            TypeError: ``scene`` is not a ``Scene``.
-            ValueError: The scene cannot be built. The error names the file and line.
-            FileNotFoundError: Its URDF file is missing.
-        """
-        moved = copy.copy(self)
-        moved._load(scene)
-        return moved
-
-    def with_material(self, material: Material) -> PhysicsEnv:
-        """Returns the same environment with another material; this one stays the same.
-
-        Args:
-            material: Softness of contacts and joint limits.
-
-        Raises:
-            TypeError: ``material`` is not a ``Material``.
-            ValueError: A number of the material is out of its range.
-        """
-        changed = copy.copy(self)
-        changed.robot = dataclasses.replace(self.robot, material=material)
-        changed._load(self.system.scene)
-        return changed
-
-    def with_feet_width(self, width: float, tail: str = "exponential") -> PhysicsEnv:
-        """Returns the same environment with another smooth feet contact.
-
-        Args:
-            width: Share of the robot's weight over which it rises from 0 to 1 [-].
-            tail: How its slope decays for large loads: ``"exponential"`` or
-                ``"algebraic"``.
-
-        Raises:
-            ValueError: ``width`` is not above 0, or ``tail`` is not allowed.
-        """
-        changed = copy.copy(self)
-        changed._feet_width = width
-        changed._feet_tail = tail
-        changed._load(self.system.scene)
-        return changed
 
     def observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
         """Returns the observation; by default all coordinates and velocities.

@@ -16,7 +16,7 @@ from newton_qd.envs import rollouts
 from newton_qd.envs.renamed import accept_params
 from newton_qd.envs.shown import described
 from newton_qd.envs.state import State, no_brax_view
-from newton_qd.robots import Material
+from newton_qd.robots import Material, RobotSpec
 from newton_qd.scenes import Scene
 from newton_qd.types import Action, Params, RNGKey
 
@@ -149,6 +149,18 @@ class Env(abc.ABC):
             NotImplementedError: The environment inside is not a simulated robot.
         """
         raise NotImplementedError(not_simulated("scene", scene, self))
+
+    def with_robot(self, robot: RobotSpec) -> Env:
+        """Returns the same wrappers around the same task for another robot.
+
+        Args:
+            robot: Spec of a robot with the same joints and actuators, in the same
+                order. This environment and its wrappers do not change.
+
+        Raises:
+            NotImplementedError: The environment inside is not a simulated robot.
+        """
+        raise NotImplementedError(not_simulated("robot", robot, self))
 
     def with_material(self, material: Material) -> Env:
         """Returns the same wrappers around the same robot with another material.

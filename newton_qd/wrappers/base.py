@@ -14,7 +14,7 @@ from newton_qd.envs.base import Env
 from newton_qd.envs.env import raise_own_error
 from newton_qd.envs.rollouts import RolloutOrder
 from newton_qd.envs.state import State
-from newton_qd.robots import Material
+from newton_qd.robots import Material, RobotSpec
 from newton_qd.scenes import Scene
 from newton_qd.types import Action, Params, RNGKey
 
@@ -141,6 +141,10 @@ class Wrapper(Env):
     def with_scene(self, scene: Scene | None) -> Env:
         """Returns the same wrappers around the same robot in another scene."""
         return self.with_base(lambda base: base.with_scene(scene))
+
+    def with_robot(self, robot: RobotSpec) -> Env:
+        """Returns the same wrappers around the same task for another robot."""
+        return self.with_base(lambda base: base.with_robot(robot))
 
     def with_material(self, material: Material) -> Env:
         """Returns the same wrappers around the same robot with another material."""

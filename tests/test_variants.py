@@ -1,0 +1,91 @@
+"""Copies of an environment with another robot."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+import newton_qd
+from newton_qd.assets import find_urdf
+from newton_qd.envs.ant import Ant
+from newton_qd.envs.locomotion import Locomotion
+from newton_qd.envs.pointmaze import PointMaze
+from newton_qd.robots import ANT, HOPPER, Material, RobotSpec
+
+KEY = jax.random.key(0)
+
+
+@pytest.fixture
+def hurt(tmp_path: Path) -> RobotSpec:
+    """An ant whose first motor is dead in all but name, and whose torso is heavier."""
+    text = find_urdf(ANT.urdf).read_text(encoding="utf-8")
+    path = tmp_path / "hurt.urdf"
+    path.write_text(text.replace('mass value="10.0"', 'mass value="12.0"', 1))
+    weak = (ANT.actuators[0][0], 0.01), *ANT.actuators[1:]
+    return dataclasses.replace(ANT, name="hurt", urdf=str(path), actuators=weak)
+
+
+def test_another_robot_in_the_same_task(hurt: RobotSpec) -> None:
+    ant = Ant(healthy_reward=7.0)
+    changed = ant.with_robot(hurt)
+    assert changed.robot is hurt and ant.robot is ANT
+    assert changed.name == "hurt"
+    torso = ant.system.torso
+    assert (ant.system.mass[torso], changed.system.mass[torso]) == (10, 12)
+    assert changed.system.gear[0] == 0.01
+    assert changed.observation_layout == ant.observation_layout
+    after = jax.jit(changed.step)(changed.reset(KEY), np.zeros(8, np.float32))
+    assert float(after.metrics["reward_survive"]) == 7.0
+    assert changed.with_robot(ANT).system is ant.system
+
+
+def test_tasks_keep_wrappers_scene_and_softness(hurt: RobotSpec) -> None:
+    whole = newton_qd.create("ant_uni", 5)
+    env: Any = newton_qd.create("ant_uni", 5, robot=hurt)
+    assert env.robot is hurt and env.state_descriptor_length == 4
+    assert env.observation_size == whole.observation_size
+    other: Any = whole.with_robot(hurt)
+    assert other.system is env.system
+    soft: Any = newton_qd.create("anttrap", robot=hurt, material=Material(friction=0.3))
+    assert soft.robot == dataclasses.replace(hurt, material=Material(friction=0.3))
+    own: Any = newton_qd.create("anttrap").unwrapped
+    assert soft.system.scene is own.system.scene is not None
+
+
+def test_a_base_that_takes_a_robot_gets_it(
+    hurt: RobotSpec, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows = dict(newton_qd.tasks.ENVIRONMENTS)
+    monkeypatch.setattr(newton_qd.tasks, "ENVIRONMENTS", rows)
+    newton_qd.register("run", Locomotion, robot=ANT)
+    run: Any = newton_qd.create("run", robot=hurt)
+    assert run.robot is hurt
+    options: Any = {"robot": "small"}
+    newton_qd.register("sized", _sized)
+    assert newton_qd.create("sized", **options).unwrapped.name == "small"
+
+
+def _sized(robot: str = "large") -> newton_qd.Env:
+    """An environment whose argument ``robot`` is no spec."""
+    return Ant().with_robot(dataclasses.replace(ANT, name=robot))
+
+
+def test_robots_that_do_not_fit_are_refused(hurt: RobotSpec) -> None:
+    words = r"robot: got hopper, whose joints are .*; allowed: a robot with the joints"
+    with pytest.raises(ValueError, match=words):
+        Ant().with_robot(HOPPER)
+    turned = dataclasses.replace(hurt, actuators=hurt.actuators[::-1])
+    words = "robot: got hurt, whose actuators are .*; allowed: .* the actuators of this"
+    with pytest.raises(ValueError, match=words):
+        newton_qd.create("ant_uni", robot=turned)
+    with pytest.raises(TypeError, match=r"robot: got 'ant'; allowed: .*RobotSpec"):
+        newton_qd.create("ant", robot="ant")  # type: ignore[arg-type]
+    with pytest.raises(NotImplementedError, match="pointmaze is not a simulated robot"):
+        PointMaze().with_robot(ANT)
+    with pytest.raises(NotImplementedError, match="pointmaze is not a simulated robot"):
+        newton_qd.create("pointmaze", robot=ANT)
