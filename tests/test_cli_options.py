@@ -171,7 +171,8 @@ def test_options_are_written_as_in_json_or_in_python(
     config, _ = settle(parser.parse_args(arguments))
     expected = {"conditioned": False, "whiten": False, "critic": (8, 8), "rate": 1e-3}
     assert dict(config.options) == expected
-    for wrong in ("conditioned", "=1", "conditioned=no", "conditioned='no'"):
+    deep = f"critic={'[' * 20_000}"
+    for wrong in ("conditioned", "=1", "conditioned=no", "conditioned='no'", deep):
         with pytest.raises(SystemExit):
             parser.parse_args(["evolve", "pointmaze", "--option", wrong])
         assert "allowed: a name and a value like" in capsys.readouterr().err

@@ -210,6 +210,10 @@ def test_eval_does_not_compare_returns_with_what_counts(
         (("--best", "0"), "--best: got 0"),
         (("--starts", "-1"), "--starts: got -1"),
         (("--seed", "3"), "--seed: got 3, which has no effect without --starts"),
+        (
+            ("--starts", "2", "--seed", "4294967296"),
+            "--seed: got 4294967296; allowed: integers from 0 to 4294967295",
+        ),
     ],
 )
 def test_eval_refuses(
@@ -220,6 +224,14 @@ def test_eval_refuses(
 ) -> None:
     assert call("eval", reference, *arguments) == cli.BAD_ARGUMENTS
     assert message in capsys.readouterr().err
+
+
+def test_eval_takes_the_seeds_of_runs(
+    reference: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = "--best", "1", "--starts", "2", "--seed", "4294967295"
+    assert call("eval", reference, *options) == cli.OK
+    assert capsys.readouterr().out
 
 
 def test_eval_of_no_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

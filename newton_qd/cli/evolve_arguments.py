@@ -257,7 +257,7 @@ def _env_option(text: str) -> tuple[str, Any]:
 def _value(text: str) -> Any:
     """Returns a value that JSON or Python writes so; other text, as in scene=maze."""
     for parse in (json.loads, ast.literal_eval):
-        with contextlib.suppress(SyntaxError, ValueError):
+        with contextlib.suppress(RecursionError, SyntaxError, ValueError):
             return parse(text)
     return text
 

@@ -139,7 +139,7 @@ def checked_starts(arguments: argparse.Namespace) -> int:
     checks.integer("--starts", arguments.starts, least=0, most=most, error=ConfigError)
     if arguments.seed is None:
         return 0
-    checks.integer("--seed", arguments.seed, least=0, error=ConfigError)
+    checks.integer("--seed", arguments.seed, least=0, most=2**32 - 1, error=ConfigError)
     if not arguments.starts:
         why = "which has no effect without --starts"
         raise ConfigError(message("--seed", arguments.seed, "with --starts", why=why))

@@ -302,7 +302,8 @@ def _trajectory(
     """
     seed = arguments.seed
     checks.integer("--steps", arguments.steps, optional=True, error=ConfigError)
-    checks.integer("--seed", seed, least=0, optional=True, error=ConfigError)
+    most = 2**32 - 1
+    checks.integer("--seed", seed, least=0, most=most, optional=True, error=ConfigError)
     checks.integer(
         "--best", arguments.best, most=_MOST_WORLDS, optional=True, error=ConfigError
     )

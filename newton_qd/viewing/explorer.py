@@ -62,7 +62,7 @@ def explorer_html(
             their scenes differ, or a number is not allowed.
     """
     checks.integer("starts", starts, least=0)
-    checks.integer("seed", seed, least=0)
+    checks.integer("seed", seed, least=0, most=2**32 - 1)
     allowed = "a list of one run or two runs, as newton_qd.qd.load_run returns them"
     checks.instance("runs", runs, (list, tuple), allowed)
     for index, run in enumerate(runs):
