@@ -266,27 +266,30 @@ class ActorCritic:
             after = self.env.step(before, jnp.clip(action, -1, 1))
             gain = jnp.append(after.reward, self.measure(before, after)) @ learner.aim
             value = self._value(learner.target, scale, after.obs)
-            row = gain, after.done, value, jnp.where(_sound(after), value, 0)
-            return select(after.done > 0, first, after), (state.obs, row)
+            ended = after.done
+            if settings.beyond_length:
+                ended = ended - after.info["truncation"]
+            row = gain, ended, value, jnp.where(_sound(after), value, 0)
+            return select(after.done > 0, first, after), (state.obs, after.done, row)
 
-        last, (obs, rows) = jax.lax.scan(advance, state, noise)
+        last, (obs, dones, rows) = jax.lax.scan(advance, state, noise)
 
         def back(sums: PyTree, row: PyTree) -> tuple[PyTree, jax.Array]:
             total, target = sums
-            gain, done, value, lost = row
+            gain, ended, value, lost = row
             mixed = (1 - settings.trace) * value + settings.trace * target
             if settings.actor_trace < 1:  # else without the value, also if it is NaN
                 part = settings.actor_trace
                 total = (1 - part) * value + part * total
             # after a fall, the value has no gradient; only done has one
-            total = jnp.where(done > 0, jax.lax.stop_gradient(lost), total)
-            total = gain + settings.discount * (1 - done) * total
-            target = gain + settings.discount * jnp.where(done > 0, 0, mixed)
+            total = jnp.where(ended > 0, jax.lax.stop_gradient(lost), total)
+            total = gain + settings.discount * (1 - ended) * total
+            target = gain + settings.discount * jnp.where(ended > 0, 0, mixed)
             return (total, target), target
 
         ends = (rows[2][-1], rows[2][-1])
         (total, _), targets = jax.lax.scan(back, ends, rows, reverse=True)
-        return total, jax.lax.stop_gradient((last, obs, targets, rows[1]))
+        return total, jax.lax.stop_gradient((last, obs, targets, dones))
 
     def _fit(
         self,

@@ -26,6 +26,8 @@ class ActorCriticSettings:
         trace: Lambda of the critic's TD(lambda) targets [-].
         actor_trace: Lambda of the return that the actor maximizes [-]; 1: only the last
             state of a window has a value.
+        beyond_length: Whether the last state of an episode of full length has a value,
+            as if the episode went on; if not, this end is worth as little as a fall.
         epochs: Number of times that the critic learns from a window.
         batches: Optimizer steps of the critic in each epoch.
         whiten: Whether an actor learns weights for whitened observations.
@@ -48,6 +50,7 @@ class ActorCriticSettings:
     discount: float = 0.97
     trace: float = 0.95
     actor_trace: float = 1.0
+    beyond_length: bool = False
     epochs: int = 2
     batches: int = 4
     whiten: bool = True
@@ -61,6 +64,7 @@ class ActorCriticSettings:
             ValueError: A value is out of its range.
         """
         checks.flag("whiten", self.whiten)
+        checks.flag("beyond_length", self.beyond_length)
         allowed = "a tuple of integers"
         checks.instance("critic", self.critic, (tuple, list), allowed)
         for index, width in enumerate(self.critic):
