@@ -194,16 +194,21 @@ class Over(PointEnv):
         return dataclasses.replace(state, done=jnp.ones_like(state.done), info=info)
 
 
+@pytest.mark.parametrize("window", [1, 3])
 @pytest.mark.parametrize("beyond", [False, True])
 @pytest.mark.parametrize("push", [0.5, 8.0])
-def test_the_end_of_a_whole_episode_has_a_value(beyond: bool, push: float) -> None:
-    way = method(noise=0.0, window=1, beyond_length=beyond)
+def test_the_end_of_a_whole_episode_has_a_value(
+    window: int, beyond: bool, push: float
+) -> None:
+    """Also within a window, whose other steps belong to other episodes."""
+    way = method(noise=0.0, window=window, beyond_length=beyond)
     way = dataclasses.replace(way, env=Over(), policy=lambda weights, _: weights[:2])
     start = learner(way)
     ones = jax.tree.map(jnp.ones_like, start.target)
     start = dataclasses.replace(start, target=ones)
     scale = jnp.zeros(3), jnp.ones(3)
     world = Over()._state(jnp.full(2, push), jnp.zeros(()))
+    first = Over()._state(jnp.full(2, 0.1), jnp.zeros(()))
     counts = beyond and push < 2  # farther from the middle, the point falls
 
     def by_hand(weights: jax.Array) -> jax.Array:
@@ -212,8 +217,8 @@ def test_the_end_of_a_whole_episode_has_a_value(beyond: bool, push: float) -> No
         return state.reward + counts * SETTINGS.discount * value
 
     def by_window(weights: jax.Array) -> tuple[jax.Array, Any]:
-        noise = jnp.zeros((1, 2))
-        return way._window(weights, start, scale, world, world, noise)
+        noise = jnp.zeros((window, 2))
+        return way._window(weights, start, scale, first, world, noise)
 
     weights = jnp.full(SIZE, 0.3)
     (total, found), slope = compiled(jax.value_and_grad(by_window, has_aux=True))(
@@ -223,8 +228,8 @@ def test_the_end_of_a_whole_episode_has_a_value(beyond: bool, push: float) -> No
     last, _, targets, dones = found
     np.testing.assert_allclose((total, targets[0]), expected, rtol=1e-5)
     np.testing.assert_allclose(slope, other, rtol=1e-5)
-    assert dones.tolist() == [1]
-    np.testing.assert_array_equal(last.pipeline_state, world.pipeline_state)
+    assert dones.tolist() == [1] * window
+    np.testing.assert_array_equal(last.pipeline_state, first.pipeline_state)
 
 
 class Blind(PointEnv):

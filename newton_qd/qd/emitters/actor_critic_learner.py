@@ -266,17 +266,23 @@ class ActorCritic:
             after = self.env.step(before, jnp.clip(action, -1, 1))
             gain = jnp.append(after.reward, self.measure(before, after)) @ learner.aim
             value = self._value(learner.target, scale, after.obs)
-            ended = after.done
+            ended, beyond = after.done, ()
             if settings.beyond_length:
                 ended = ended - after.info["truncation"]
-            row = gain, ended, value, jnp.where(_sound(after), value, 0)
+                full = after.done > ended
+                # the gradient of another value, which may be NaN, does not count
+                seen = jnp.where(full, after.obs, 0)
+                beyond = full, self._value(learner.target, scale, seen)
+            row = gain, ended, value, jnp.where(_sound(after), value, 0), beyond
             return select(after.done > 0, first, after), (state.obs, after.done, row)
 
         last, (obs, dones, rows) = jax.lax.scan(advance, state, noise)
 
         def back(sums: PyTree, row: PyTree) -> tuple[PyTree, jax.Array]:
             total, target = sums
-            gain, ended, value, lost = row
+            gain, ended, value, lost, beyond = row
+            if beyond:  # the rest of the window belongs to another episode
+                total, target = (jnp.where(beyond[0], beyond[1], x) for x in sums)
             mixed = (1 - settings.trace) * value + settings.trace * target
             if settings.actor_trace < 1:  # else without the value, also if it is NaN
                 part = settings.actor_trace
