@@ -15,7 +15,7 @@ from newton_qd.assets import find_urdf
 from newton_qd.envs.ant import Ant
 from newton_qd.envs.locomotion import Locomotion
 from newton_qd.envs.pointmaze import PointMaze
-from newton_qd.robots import ANT, HOPPER, Material, RobotSpec
+from newton_qd.robots import ANT, HOPPER, REACHER, Material, RobotSpec
 
 KEY = jax.random.key(0)
 
@@ -75,7 +75,7 @@ def _sized(robot: str = "large") -> newton_qd.Env:
     return Ant().with_robot(dataclasses.replace(ANT, name=robot))
 
 
-def test_robots_that_do_not_fit_are_refused(hurt: RobotSpec) -> None:
+def test_robots_that_do_not_fit_are_refused(hurt: RobotSpec, tmp_path: Path) -> None:
     words = r"robot: got hopper, whose joints are .*; allowed: a robot with the joints"
     with pytest.raises(ValueError, match=words):
         Ant().with_robot(HOPPER)
@@ -83,6 +83,15 @@ def test_robots_that_do_not_fit_are_refused(hurt: RobotSpec) -> None:
     words = "robot: got hurt, whose actuators are .*; allowed: .* the actuators of this"
     with pytest.raises(ValueError, match=words):
         newton_qd.create("ant_uni", robot=turned)
+    text = find_urdf(REACHER.urdf).read_text(encoding="utf-8")
+    path = tmp_path / "renamed.urdf"  # the task asks for the tip of body1
+    path.write_text(text.replace('"body1"', '"hand"'))
+    renamed = dataclasses.replace(REACHER, name="renamed", urdf=str(path))
+    words = (
+        "robot: got renamed, whose links are .*hand.*; allowed: .* the links of this"
+    )
+    with pytest.raises(ValueError, match=words):
+        newton_qd.create("reacher", robot=renamed)
     with pytest.raises(TypeError, match=r"robot: got 'ant'; allowed: .*RobotSpec"):
         newton_qd.create("ant", robot="ant")  # type: ignore[arg-type]
     with pytest.raises(NotImplementedError, match="pointmaze is not a simulated robot"):

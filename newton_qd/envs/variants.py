@@ -54,12 +54,12 @@ class Variants(Env):
         """Returns the same task for another robot, such as a damaged one.
 
         Args:
-            robot: Spec of a robot with the same joints and actuators, in the same
-                order. Lengths, masses, limits, gears and contacts may differ.
+            robot: Spec of a robot with the same joints, links and actuators, in the
+                same order. Lengths, masses, limits, gears and contacts may differ.
 
         Raises:
             TypeError: ``robot`` is not a ``RobotSpec``.
-            ValueError: Its joints or actuators differ, or it cannot be built.
+            ValueError: Its joints, links or actuators differ, or it cannot be built.
             FileNotFoundError: Its URDF file is missing.
         """
         checks.instance("robot", robot, RobotSpec, ROBOT)
@@ -105,13 +105,14 @@ class Variants(Env):
 
 
 def _require_same_joints(system: System, task: System) -> None:
-    """Checks that a task may read the state of a robot by the places of its joints.
+    """Checks that a task may read the state of a robot by places and names.
 
     Raises:
-        ValueError: The joints or the actuators differ.
+        ValueError: The joints, the links or the actuators differ.
     """
     for name, new, own in (
         ("joints", _joints(system), _joints(task)),
+        ("links", list(system.body_names), list(task.body_names)),
         ("actuators", _actuators(system), _actuators(task)),
     ):
         if new != own:
