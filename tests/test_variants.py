@@ -83,6 +83,10 @@ def test_robots_that_do_not_fit_are_refused(hurt: RobotSpec, tmp_path: Path) -> 
     words = "robot: got hurt, whose actuators are .*; allowed: .* the actuators of this"
     with pytest.raises(ValueError, match=words):
         newton_qd.create("ant_uni", robot=turned)
+    lame = dataclasses.replace(hurt, feet=hurt.feet[:2])
+    words = "robot: got hurt, whose feet are .*; allowed: .* the feet of this task: "
+    with pytest.raises(ValueError, match=words):
+        newton_qd.create("ant_uni", robot=lame)
     text = find_urdf(REACHER.urdf).read_text(encoding="utf-8")
     path = tmp_path / "renamed.urdf"  # the task asks for the tip of body1
     path.write_text(text.replace('"body1"', '"hand"'))

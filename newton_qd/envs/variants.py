@@ -54,19 +54,22 @@ class Variants(Env):
         """Returns the same task for another robot, such as a damaged one.
 
         Args:
-            robot: Spec of a robot with the same joints, links and actuators, in the
-                same order. Lengths, masses, limits, gears and contacts may differ.
+            robot: Spec of a robot with the same joints, links, feet and actuators, in
+                the same order. Lengths, masses, limits, gears and contacts may differ.
+                The tips that ``Reacher`` and ``InvertedDoublePendulum`` read stay where
+                they are on the links of their own robots.
 
         Raises:
             TypeError: ``robot`` is not a ``RobotSpec``.
-            ValueError: Its joints, links or actuators differ, or it cannot be built.
+            ValueError: Its joints, links, feet or actuators differ, or it cannot be
+                built.
             FileNotFoundError: Its URDF file is missing.
         """
         checks.instance("robot", robot, RobotSpec, ROBOT)
         changed = copy.copy(self)
         changed.robot = robot
         # before the task reads places that another robot does not have
-        _require_same_joints(changed._built(self.system.scene), self.system)
+        _require_fit(changed._built(self.system.scene), self.system)
         changed._load(self.system.scene)
         return changed
 
@@ -104,15 +107,16 @@ class Variants(Env):
         return changed
 
 
-def _require_same_joints(system: System, task: System) -> None:
+def _require_fit(system: System, task: System) -> None:
     """Checks that a task may read the state of a robot by places and names.
 
     Raises:
-        ValueError: The joints, the links or the actuators differ.
+        ValueError: The joints, the links, the feet or the actuators differ.
     """
     for name, new, own in (
         ("joints", _joints(system), _joints(task)),
         ("links", list(system.body_names), list(task.body_names)),
+        ("feet", list(system.robot.feet), list(task.robot.feet)),
         ("actuators", _actuators(system), _actuators(task)),
     ):
         if new != own:

@@ -268,7 +268,7 @@ class ActorCritic:
             value = self._value(learner.target, scale, after.obs)
             ended, beyond = after.done, ()
             if settings.beyond_length:
-                ended = ended - after.info["truncation"]
+                ended = ended - after.info.get("truncation", 0)
                 full = after.done > ended
                 # the gradient of another value, which may be NaN, does not count
                 seen = jnp.where(full, after.obs, 0)
