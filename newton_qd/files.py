@@ -6,8 +6,11 @@ import contextlib
 import glob
 import os
 import secrets
+import time
 from collections.abc import Iterator
 from pathlib import Path
+
+_ABANDONED = 3600.0  # age [s] of a temporary file whose writer was killed
 
 
 def temporary_name(path: Path) -> Path:
@@ -51,3 +54,13 @@ def write_atomically(path: Path, content: bytes) -> None:
             raise
         # The message of the system does not always name the file.
         raise OSError(error.errno, error.strerror, str(path)) from error
+    _remove_abandoned(path)
+
+
+def _remove_abandoned(path: Path) -> None:
+    """Removes what killed writers of a file left behind."""
+    newest = time.time() - _ABANDONED
+    for part in temporary_files(path):
+        with contextlib.suppress(OSError):
+            if part.stat().st_mtime < newest:
+                part.unlink()

@@ -7,6 +7,7 @@ import dataclasses
 import errno
 import io
 import os
+import time
 from pathlib import Path
 from typing import Any
 
@@ -178,6 +179,18 @@ def test_two_writers_of_one_file(
     files.write_atomically(path, b"first")
     assert path.read_bytes() == b"first"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_what_killed_writers_left_is_removed(tmp_path: Path) -> None:
+    path = tmp_path / "page.html"
+    old, new = files.temporary_name(path), files.temporary_name(path)
+    for part, age in ((old, 2 * 3600), (new, 60)):
+        part.touch()
+        then = time.time() - age
+        os.utime(part, (then, then))
+    files.write_atomically(path, b"page")
+    assert not old.exists() and new.exists()  # another process may write it now
+    assert path.read_bytes() == b"page"
 
 
 def test_unfinished_files_of_a_killed_run_are_removed(tmp_path: Path) -> None:
