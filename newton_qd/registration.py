@@ -101,6 +101,12 @@ def takes_robot(base: Callable[..., Env]) -> bool:
     return "robot" in inspect.signature(base).parameters
 
 
+def takes_any(base: Callable[..., Env]) -> bool:
+    """Returns whether ``base`` takes every keyword argument, as ``**options``."""
+    parameters = inspect.signature(base).parameters.values()
+    return any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters)
+
+
 def needs_robot(base: Callable[..., Env]) -> bool:
     """Returns whether ``base`` has an argument ``robot`` without a value."""
     parameter = inspect.signature(base).parameters.get("robot")

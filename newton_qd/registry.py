@@ -14,9 +14,9 @@ from newton_qd import brax_views as brax
 from newton_qd import checks, tasks
 from newton_qd.checks import Fact, listed, message
 from newton_qd.envs.base import Env
+from newton_qd.envs.changes import ROBOT
 from newton_qd.envs.methods import check_methods, random_key
 from newton_qd.envs.shown import REGISTERED
-from newton_qd.envs.variants import ROBOT
 from newton_qd.errors import UnknownEnvironment
 from newton_qd.moved import moved_name
 from newton_qd.registration import (
@@ -27,6 +27,7 @@ from newton_qd.registration import (
     check_wrappers,
     descriptor_specs,
     needs_robot,
+    takes_any,
     takes_robot,
 )
 from newton_qd.robots import Material, RobotSpec
@@ -166,7 +167,8 @@ def create(
         material: Softness of contacts and limits; ``None``: as in the robot's spec.
         brax_views: Whether to add ``state.qp`` and ``env.sys`` for code for brax v1.
         robot: Another robot for the task, such as a damaged one: see
-            ``env.with_robot``; ``None``: that of the environment.
+            ``env.with_robot``. A base with an argument ``robot``, or with any keyword
+            arguments, gets it instead. ``None``: that of the environment.
         **kwargs: Options of the environment inside, such as ``dtype``.
 
     Returns:
@@ -249,7 +251,7 @@ def _base(
     """
     allowed = "newton_qd.robots.Material"
     checks.instance("material", material, Material, allowed, optional=True)
-    takes = takes_robot(spec.base)
+    takes = takes_robot(spec.base) or (robot is not None and takes_any(spec.base))
     if not takes:
         checks.instance("robot", robot, RobotSpec, ROBOT, optional=True)
     elif robot is not None:
@@ -295,9 +297,9 @@ def _require_keywords(
     Raises:
         TypeError: One of them is unknown.
     """
-    parameters = inspect.signature(base).parameters.values()
-    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
+    if takes_any(base):
         return
+    parameters = inspect.signature(base).parameters.values()
     allowed = [p.name for p in parameters if p.kind is not p.POSITIONAL_ONLY]
     for name in given:
         if name not in allowed:

@@ -11,13 +11,13 @@ import numpy as np
 
 from newton_qd import checks, physics
 from newton_qd.envs import inputs
+from newton_qd.envs.changes import WithChanges
 from newton_qd.envs.env import Env, QDEnv
 from newton_qd.envs.joints import joint_indices, joint_slices
 from newton_qd.envs.options import checked_options
 from newton_qd.envs.renamed import keep_old_names
 from newton_qd.envs.rollouts import RolloutOrder
 from newton_qd.envs.state import State, select
-from newton_qd.envs.variants import Variants
 from newton_qd.physics.explicit_mesh import split_as
 from newton_qd.physics.system import Kinematics, PhysicsState, System
 from newton_qd.robots import RobotSpec
@@ -27,7 +27,7 @@ from newton_qd.types import Action, Metrics, Observation, Params, RNGKey
 __all__ = ["Env", "PhysicsEnv", "QDEnv"]
 
 
-class PhysicsEnv(Variants):
+class PhysicsEnv(WithChanges):
     """A simulated robot; the base class for your own environments.
 
     A subclass overrides ``outcome``, which computes the reward of a step. It may also

@@ -18,8 +18,8 @@ ROBOT = "a newton_qd.robots.RobotSpec"
 """What ``with_robot`` takes."""
 
 
-class Variants(Env):
-    """Makes copies of an environment that differ in one thing; it never changes.
+class WithChanges(Env):
+    """Makes copies that differ in one thing; the environment itself stays the same.
 
     Attributes:
         robot: Spec of the robot.
@@ -135,4 +135,6 @@ def _joints(system: System) -> list[str]:
 
 
 def _actuators(system: System) -> list[str]:
-    return [name for name, _ in system.robot.actuators]
+    robot = system.robot
+    servos = {name: f"{name} (servo)" for name in robot.servos}
+    return [servos.get(name, name) for name, _ in robot.actuators]

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 import newton_qd
+from newton_qd import tasks
 from newton_qd.assets import find_urdf
 from newton_qd.envs.ant import Ant
 from newton_qd.envs.locomotion import Locomotion
 from newton_qd.envs.pointmaze import PointMaze
-from newton_qd.robots import ANT, HOPPER, REACHER, Material, RobotSpec
+from newton_qd.robots import ANT, HOPPER, QUADRUPED, REACHER, Material, RobotSpec
 
 KEY = jax.random.key(0)
 
@@ -60,14 +61,20 @@ def test_tasks_keep_wrappers_scene_and_softness(hurt: RobotSpec) -> None:
 def test_a_base_that_takes_a_robot_gets_it(
     hurt: RobotSpec, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rows = dict(newton_qd.tasks.ENVIRONMENTS)
-    monkeypatch.setattr(newton_qd.tasks, "ENVIRONMENTS", rows)
+    monkeypatch.setattr(tasks, "ENVIRONMENTS", dict(tasks.ENVIRONMENTS))
     newton_qd.register("run", Locomotion, robot=ANT)
     run: Any = newton_qd.create("run", robot=hurt)
     assert run.robot is hurt
+    newton_qd.register("any", _any)
+    own: Any = newton_qd.create("any", robot=QUADRUPED)  # which has other joints
+    assert own.robot is QUADRUPED
     options: Any = {"robot": "small"}
     newton_qd.register("sized", _sized)
     assert newton_qd.create("sized", **options).unwrapped.name == "small"
+
+
+def _any(**options: Any) -> newton_qd.Env:
+    return Locomotion(**{"robot": ANT, **options})
 
 
 def _sized(robot: str = "large") -> newton_qd.Env:
