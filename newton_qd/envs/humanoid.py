@@ -14,6 +14,7 @@ from newton_qd.envs.options import checked_options
 from newton_qd.envs.vectors import cross, length, ordered_sum, rounded
 from newton_qd.physics.system import Kinematics, PhysicsState
 from newton_qd.robots import HUMANOID, RobotSpec
+from newton_qd.scenes import Scene
 from newton_qd.types import Action, Metrics
 
 _ROOT_V = 6  # a free root has 6 velocities
@@ -49,6 +50,7 @@ class Humanoid(PhysicsEnv):
     forward_reward_name: str | None = "reward_linvel"
     reads_bodies = True
     _spec: RobotSpec = HUMANOID
+    _scene: Scene | None = None
 
     @checked_options
     def __init__(
@@ -88,7 +90,12 @@ class Humanoid(PhysicsEnv):
         self._terminate_when_unhealthy = terminate_when_unhealthy
         self._healthy_z_range = healthy_z_range
         self._omit_xy = exclude_current_positions_from_observation
-        super().__init__(self._spec, reset_noise_scale=reset_noise_scale, dtype=dtype)
+        super().__init__(
+            self._spec,
+            reset_noise_scale=reset_noise_scale,
+            dtype=dtype,
+            scene=self._scene,
+        )
 
     def observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
         """Returns the blocks of the observation."""

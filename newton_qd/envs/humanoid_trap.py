@@ -27,6 +27,8 @@ class HumanoidTrap(Humanoid):
         reward_impact: 0, as in the original.
     """
 
+    _scene = HUMANOID_TRAP
+
     @checked_options
     def __init__(
         self,
@@ -70,7 +72,6 @@ class HumanoidTrap(Humanoid):
             ),
             dtype=dtype,
         )
-        self._load(HUMANOID_TRAP)
 
     @property
     def name(self) -> str:
