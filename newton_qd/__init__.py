@@ -109,9 +109,9 @@ def __getattr__(name: str) -> Any:
         if not name.startswith("_") and importlib.util.find_spec(path) is not None:
             raise AttributeError(f"{path} is loaded by itself: import {path}")
         return moved_name(__name__, name, _MOVED)
-    value = getattr(importlib.import_module(_HOME[name]), name)
-    globals()[name] = value
-    return value
+    from newton_qd.lazy import loaded_name
+
+    return loaded_name(globals(), name, _HOME)
 
 
 def __dir__() -> list[str]:

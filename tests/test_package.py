@@ -26,6 +26,7 @@ LAYERS = (
     "errors",
     "figure",
     "files",
+    "lazy",
     "memory",
     "moved",
     "types",

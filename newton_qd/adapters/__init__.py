@@ -13,8 +13,9 @@ first used, and needs its extra: ``gym``, ``torch`` or ``brax``.
 
 from __future__ import annotations
 
-import importlib
 from typing import TYPE_CHECKING, Any
+
+from newton_qd.lazy import loaded_name
 
 if TYPE_CHECKING:
     from newton_qd.adapters.brax import BraxEnv, BraxSystem, register_with_brax
@@ -35,28 +36,19 @@ __all__ = [
 ]
 
 _HOME = {
-    "BraxEnv": "brax",
-    "BraxSystem": "brax",
-    "GymnasiumEnv": "gymnasium",
-    "GymnasiumVectorEnv": "gymnasium_vector",
-    "make_gymnasium": "gymnasium",
-    "make_gymnasium_vector": "gymnasium_vector",
-    "register_with_brax": "brax",
+    "BraxEnv": ".brax",
+    "BraxSystem": ".brax",
+    "GymnasiumEnv": ".gymnasium",
+    "GymnasiumVectorEnv": ".gymnasium_vector",
+    "make_gymnasium": ".gymnasium",
+    "make_gymnasium_vector": ".gymnasium_vector",
+    "register_with_brax": ".brax",
 }
 
 
 def __getattr__(name: str) -> Any:
-    """Loads a name of this package when it is first used.
-
-    Raises:
-        AttributeError: The package has no such name.
-        MissingExtra: The other library is not installed.
-    """
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
-    globals()[name] = value
-    return value
+    """Loads a name of this package when it is first used."""
+    return loaded_name(globals(), name, _HOME)
 
 
 def __dir__() -> list[str]:

@@ -17,8 +17,9 @@ first used.
 
 from __future__ import annotations
 
-import importlib
 from typing import TYPE_CHECKING, Any
+
+from newton_qd.lazy import loaded_name
 
 if TYPE_CHECKING:
     from newton_qd.gradients.doctor import diagnose_gradients
@@ -59,35 +60,27 @@ __all__ = [
 ]
 
 _HOME = {
-    "Episode": "episode",
-    "EpisodeGradients": "exact",
-    "GradientOptions": "flow",
-    "GradientReport": "report",
-    "MixedGradients": "mixed",
-    "Outcome": "outcome",
-    "diagnose_gradients": "doctor",
-    "make_directional_gradient": "factories",
-    "make_episode": "factories",
-    "make_episode_gradient": "factories",
-    "make_mixed_gradient": "factories",
-    "soft_to_stiff": "softness",
-    "softened": "softness",
-    "with_smooth_descriptor": "smooth",
-    "with_smooth_termination": "smooth",
+    "Episode": ".episode",
+    "EpisodeGradients": ".exact",
+    "GradientOptions": ".flow",
+    "GradientReport": ".report",
+    "MixedGradients": ".mixed",
+    "Outcome": ".outcome",
+    "diagnose_gradients": ".doctor",
+    "make_directional_gradient": ".factories",
+    "make_episode": ".factories",
+    "make_episode_gradient": ".factories",
+    "make_mixed_gradient": ".factories",
+    "soft_to_stiff": ".softness",
+    "softened": ".softness",
+    "with_smooth_descriptor": ".smooth",
+    "with_smooth_termination": ".smooth",
 }
 
 
 def __getattr__(name: str) -> Any:
-    """Loads a name of this package when it is first used.
-
-    Raises:
-        AttributeError: The package has no such name.
-    """
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
-    globals()[name] = value
-    return value
+    """Loads a name of this package when it is first used."""
+    return loaded_name(globals(), name, _HOME)
 
 
 def __dir__() -> list[str]:

@@ -24,8 +24,9 @@ first used. Functions that need QDax or matplotlib (extra ``qd``) import them.
 
 from __future__ import annotations
 
-import importlib
 from typing import TYPE_CHECKING, Any
+
+from newton_qd.lazy import loaded_name
 
 if TYPE_CHECKING:
     from newton_qd.qd.algorithms import (
@@ -99,57 +100,49 @@ __all__ = [
 ]
 
 _HOME = {
-    "AlgorithmSpec": "algorithms",
-    "AnnealedRepertoire": "emitters.annealed_repertoire",
-    "Archive": "run.archive",
-    "ArchiveError": "run.archive",
-    "CheckpointError": "run.checkpoint",
-    "ConfigError": "config",
-    "Elite": "run.opened",
-    "EmitterContext": "algorithms",
-    "Evaluation": "run.opened",
-    "EvolveConfig": "config",
-    "EvolveResult": "run.evolution",
-    "Options": "algorithms.options",
-    "Policy": "scoring.rollout",
-    "Reevaluated": "run.reevaluation",
-    "Run": "run.opened",
-    "Scatter": "scoring.scatter",
-    "SearchError": "run.search",
-    "Task": "scoring.task",
-    "device_mesh": "scoring.sharding",
-    "episode_of": "scoring.rollout",
-    "evolve": "run.evolution",
-    "from_ribs": "scoring.ribs",
-    "load_archive": "run.archive",
-    "load_run": "run.opened",
-    "make_gradient_scoring_function": "scoring.gradient_scoring",
-    "make_policy": "scoring.rollout",
-    "make_ribs_evaluation": "scoring.ribs",
-    "make_scoring_function": "scoring.rollout",
-    "make_task": "scoring.task",
-    "plot_archive": "run.plot",
-    "policy_of": "scoring.networks",
-    "reevaluate": "run.reevaluation",
-    "register_algorithm": "algorithms",
-    "robust_scoring": "scoring.robust",
-    "shard_scoring": "scoring.sharding",
-    "study_config": "study",
-    "to_ribs": "scoring.ribs",
+    "AlgorithmSpec": ".algorithms",
+    "AnnealedRepertoire": ".emitters.annealed_repertoire",
+    "Archive": ".run.archive",
+    "ArchiveError": ".run.archive",
+    "CheckpointError": ".run.checkpoint",
+    "ConfigError": ".config",
+    "Elite": ".run.opened",
+    "EmitterContext": ".algorithms",
+    "Evaluation": ".run.opened",
+    "EvolveConfig": ".config",
+    "EvolveResult": ".run.evolution",
+    "Options": ".algorithms.options",
+    "Policy": ".scoring.rollout",
+    "Reevaluated": ".run.reevaluation",
+    "Run": ".run.opened",
+    "Scatter": ".scoring.scatter",
+    "SearchError": ".run.search",
+    "Task": ".scoring.task",
+    "device_mesh": ".scoring.sharding",
+    "episode_of": ".scoring.rollout",
+    "evolve": ".run.evolution",
+    "from_ribs": ".scoring.ribs",
+    "load_archive": ".run.archive",
+    "load_run": ".run.opened",
+    "make_gradient_scoring_function": ".scoring.gradient_scoring",
+    "make_policy": ".scoring.rollout",
+    "make_ribs_evaluation": ".scoring.ribs",
+    "make_scoring_function": ".scoring.rollout",
+    "make_task": ".scoring.task",
+    "plot_archive": ".run.plot",
+    "policy_of": ".scoring.networks",
+    "reevaluate": ".run.reevaluation",
+    "register_algorithm": ".algorithms",
+    "robust_scoring": ".scoring.robust",
+    "shard_scoring": ".scoring.sharding",
+    "study_config": ".study",
+    "to_ribs": ".scoring.ribs",
 }
 
 
 def __getattr__(name: str) -> Any:
-    """Loads a name of this package when it is first used.
-
-    Raises:
-        AttributeError: The package has no such name.
-    """
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
-    globals()[name] = value
-    return value
+    """Loads a name of this package when it is first used."""
+    return loaded_name(globals(), name, _HOME)
 
 
 def __dir__() -> list[str]:

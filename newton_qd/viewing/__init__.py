@@ -16,8 +16,9 @@ first used. Pages need no extra, pictures and GIFs need ``viz``, videos ``video`
 
 from __future__ import annotations
 
-import importlib
 from typing import TYPE_CHECKING, Any
+
+from newton_qd.lazy import loaded_name
 
 if TYPE_CHECKING:
     from newton_qd.viewing.drawing import Drawing, DrawnShape, can_draw, drawing_of
@@ -50,37 +51,29 @@ __all__ = [
 ]
 
 _HOME = {
-    "Contacts": "trajectory",
-    "Drawing": "drawing",
-    "DrawnShape": "drawing",
-    "Recorder": "recording",
-    "Trajectory": "trajectory",
-    "can_draw": "drawing",
-    "drawing_of": "drawing",
-    "explorer_html": "explorer",
-    "joined": "trajectory",
-    "play": "newton_viewers",
-    "record": "recording",
-    "record_elites": "elites",
-    "render": "video",
-    "replay_html": "replay",
-    "show": "replay",
-    "write_explorer": "explorer",
-    "write_replay": "replay",
+    "Contacts": ".trajectory",
+    "Drawing": ".drawing",
+    "DrawnShape": ".drawing",
+    "Recorder": ".recording",
+    "Trajectory": ".trajectory",
+    "can_draw": ".drawing",
+    "drawing_of": ".drawing",
+    "explorer_html": ".explorer",
+    "joined": ".trajectory",
+    "play": ".newton_viewers",
+    "record": ".recording",
+    "record_elites": ".elites",
+    "render": ".video",
+    "replay_html": ".replay",
+    "show": ".replay",
+    "write_explorer": ".explorer",
+    "write_replay": ".replay",
 }
 
 
 def __getattr__(name: str) -> Any:
-    """Loads a name of this package when it is first used.
-
-    Raises:
-        AttributeError: The package has no such name.
-    """
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
-    globals()[name] = value
-    return value
+    """Loads a name of this package when it is first used."""
+    return loaded_name(globals(), name, _HOME)
 
 
 def __dir__() -> list[str]:

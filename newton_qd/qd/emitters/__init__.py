@@ -25,10 +25,10 @@ and together with QDax's emitters in its ``MultiEmitter``.
 
 from __future__ import annotations
 
-import importlib
 from typing import TYPE_CHECKING, Any
 
 from newton_qd.errors import require_extra
+from newton_qd.lazy import loaded_name
 
 if TYPE_CHECKING:
     from newton_qd.qd.emitters.actor_critic import ActorCriticEmitter
@@ -71,39 +71,32 @@ __all__ = [
 ]
 
 _HOME = {
-    "ActorCritic": "newton_qd.qd.emitters.actor_critic_learner",
-    "ActorCriticEmitter": "newton_qd.qd.emitters.actor_critic",
-    "ActorCriticSettings": "newton_qd.qd.emitters.actor_critic_settings",
-    "AscentEmitter": "newton_qd.qd.emitters.ascent",
-    "AsciiEmitter": "newton_qd.qd.emitters.ascii",
-    "CMAMAEGAEmitter": "newton_qd.qd.emitters.cma_maega",
-    "CMAMEGAEmitter": "newton_qd.qd.emitters.cma_mega",
-    "ConditionedActorEmitter": "newton_qd.qd.emitters.conditioned",
-    "EpisodeLearning": "newton_qd.qd.emitters.episode_learner",
-    "ExactAsciiEmitter": "newton_qd.qd.emitters.ascii",
-    "GradientLineEmitter": "newton_qd.qd.emitters.gradient_line",
-    "GradientVariationEmitter": "newton_qd.qd.emitters.gradient_variation",
-    "GradientsError": "newton_qd.qd.scoring.gradient_scores",
-    "Interpolation": "newton_qd.qd.emitters.behaviors",
-    "OMGMEGAEmitter": "newton_qd.qd.emitters.omg_mega",
-    "RestartRule": "newton_qd.qd.emitters.restarts",
-    "SteeringEmitter": "newton_qd.qd.emitters.steering",
-    "WindowArborescenceEmitter": "newton_qd.qd.emitters.window_arborescence",
+    "ActorCritic": ".actor_critic_learner",
+    "ActorCriticEmitter": ".actor_critic",
+    "ActorCriticSettings": ".actor_critic_settings",
+    "AscentEmitter": ".ascent",
+    "AsciiEmitter": ".ascii",
+    "CMAMAEGAEmitter": ".cma_maega",
+    "CMAMEGAEmitter": ".cma_mega",
+    "ConditionedActorEmitter": ".conditioned",
+    "EpisodeLearning": ".episode_learner",
+    "ExactAsciiEmitter": ".ascii",
+    "GradientLineEmitter": ".gradient_line",
+    "GradientVariationEmitter": ".gradient_variation",
+    "GradientsError": "..scoring.gradient_scores",
+    "Interpolation": ".behaviors",
+    "OMGMEGAEmitter": ".omg_mega",
+    "RestartRule": ".restarts",
+    "SteeringEmitter": ".steering",
+    "WindowArborescenceEmitter": ".window_arborescence",
 }
 
 
 def __getattr__(name: str) -> Any:
-    """Loads a name of this package when it is first used.
-
-    Raises:
-        AttributeError: The package has no such name.
-    """
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    require_extra("qdax", "qd")
-    value = getattr(importlib.import_module(_HOME[name]), name)
-    globals()[name] = value
-    return value
+    """Loads a name of this package when it is first used."""
+    if name in _HOME:
+        require_extra("qdax", "qd")
+    return loaded_name(globals(), name, _HOME)
 
 
 def __dir__() -> list[str]:
