@@ -49,7 +49,7 @@ def archive(task: str, variant: str, generations: int, seed: int) -> Any:
 
 def gains(context: EmitterContext, repertoire: Any, options: Any, steps: int) -> Any:
     """Yields the QD score with offset after each step of the climbers."""
-    offset = context.task.reward_offset * context.config.episode_length
+    offset = context.task.qd_offset(context.config.episode_length)
     emitter = ascent_emitter(context, options, options.climbers)
     nothing: Any = None  # climbers begin at the elites alone
     state = emitter.init(jax.random.key(5), repertoire, *[nothing] * 4)
@@ -95,7 +95,7 @@ def main() -> None:
     context = EmitterContext(config, task, policy, score, reset_key, begun.centroids)
     found = np.asarray(begun.fitnesses)[:, 0]
     found = found[found > -np.inf]
-    base = np.sum(found + task.reward_offset * config.episode_length)
+    base = np.sum(found + task.qd_offset(config.episode_length))
     print(f"{found.size} elites, QD score {base:,.0f}, best {found.max():,.0f}\n")
     marks = [n for n in (1, 2, 4, 8, 16, 32, 64) if n <= args.steps]
     print(

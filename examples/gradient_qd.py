@@ -48,7 +48,7 @@ def main() -> None:
         batch_size=options.batch_size,
         num_emitters=options.points,
     )
-    offset = task.reward_offset * config.episode_length
+    offset = task.qd_offset(config.episode_length)
     search = MAPElites(
         lambda genotypes, _: plain(genotypes, start),
         emitter,

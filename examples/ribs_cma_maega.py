@@ -31,7 +31,7 @@ def main() -> None:
     env = with_smooth_descriptor(task.env, 0.1, straight_through=True)
     task = dataclasses.replace(task, env=env)
     policy = qd.make_policy(task.env, (16,))
-    worst = -task.reward_offset * config.episode_length
+    worst = -task.qd_offset(config.episode_length)
     common = {"key": jax.random.key(1), "limits": task.limits, "worst": worst}
     episode = qd.episode_of(
         task, policy, config.episode_length, options=GradientOptions(clip=10.0)

@@ -35,7 +35,7 @@ def main() -> None:
     task = make_task(config)
     policy = make_policy(task.env, (16,))
     score = make_scoring_function(task, policy, config.episode_length)
-    worst = -task.reward_offset * config.episode_length
+    worst = -task.qd_offset(config.episode_length)
     evaluate = make_ribs_evaluation(
         score, jax.random.key(1), limits=task.limits, worst=worst
     )

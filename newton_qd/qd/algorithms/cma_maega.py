@@ -35,7 +35,7 @@ def _make(context: EmitterContext, options: CMAMAEGAOptions) -> Any:
         make_search(CMAMAEGAEmitter, context, options),
         learning_rate=options.learning_rate,
         # The lowest return with a positive share in the QD score.
-        threshold_min=-context.task.reward_offset * context.config.episode_length,
+        threshold_min=-context.task.qd_offset(context.config.episode_length),
     )
 
 

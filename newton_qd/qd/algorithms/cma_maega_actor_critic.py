@@ -84,7 +84,7 @@ def _make(context: EmitterContext, options: ArborescenceActorOptions) -> Any:
         emitter,
         learning_rate=options.learning_rate,
         # The lowest return with a positive share in the QD score.
-        threshold_min=-context.task.reward_offset * config.episode_length,
+        threshold_min=-context.task.qd_offset(config.episode_length),
     )
 
 

@@ -76,7 +76,7 @@ class GenerationParts:
             self.algorithm.make(context, self.options),
             drawn.emitter_key,
             self.algorithm.takes_faulty,
-            self.task.reward_offset * self.config.episode_length,
+            self.task.qd_offset(self.config.episode_length),
         )
 
     def propose(self, drawn: Drawn, *arguments: Any) -> PyTree:

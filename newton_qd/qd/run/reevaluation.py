@@ -82,8 +82,8 @@ def reevaluate(
             in each call.
         key: Key that is split into one key for each call.
         reevaluations: Number of calls, from 1.
-        offset: Added to each elite's fitness in the QD score: the reward offset of the
-            task times the episode length.
+        offset: Added to each elite's fitness in the QD score, such as
+            ``task.qd_offset(episode_length)``.
         untrained: Fitness of an untrained policy, for the QD score without offset.
         stop: Called before each call of ``score``; true ends the re-evaluation.
 

@@ -47,7 +47,7 @@ def make_ribs_evaluation(
         key: Key for the resets.
         limits: Lowest and highest descriptor, (D,) each, as in ``Task.limits``.
         worst: Objective of a faulty individual, because pyribs does not allow infinite
-            objectives. ``-task.reward_offset * episode_length`` adds 0 to the QD score.
+            objectives. ``-task.qd_offset(episode_length)`` adds 0 to the QD score.
             The measures of a faulty individual are the lowest ones, its gradients 0.
         jacobian: Whether to return gradients too.
 

@@ -89,5 +89,5 @@ def scatter_of(config: EvolveConfig, task: Task) -> Scatter | None:
     lowest, highest = (np.asarray(x, np.float64) for x in task.limits)
     cells = config.centroids or math.prod(config.grid or (1,))
     width = float((np.prod(highest - lowest) / cells) ** (1 / len(lowest)))
-    offset = float(task.reward_offset * config.episode_length)
+    offset = float(task.qd_offset(config.episode_length))
     return Scatter(width=config.scatter * width, offset=offset)

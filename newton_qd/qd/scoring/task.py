@@ -75,6 +75,14 @@ class Task:
         """Number of components of the descriptor."""
         return len(self.labels)
 
+    def qd_offset(self, episode_length: int) -> float:
+        """Returns the number that makes returns positive, for the QD score.
+
+        Args:
+            episode_length: Control steps of an episode.
+        """
+        return self.reward_offset * episode_length
+
     @property
     def reads_end(self) -> bool:
         """Whether the descriptor depends on the end of an episode alone.
