@@ -334,6 +334,10 @@ def test_meshes_of_a_package(tmp_path: Path) -> None:
         assert built(folder, text, "a").nb == 1
     with pytest.raises(RobotDescriptionError, match="no file on this machine"):
         built(folder, text.replace("../a", "package://b_description/a"), "a")
+    # a folder inside may have the name of the package, too
+    inside = folder / "a_description"
+    inside.mkdir()
+    assert built(inside, text.replace("../a", "package://a_description/a"), "a").nb == 1
 
 
 TWICE = {

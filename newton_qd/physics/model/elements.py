@@ -13,11 +13,8 @@ from xml.etree import ElementTree
 import numpy as np
 
 from newton_qd.checks import Fact, listed, message
-from newton_qd.physics.model.xml_reader import (
-    RobotDescriptionError,
-    XmlReader,
-    asset_file,
-)
+from newton_qd.physics.model.mesh_files import places
+from newton_qd.physics.model.xml_reader import RobotDescriptionError, XmlReader
 from newton_qd.physics.reference import rotation_matrix
 
 UNLIMITED = 1e9
@@ -200,7 +197,7 @@ def check_meshes(reader: XmlReader, link: ElementTree.Element) -> None:
     """
     for mesh in link.iterfind("collision/geometry/mesh"):
         filename = reader.text(mesh, "filename")
-        if asset_file(reader.path, filename) is None:
+        if not any(place.is_file() for place in places(reader.path, filename)):
             why = "which is no file on this machine; contacts do not support a mesh"
             allowed = (
                 "sphere or capsule, or box, cylinder or the file of a mesh where "

@@ -25,6 +25,28 @@ _PLY_FILES = re.compile(rb"^\s*comment\s+TextureFile\s+([^\r\n]*)", re.MULTILINE
 _DAE_TAGS = ("init_from", "ref")
 
 
+def places(urdf: Path, name: str, packages: Sequence[Path] = ()) -> list[Path]:
+    """Returns where the file is that a URDF file names; empty if nowhere here.
+
+    Args:
+        urdf: The URDF file.
+        name: A path, relative to the file's folder, or ``file:///path``, or
+            ``package://NAME/path`` with a folder NAME that contains the URDF file.
+        packages: Folders of packages, or folders that contain some.
+    """
+    base = urdf.absolute().parent
+    scheme, mark, rest = name.partition("://")
+    if not mark:
+        return [base / name]
+    if scheme.lower() == "file":
+        return [Path(unquote(urlsplit(name).path))]
+    if scheme.lower() not in ("package", "model"):
+        return []
+    package, _, inside = rest.partition("/")
+    named = [f for f in (base, *base.parents, *packages) if f.name == package]
+    return [*(folder / inside for folder in named), *(f / rest for f in packages)]
+
+
 class Folders:
     """The folders of which a URDF file may have files read.
 
@@ -33,32 +55,17 @@ class Folders:
     """
 
     def __init__(self, urdf: Path, packages: Sequence[str | Path] = ()):
-        self._base = urdf.absolute().parent
+        self._urdf = urdf.absolute()
         self._packages = [Path(package).expanduser().absolute() for package in packages]
-        self._roots = [root.resolve() for root in (self._base, *self._packages)]
-        places = listed([self._base, *self._packages])
-        self.allowed = f"files below {places}, or below a folder given as packages=..."
+        roots = [self._urdf.parent, *self._packages]
+        self._roots = [root.resolve() for root in roots]
+        below = listed(roots)
+        self.allowed = f"files below {below}, or below a folder given as packages=..."
 
     def file(self, name: str) -> Path | None:
-        """Returns the file that a URDF file names, or ``None`` if it is not allowed.
-
-        Args:
-            name: A path, relative to the URDF file's folder, or ``file:///path``, or
-                ``package://NAME/path``.
-        """
-        scheme, mark, rest = name.partition("://")
-        if not mark:
-            places = [self._base / name]
-        elif scheme.lower() == "file":
-            places = [Path(unquote(urlsplit(name).path))]
-        elif scheme.lower() in ("package", "model"):
-            package, _, inside = rest.partition("/")
-            above = [self._base, *self._base.parents, *self._packages]
-            places = [folder / inside for folder in above if folder.name == package]
-            places += [folder / rest for folder in self._packages]
-        else:
-            return None
-        return next((place for place in places if self._is_file(place)), None)
+        """Returns the file that a URDF file names, or ``None`` if it is not allowed."""
+        found = places(self._urdf, name, self._packages)
+        return next((place for place in found if self._is_file(place)), None)
 
     def problem(self, mesh: Path) -> str:
         """Returns why the file of a mesh may not be read; empty if it may."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from urllib.parse import unquote, urlsplit
 from xml.etree import ElementTree
 from xml.parsers import expat
 
@@ -25,33 +24,6 @@ class RobotDescriptionError(ValueError):
 
 class RobotDescriptionWarning(UserWarning):
     """A URDF file may not mean what its author wanted; the text says what it means."""
-
-
-def asset_file(urdf: Path, name: str) -> Path | None:
-    """Returns the file on this machine that a URDF file names, or ``None``.
-
-    Args:
-        urdf: The URDF file.
-        name: A path, relative to the file's folder, or ``file:///path``, or
-            ``package://NAME/path`` with a folder NAME that contains the URDF file.
-    """
-    folder = urdf.absolute().parent
-    scheme, mark, rest = name.partition("://")
-    scheme = scheme.lower()
-    if mark and scheme in ("package", "model"):
-        package = rest.partition("/")[0]
-        roots = [above.parent for above in (folder, *folder.parents)]
-        names = [above.name for above in (folder, *folder.parents)]
-        if package not in names:
-            return None
-        path = roots[names.index(package)] / rest
-    elif mark and scheme == "file":
-        path = Path(unquote(urlsplit(name).path))
-    elif mark:
-        return None
-    else:
-        path = folder / name
-    return path if path.is_file() else None
 
 
 class XmlReader:
