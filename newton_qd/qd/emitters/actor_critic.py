@@ -15,7 +15,7 @@ from newton_qd import checks
 from newton_qd.checks import message
 from newton_qd.envs.state import select
 from newton_qd.qd.emitters.actor_critic_learner import ActorCritic, Learner
-from newton_qd.qd.emitters.cells import draw_cells, empty_targets
+from newton_qd.qd.emitters.cells import draw_elites, empty_targets
 from newton_qd.qd.emitters.episode_learner import EpisodeLearning
 from newton_qd.qd.emitters.restarts import LONGEST_LIFE, due_for_restart
 from newton_qd.types import (
@@ -188,9 +188,8 @@ class ActorCriticEmitter(Emitter):
         snapshots = emitter_state.snapshots
         actors = snapshots.reshape(-1, snapshots.shape[-1])
         cell_key, part_key, size_key, noise_key = jax.random.split(key, 4)
-        filled = repertoire.fitnesses[:, 0] > -jnp.inf
         shape = (self._copies - 1, len(actors))
-        cells = draw_cells(cell_key, filled, shape[0] * shape[1])
+        cells = draw_elites(repertoire, cell_key, shape[0] * shape[1])
         elites = white.whitened(repertoire.genotypes[cells], scale)
         elites = elites.reshape(*shape, actors.shape[-1])
         dtype = actors.dtype
@@ -334,8 +333,7 @@ class ActorCriticEmitter(Emitter):
     ) -> Learner:
         """Returns the actors; restarts those with a finished lifetime from elites."""
         aim_key, cell_key, critic_key = jax.random.split(key, 3)
-        filled = repertoire.fitnesses[:, 0] > -jnp.inf
-        cells = draw_cells(cell_key, filled, self._actors)
+        cells = draw_elites(repertoire, cell_key, self._actors)
         weights = repertoire.genotypes[cells]
         weights = self._method.whitening.whitened(weights, state.scale)
         aims = self._aims(aim_key)

@@ -13,7 +13,7 @@ from qdax.core.emitters.emitter import Emitter
 from newton_qd import checks
 from newton_qd.envs.state import select
 from newton_qd.gradients.episode import Episode
-from newton_qd.qd.emitters.cells import draw_cells
+from newton_qd.qd.emitters.cells import draw_elites
 from newton_qd.qd.emitters.restarts import LONGEST_LIFE, due_for_restart
 from newton_qd.types import ExtraScores, Genotype, PyTree, Repertoire, RNGKey
 
@@ -215,8 +215,7 @@ class AscentEmitter(Emitter):
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Returns weights, motion and lengths of the steps of new climbers."""
         cell_key, step_key = jax.random.split(key)
-        filled = repertoire.fitnesses[:, 0] > -jnp.inf
-        cells = draw_cells(cell_key, filled, self._climbers)
+        cells = draw_elites(repertoire, cell_key, self._climbers)
         weights = repertoire.genotypes[cells]
         drawn = jax.random.uniform(step_key, (self._climbers,), weights.dtype)
         shortest, longest = self._range

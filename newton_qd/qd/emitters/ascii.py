@@ -21,7 +21,7 @@ from newton_qd.qd.emitters.behaviors import (
     interpolated,
     preference,
 )
-from newton_qd.qd.emitters.cells import accepted_cells, draw_cells
+from newton_qd.qd.emitters.cells import accepted_cells, draw_cells, draw_elites
 from newton_qd.types import ExtraScores, Genotype, PyTree, Repertoire
 
 
@@ -279,8 +279,8 @@ class ExactAsciiEmitter(Emitter):
         """
         del emitter_state
         cell_key, rate_key, step_key, score_key = jax.random.split(key, 4)
-        filled = repertoire.fitnesses[:, 0] > -jnp.inf
-        weights = repertoire.genotypes[draw_cells(cell_key, filled, self._parents)]
+        cells = draw_elites(repertoire, cell_key, self._parents)
+        weights = repertoire.genotypes[cells]
         steps = self._rollout(weights, score_key)
         own = behavior_of(steps, steps["rewards"].shape[1], 1.0)
         found = self._gradient(own.actions, score_key)

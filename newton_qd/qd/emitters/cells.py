@@ -28,6 +28,11 @@ def draw_cells(key: jax.Array, wanted: jax.Array, count: int) -> jax.Array:
     return jnp.searchsorted(number, drawn, side="right").astype(jnp.int32)
 
 
+def draw_elites(repertoire: Repertoire, key: jax.Array, count: int) -> jax.Array:
+    """Draws cells (count,) with an individual, or any cells if none has one."""
+    return draw_cells(key, repertoire.fitnesses[:, 0] > -jnp.inf, count)
+
+
 def accepted_cells(
     repertoire: Repertoire, genotypes: jax.Array, descriptors: jax.Array
 ) -> tuple[jax.Array, jax.Array]:

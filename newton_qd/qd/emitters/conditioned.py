@@ -13,7 +13,7 @@ from newton_qd import checks
 from newton_qd.checks import message
 from newton_qd.qd.emitters.actor_critic_learner import ActorCritic, Learner
 from newton_qd.qd.emitters.aims import AimedEnv, AimedState, ConditionedPolicy
-from newton_qd.qd.emitters.cells import draw_cells
+from newton_qd.qd.emitters.cells import draw_cells, draw_elites
 from newton_qd.types import (
     ExtraScores,
     Genotype,
@@ -184,8 +184,7 @@ class ConditionedActorEmitter(Emitter):
         state, special = emitter_state, self._specialized
         copies = special(state, repertoire.centroids[state.cells])
         cell_key, part_key, size_key, noise_key = jax.random.split(key, 4)
-        filled = repertoire.fitnesses[:, 0] > -jnp.inf
-        cells = draw_cells(cell_key, filled, self._between)
+        cells = draw_elites(repertoire, cell_key, self._between)
         white = self._method.whitening
         elites = white.whitened(repertoire.genotypes[cells], state.scale)
         actors = special(state, repertoire.descriptors[cells])
