@@ -1,4 +1,4 @@
-"""Helpers of all commands: exit codes, error messages, lists of integers."""
+"""Helpers of all commands: exit codes, error messages, tables, lists of integers."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import argparse
 import os
 import shutil
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TextIO, TypeAlias
 
@@ -110,6 +111,15 @@ def load_physics() -> None:
 def terminal_width() -> int:
     """Returns the columns of a table for the terminal: 79, or fewer if it is narrow."""
     return max(24, min(79, shutil.get_terminal_size().columns - 1))
+
+
+def print_table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
+    """Prints rows below a head."""
+    lines = [head, *rows]
+    sizes = [max(len(str(row[i])) for row in lines) for i in range(len(head))]
+    for row in lines:
+        cells = (str(cell).ljust(size) for cell, size in zip(row, sizes, strict=True))
+        print("  ".join(cells).rstrip())
 
 
 def widths(text: str) -> tuple[int, ...]:

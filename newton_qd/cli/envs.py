@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from newton_qd.cli import modules
-from newton_qd.cli.arguments import OK, Commands, terminal_width
+from newton_qd.cli.arguments import OK, Commands, print_table, terminal_width
 
 
 def add_parser(commands: Commands) -> None:
@@ -46,20 +46,16 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print(json.dumps(rows, indent=2))
         return OK
-    table = [("name", "observation", "action", "descriptor", "reward offset")]
+    table = []
     for row in rows:
         descriptor = offset = "-"
         if row["descriptor"] is not None:
             descriptor = f"{row['descriptor']['name']} ({row['descriptor']['size']})"
             offset = _number(row["reward_offset"])
-        sizes = str(row["observation_size"]), str(row["action_size"])
+        sizes = row["observation_size"], row["action_size"]
         table.append((row["name"], *sizes, descriptor, offset))
-    widths = [
-        max(len(line[column]) for line in table) for column in range(len(table[0]))
-    ]
-    for line in table:
-        cells = (cell.ljust(width) for cell, width in zip(line, widths, strict=True))
-        print("  ".join(cells).rstrip())
+    head = ("name", "observation", "action", "descriptor", "reward offset")
+    print_table(head, table)
     return OK
 
 

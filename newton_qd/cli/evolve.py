@@ -101,6 +101,7 @@ def _help(arguments: argparse.Namespace) -> int:
 def _report(result: EvolveResult, out: Path, modules: Sequence[str]) -> None:
     """Prints the results of the run. After an interrupt, prints how to resume it."""
     config = result.config
+    own = "".join(f" --module {shlex.quote(name)}" for name in modules)
     if result.iteration >= 0:
         first, last = (
             {name: values[index] for name, values in result.metrics.items()}
@@ -122,7 +123,6 @@ def _report(result: EvolveResult, out: Path, modules: Sequence[str]) -> None:
                 f"best fitness {again.max_fitness:.1f}"
             )
         print(f"results in {out}")
-        own = "".join(f" --module {shlex.quote(name)}" for name in modules)
         print(f"see them: newton-qd explore {_argument(out)}{own}")
     if result.interrupted:
         when = "before the initial population"
@@ -133,7 +133,6 @@ def _report(result: EvolveResult, out: Path, modules: Sequence[str]) -> None:
             )
         if result.iteration == config.iterations:
             when = "during the re-evaluation, the archive is saved"
-        own = "".join(f" --module {shlex.quote(name)}" for name in modules)
         say(f"interrupted {when}; continue with:")
         print(f"  newton-qd evolve --resume --out {_argument(out)}{own}")
 

@@ -21,6 +21,7 @@ from newton_qd.cli.arguments import (
     add_elite_choice,
     complain,
     load_physics,
+    print_table,
     say,
     warn_of_changes,
 )
@@ -177,7 +178,9 @@ def _print_repeated(
         for i in shown[:_MOST_SHOWN]
     ]
     if rows:
-        _table(("cell", "descriptor", "in the archive", "fitness", "same bits"), rows)
+        print_table(
+            ("cell", "descriptor", "in the archive", "fitness", "same bits"), rows
+        )
     if len(shown) > _MOST_SHOWN:
         print(f"... and {len(shown) - _MOST_SHOWN} more")
     count = "1 elite" if len(elites) == 1 else f"{len(elites)} elites"
@@ -219,7 +222,7 @@ def _print_starts(
         for i, elite in enumerate(elites[:_MOST_SHOWN])
     ]
     head = ("cell", "descriptor", "again", "fitness", "again", "worst", "deviation")
-    _table(head, rows)
+    print_table(head, rows)
     if len(elites) > _MOST_SHOWN:
         print(f"... and {len(elites) - _MOST_SHOWN} more")
     starts, lost = found.fitnesses.shape[1], _lost(elites, median)
@@ -245,17 +248,6 @@ def _lost(elites: Sequence[Elite], medians: Any) -> float:
 
 def _text(descriptor: Any) -> str:
     return " ".join(f"{value:.4g}" for value in descriptor)
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
-    """Prints rows below a head."""
-    lines = [head, *rows]
-    widths = [max(len(str(row[i])) for row in lines) for i in range(len(head))]
-    for row in lines:
-        cells = (
-            str(cell).ljust(width) for cell, width in zip(row, widths, strict=True)
-        )
-        print("  ".join(cells).rstrip())
 
 
 def plot(arguments: argparse.Namespace, task_factory: TaskFactory = None) -> int:
