@@ -132,9 +132,7 @@ ELSEWHERE = {
     "newton_qd.compat.brax_envs": "names of QDax, in coming_from_qdax.md",
     "newton_qd.compat.brax_v1": "names of brax, in coming_from_qdax.md",
     "newton_qd.compat.env_creators": "names of QDax, in coming_from_qdax.md",
-    "newton_qd.gradients.outcome": "parts of `Episode`",
     "newton_qd.physics.native": "the way into the kernels of a CPU",
-    "newton_qd.qd.run.plot": "parts of `Run.plot`",
 }
 
 

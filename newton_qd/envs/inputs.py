@@ -209,7 +209,7 @@ def checked_outcome(env: str, found: object) -> tuple[str, ...]:
     return tuple(metrics)
 
 
-def checked_vector(name: str, found: object, size: int, *, meaning: str) -> None:
+def require_vector(name: str, found: object, size: int, *, meaning: str) -> None:
     """Checks the result of ``control`` or ``reset_pose``.
 
     Args:

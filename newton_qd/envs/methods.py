@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax
 
 from newton_qd.envs.base import Env, PhysicsEnv
-from newton_qd.envs.inputs import checked_vector
+from newton_qd.envs.inputs import require_vector
 
 
 def check_methods(env: Env) -> None:
@@ -28,9 +28,9 @@ def check_methods(env: Env) -> None:
     action = jax.ShapeDtypeStruct((env.action_size,), env.dtype)
     found = jax.eval_shape(env.control, rest, action)
     meaning = "the control of the actuators"
-    checked_vector(f"{kind}.control", found, system.nu, meaning=meaning)
+    require_vector(f"{kind}.control", found, system.nu, meaning=meaning)
     found = jax.eval_shape(env.reset_pose, random_key(), rest.q)
-    checked_vector(f"{kind}.reset_pose", found, system.nq, meaning="the coordinates")
+    require_vector(f"{kind}.reset_pose", found, system.nq, meaning="the coordinates")
 
 
 def random_key() -> jax.ShapeDtypeStruct:

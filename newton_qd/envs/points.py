@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from newton_qd.envs.vectors import cross, rotated
-from newton_qd.physics.inspection import Kinematics
+from newton_qd.physics.system import Kinematics
 
 
 def point(

@@ -13,8 +13,7 @@ from newton_qd.envs.points import point
 from newton_qd.envs.rollouts import RolloutOrder
 from newton_qd.envs.servos import Servos
 from newton_qd.envs.vectors import length, ordered_sum
-from newton_qd.physics.inspection import Kinematics
-from newton_qd.physics.system import PhysicsState
+from newton_qd.physics.system import Kinematics, PhysicsState
 from newton_qd.robots import REACHER, REACHERANGLE, RobotSpec
 from newton_qd.types import Action, Metrics, RNGKey
 

@@ -11,8 +11,7 @@ from newton_qd.envs.base import PhysicsEnv
 from newton_qd.envs.options import checked_options
 from newton_qd.envs.state import select
 from newton_qd.envs.vectors import length, ordered_sum, rounded, wrapped
-from newton_qd.physics.inspection import Kinematics
-from newton_qd.physics.system import PhysicsState
+from newton_qd.physics.system import Kinematics, PhysicsState
 from newton_qd.robots import SWIMMER
 from newton_qd.types import Action, Metrics
 

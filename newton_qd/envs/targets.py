@@ -16,8 +16,7 @@ from newton_qd.envs.rollouts import RolloutOrder
 from newton_qd.envs.state import State
 from newton_qd.envs.vectors import length, ordered_sum, rotated, rounded
 from newton_qd.physics.explicit_mesh import split_as
-from newton_qd.physics.inspection import Kinematics
-from newton_qd.physics.system import PhysicsState
+from newton_qd.physics.system import Kinematics, PhysicsState
 from newton_qd.types import Action, Metrics, Params, RNGKey
 
 GROUND = "ground"

@@ -16,7 +16,7 @@ from newton_qd import checks
 from newton_qd.checks import Fact, message
 from newton_qd.envs.env import Env
 from newton_qd.envs.inputs import require_key
-from newton_qd.envs.state import select
+from newton_qd.envs.state import at_fault, select
 from newton_qd.extractors import check_extractor
 from newton_qd.gradients.compiled import compiled_once, without_compiled
 from newton_qd.gradients.episode_input import check_first, check_length, check_weights
@@ -27,13 +27,7 @@ from newton_qd.gradients.mixed import (
     check_mixture,
     mixed_gradients,
 )
-from newton_qd.gradients.outcome import (
-    Outcome,
-    Tally,
-    at_fault,
-    finished,
-    transition,
-)
+from newton_qd.gradients.outcome import Outcome, Tally, finished, transition
 from newton_qd.gradients.plans import run_plan
 from newton_qd.gradients.scores import gradient_scores, scores
 from newton_qd.moved import moved_name

@@ -11,10 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from newton_qd.envs.base import Env
+from newton_qd.envs.state import at_fault
 from newton_qd.gradients.exact import finite_rows
 from newton_qd.gradients.flow import tree_norm
 from newton_qd.gradients.mixed import Mixture, mixture, normal_noise
-from newton_qd.gradients.outcome import Tally, at_fault
+from newton_qd.gradients.outcome import Tally
 from newton_qd.physics.system import PhysicsState
 from newton_qd.types import Genotype, Policy, PyTree, RNGKey
 

@@ -8,11 +8,8 @@ import jax
 import jax.numpy as jnp
 
 from newton_qd.checks import Fact, message
-from newton_qd.envs.state import at_fault
 from newton_qd.extractors import Trajectories
 from newton_qd.types import Action, DescriptorExtractor, StateLike
-
-__all__ = ["Outcome", "Tally", "at_fault", "finished", "transition"]
 
 
 @jax.tree_util.register_dataclass

@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 
 from newton_qd.envs.env import Env
-from newton_qd.gradients.outcome import Tally, at_fault
+from newton_qd.envs.state import at_fault
+from newton_qd.gradients.outcome import Tally
 from newton_qd.physics.explicit_mesh import split_as
 from newton_qd.types import Params
 

@@ -232,7 +232,7 @@ def _genotypes(run: Run) -> dict[str, Any] | None:
 
 def _map_data(run: Run) -> dict[str, Any]:
     """Returns where the cells are: a nested grid, or centroids."""
-    from newton_qd.qd.run.plot import grid_indices
+    from newton_qd.qd.run.plot_grid import grid_indices
 
     archive, grid = run.archive, run.config.grid
     if grid is not None:

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 
 from newton_qd import checks
-from newton_qd.envs.state import select
-from newton_qd.gradients.outcome import Tally, at_fault
+from newton_qd.envs.state import at_fault, select
+from newton_qd.gradients.outcome import Tally
 from newton_qd.qd.emitters.actor_critic_learner import ActorCritic, Learner
 from newton_qd.qd.emitters.ascent import limited_mean
 from newton_qd.types import Environment, PyTree

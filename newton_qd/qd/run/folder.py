@@ -30,8 +30,9 @@ from newton_qd.qd.config import (
     settings_text,
 )
 from newton_qd.qd.facts import changed_facts
-from newton_qd.qd.run.archive import ARCHIVE, DAMAGE, Archive, archive_bytes
+from newton_qd.qd.run.archive import ARCHIVE, Archive, archive_bytes
 from newton_qd.qd.run.checkpoint import (
+    DAMAGE,
     Checkpoint,
     CheckpointError,
     load_checkpoint,

@@ -21,7 +21,7 @@ from newton_qd.qd.algorithms import ALGORITHMS, algorithm_named
 from newton_qd.qd.config import ConfigError, EvolveConfig, read_config
 from newton_qd.qd.run.archive import Archive, repertoire_of
 from newton_qd.qd.run.folder import CONFIG, REEVALUATED
-from newton_qd.qd.run.plot import grid_indices
+from newton_qd.qd.run.plot_grid import grid_indices
 from newton_qd.qd.run.reevaluation import Reevaluated
 from newton_qd.qd.run.results import read_reevaluated, read_results
 from newton_qd.qd.run.search import start_key

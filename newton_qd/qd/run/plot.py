@@ -12,15 +12,13 @@ from newton_qd.qd.algorithms import ALGORITHMS, algorithm_named
 from newton_qd.qd.config import EvolveConfig
 from newton_qd.qd.run.archive import Archive
 from newton_qd.qd.run.plot_cells import draw_intervals, draw_pairs, draw_tessellation
-from newton_qd.qd.run.plot_grid import draw_line, draw_nested, grid_indices
+from newton_qd.qd.run.plot_grid import draw_line, draw_nested
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from newton_qd.qd.scoring.task import Task
-
-__all__ = ["archive_figure", "archive_png", "grid_indices", "plot_archive"]
 
 _NESTED_DIMENSIONS = 4
 
