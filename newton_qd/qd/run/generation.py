@@ -10,6 +10,7 @@ import jax.numpy as jnp
 
 from newton_qd.checks import Fact, message
 from newton_qd.qd.run import quality
+from newton_qd.qd.scoring.gradient_scores import finite_scores
 from newton_qd.types import ExtraScores, Genotype, PyTree, Repertoire
 
 
@@ -102,7 +103,7 @@ class Generation:
         """Returns the archive with a generation added, and the emitter's arguments."""
         fitnesses, found, extra = scores
         # an algorithm's own scores may be finite where the descriptor is not
-        sound = _sound(scores)
+        sound = finite_scores(fitnesses, found)
         fitnesses = jnp.where(sound, fitnesses, -jnp.inf)
         found = jnp.where(jnp.isfinite(found), found, 0)
         kept = _break_ties(fitnesses, found, repertoire.centroids)
@@ -130,17 +131,11 @@ class Generation:
         found = repertoire.fitnesses[:, 0]
         return {
             **metrics,
-            "rejected": jnp.sum(~_sound(scores) | _lost(scores)),
+            "rejected": jnp.sum(~finite_scores(*scores[:2]) | _lost(scores)),
             "mean_fitness": quality.mean_fitness(found),
             "initial_fitness": initial,
             "qd_gain": quality.qd_gain(found, initial),
         }
-
-
-def _sound(scores: PyTree) -> jax.Array:
-    """Returns whether fitness and descriptor of each individual are finite, (N,)."""
-    fitnesses, found, _ = scores
-    return jnp.isfinite(fitnesses) & jnp.all(jnp.isfinite(found), axis=1)
 
 
 def _lost(scores: PyTree) -> jax.Array:
