@@ -12,6 +12,7 @@ from newton_qd import registry
 from newton_qd.envs.base import Env
 from newton_qd.envs.state import State, at_fault
 from newton_qd.extractors import folded_sum
+from newton_qd.gradients.outcome import transition
 from newton_qd.types import DescriptorExtractor, ExtraScores, Genotype, PyTree, RNGKey
 
 if TYPE_CHECKING:
@@ -48,17 +49,8 @@ def make_policy_network_play_step_fn_brax(
     ) -> tuple[State, Genotype, RNGKey, PyTree]:
         actions = policy_network.apply(params, state.obs)
         following = env.step(state, actions)
-        transition = QDTransition(
-            obs=state.obs,
-            next_obs=following.obs,
-            rewards=following.reward,
-            dones=following.done,
-            truncations=following.info["truncation"],
-            actions=actions,
-            state_desc=state.info["state_descriptor"],
-            next_state_desc=following.info["state_descriptor"],
-        )
-        return following, params, key, transition
+        taken = QDTransition(**transition(state, actions, following))
+        return following, params, key, taken
 
     return play_step
 
