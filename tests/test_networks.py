@@ -71,6 +71,10 @@ def test_weights_are_a_vector(name: str) -> None:
         wanted = network(key)(OBSERVATION)
     assert np.allclose(policy.of_weights(weights, OBSERVATION), wanted, atol=1e-6)
     assert np.array_equal(policy.ravel(policy.unravel(weights)), weights)
+    with pytest.raises(
+        ValueError, match=r"weights: got shape \(3,\); allowed: \(17,\)"
+    ):
+        policy.of_weights(weights[:3], OBSERVATION)
     both = jax.vmap(policy.init)(jax.random.split(key, 2))
     assert both.shape == (2, policy.size) and not np.array_equal(*both)
 

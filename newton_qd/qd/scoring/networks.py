@@ -13,7 +13,7 @@ from jax.flatten_util import ravel_pytree
 
 from newton_qd import checks
 from newton_qd.checks import Fact, message
-from newton_qd.qd.scoring.rollout import Policy, make_policy
+from newton_qd.qd.scoring.rollout import Policy, flattened, make_policy
 from newton_qd.qd.scoring.task import Task
 from newton_qd.types import Environment, Observation, PyTree, RNGKey
 
@@ -53,7 +53,7 @@ def policy_of(env: Environment, network: Any) -> Policy:
     leaves, structure = jax.tree.flatten(tree)
     moving = [_is_weight(leaf) for leaf in leaves]
     zeros = [np.zeros(x.shape, x.dtype) for x in leaves if _is_weight(x)]
-    flat, unravel = ravel_pytree(zeros)
+    size, unravel = flattened(zeros)
 
     def init(key: RNGKey) -> jax.Array:
         made = jax.tree.leaves(parts(key)[1])
@@ -73,7 +73,7 @@ def policy_of(env: Environment, network: Any) -> Policy:
         wrong = Fact(f"actions of shape {given}")
         raise ValueError(message("network", wrong, f"shape {(env.action_size,)}"))
     return Policy(
-        size=flat.size,
+        size=size,
         init=init,
         unravel=unravel,
         apply=apply,

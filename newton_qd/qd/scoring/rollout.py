@@ -96,7 +96,7 @@ def make_policy(env: Environment, hidden: tuple[int, ...]) -> Policy:
     dummy = jnp.zeros((env.observation_size,), jnp.float32)
     example = jax.eval_shape(network.init, jax.random.key(0), dummy)
     zeros = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), example)
-    flat, unravel = ravel_pytree(zeros)
+    size, unravel = flattened(zeros)
 
     def init(key: RNGKey) -> jax.Array:
         require_key("key", key)
@@ -105,21 +105,32 @@ def make_policy(env: Environment, hidden: tuple[int, ...]) -> Policy:
     def apply(parameters: PyTree, observation: Observation) -> jax.Array:
         return jnp.asarray(network.apply(parameters, observation))
 
-    def parameters_of(weights: jax.Array) -> PyTree:
-        if jnp.shape(weights) != (flat.size,):
-            given = Fact(f"shape {jnp.shape(weights)}")
-            allowed = f"({flat.size},), those of this policy"
-            raise ValueError(message("weights", given, allowed))
-        return unravel(weights)
-
     return Policy(
-        size=flat.size,
+        size=size,
         init=init,
-        unravel=parameters_of,
+        unravel=unravel,
         apply=apply,
         ravel=lambda parameters: ravel_pytree(parameters)[0],
         network=network,
     )
+
+
+def flattened(zeros: PyTree) -> tuple[int, Callable[[jax.Array], PyTree]]:
+    """Returns the number of weights in parameters, and ``unravel`` of a policy.
+
+    Args:
+        zeros: Parameters of the policy; their values do not count.
+    """
+    flat, unravel = ravel_pytree(zeros)
+
+    def parameters_of(weights: jax.Array) -> PyTree:
+        if jnp.shape(weights) != flat.shape:
+            given = Fact(f"shape {jnp.shape(weights)}")
+            allowed = f"{flat.shape}, those of this policy"
+            raise ValueError(message("weights", given, allowed))
+        return unravel(weights)
+
+    return flat.size, parameters_of
 
 
 def episode_of(
