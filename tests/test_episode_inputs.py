@@ -153,6 +153,25 @@ def test_parameters_are_checked_before_anything_is_compiled() -> None:
             run()
 
 
+def test_genotypes_are_several() -> None:
+    """Their number is that of the episodes."""
+    _, episode, _, plan = hopping("float32")
+    weights = jnp.ones((1, 1, 1))
+    for wrong, shown in (
+        ({}, "no leaves"),
+        (1.0, r"leaves of shape \(\)"),
+        ({"a": plan, "b": plan[:3]}, r"leaves of shape \(16, 3\), \(3, 3\)"),
+    ):
+        for method in (
+            lambda given: episode.directional(given, weights, KEY),
+            lambda given: episode.gradient(given, KEY),
+            lambda given: episode.mixed(given, KEY),
+            lambda given: episode.scoring()(given, KEY),
+        ):
+            with pytest.raises(ValueError, match=f"genotypes: got {shown}; allowed: "):
+                method(wrong)
+
+
 def test_transitions_need_no_wrapper() -> None:
     """Only an ``EpisodeWrapper`` cuts episodes; without one, none is cut."""
     env = PointMaze()

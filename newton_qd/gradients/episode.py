@@ -18,8 +18,8 @@ from newton_qd.envs.env import Env
 from newton_qd.envs.inputs import require_key
 from newton_qd.envs.state import at_fault, select
 from newton_qd.extractors import check_extractor
+from newton_qd.gradients import episode_input
 from newton_qd.gradients.compiled import compiled_once, without_compiled
-from newton_qd.gradients.episode_input import check_first, check_length, check_weights
 from newton_qd.gradients.exact import EpisodeGradient, EpisodeGradients, differentiate
 from newton_qd.gradients.flow import EXACT, GradientOptions, passed_back, scan_keeping
 from newton_qd.gradients.mixed import (
@@ -133,7 +133,7 @@ class Episode:
             optional = name != "unravel"
             checks.function(name, getattr(self, name), needed, optional=optional)
         check_extractor(self.env, self.descriptor_extractor)
-        check_length(self.env, self.episode_length)
+        episode_input.check_length(self.env, self.episode_length)
         checks.instance("options", self.options, GradientOptions, "GradientOptions")
         checks.flag("transitions", self.transitions)
 
@@ -165,7 +165,7 @@ class Episode:
             require_key("start", start)
         first: Any = self.env.reset(start) if is_key else start
         described = self.descriptor_extractor is not None or self.transitions
-        check_first(self.env, first, described)
+        episode_input.check_first(self.env, first, described)
         kept = self.options.exact and self.options.checkpoint_every in (None, 1)
         if self.policy is None and kept and not self.transitions:
             if isinstance(self.env, Env):
@@ -211,6 +211,7 @@ class Episode:
             TypeError: ``start`` is neither a key nor a state.
             ValueError: ``start`` or a genotype is wrong, as in a call of the episode.
         """
+        episode_input.check_genotypes(genotypes)
         axes = (0, None, None, None)
         return jax.vmap(self._differentiated, axes)(genotypes, None, start, params)
 
@@ -244,7 +245,7 @@ class Episode:
             ValueError: ``start`` or a genotype is wrong, as in a call of the episode,
                 or ``weights`` have another shape.
         """
-        check_weights(genotypes, weights)
+        episode_input.check_weights(genotypes, weights)
         axes = (0, 0, None, None)
         return jax.vmap(self._differentiated, axes)(genotypes, weights, start, params)
 
@@ -286,6 +287,7 @@ class Episode:
             ValueError: A setting is out of its range, or a genotype is wrong, as in a
                 call of the episode.
         """
+        episode_input.check_genotypes(genotypes)
         check_mixture(samples, sigma, tolerance)
         require_key("key", key)
         return mixed_gradients(
@@ -330,6 +332,7 @@ class Episode:
         self, genotypes: Genotype, key: RNGKey
     ) -> tuple[jax.Array, jax.Array, ExtraScores]:
         """Returns fitnesses (N,), descriptors (N, D), and transitions, if any."""
+        episode_input.check_genotypes(genotypes)
         return scores(jax.vmap(self, (0, None))(genotypes, key))
 
     def _differentiated(

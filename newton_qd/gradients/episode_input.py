@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from newton_qd.checks import Error, Fact, message
+from newton_qd.checks import Error, Fact, listed, message
 from newton_qd.envs.base import Env
 from newton_qd.types import Environment, Genotype
 from newton_qd.wrappers.base import outermost
@@ -68,6 +68,27 @@ def check_length(
         raise error(message("episode_length", episode_length, allowed))
 
 
+def check_genotypes(genotypes: Genotype) -> int:
+    """Checks genotypes of several episodes; returns their number N.
+
+    Args:
+        genotypes: Leaves (N, ...).
+
+    Raises:
+        ValueError: There are no leaves, or they have other first axes.
+    """
+    allowed = "a pytree with leaves (N, ...)"
+    shapes = [jnp.shape(leaf) for leaf in jax.tree.leaves(genotypes)]
+    if not shapes:
+        raise ValueError(message("genotypes", Fact("no leaves"), allowed))
+    numbers = {shape[:1] for shape in shapes}
+    if len(numbers) > 1 or () in numbers:
+        texts = list(dict.fromkeys(map(str, shapes)))
+        given = Fact(f"leaves of shape {listed(texts)}")
+        raise ValueError(message("genotypes", given, allowed))
+    return shapes[0][0]
+
+
 def check_weights(genotypes: Genotype, weights: Any) -> None:
     """Checks the weights of sums of fitness and descriptor.
 
@@ -77,13 +98,13 @@ def check_weights(genotypes: Genotype, weights: Any) -> None:
 
     Raises:
         TypeError: They are not an array.
-        ValueError: They have another shape.
+        ValueError: They have another shape, or the genotypes are wrong.
     """
     allowed = "an array of shape (N, R, 1 + D)"
     if not isinstance(weights, jax.Array | np.ndarray):
         given = Fact(f"a {type(weights).__name__}")
         raise TypeError(message("weights", given, allowed))
-    shape, number = jnp.shape(weights), len(jax.tree.leaves(genotypes)[0])
+    shape, number = jnp.shape(weights), check_genotypes(genotypes)
     if len(shape) != 3 or shape[0] != number or not shape[1]:
         allowed = f"shape ({number}, R, 1 + D), R from 1"
         raise ValueError(message("weights", Fact(f"shape {shape}"), allowed))
