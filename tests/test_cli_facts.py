@@ -84,6 +84,30 @@ def test_the_table_for_scripts(capsys: pytest.CaptureFixture[str]) -> None:
     assert [row["name"] for row in rows] == [*newton_qd.registered_envs()]
 
 
+def test_an_environment_that_cannot_be_made_leaves_the_others(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Broken(PointMaze):
+        @property
+        def action_size(self) -> int:
+            raise ZeroDivisionError("no actions")
+
+    specs = {
+        "broken": tasks.EnvironmentSpec(Broken, "broken"),
+        "pointmaze": tasks.ENVIRONMENTS["pointmaze"],
+    }
+    monkeypatch.setattr(tasks, "ENVIRONMENTS", specs)
+    why = "newton-qd envs: error: broken cannot be made: ZeroDivisionError: no actions"
+    assert cli.main(["envs"]) == cli.FAILED
+    seen = capsys.readouterr()
+    names = [line.split()[0] for line in seen.out.splitlines()]
+    assert (names, seen.err) == (["name", "pointmaze"], f"{why}\n")
+    assert cli.main(["envs", "--json"]) == cli.FAILED
+    seen = capsys.readouterr()
+    assert [row["name"] for row in json.loads(seen.out)] == ["pointmaze"]
+    assert seen.err == f"{why}\n"
+
+
 @pytest.mark.parametrize("closed", ["stdout", "stderr"])
 def test_a_closed_output_is_no_failure(
     closed: str, monkeypatch: pytest.MonkeyPatch

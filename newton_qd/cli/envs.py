@@ -7,11 +7,19 @@ import inspect
 import json
 import re
 import textwrap
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from newton_qd.cli import modules
-from newton_qd.cli.arguments import OK, Commands, print_table, terminal_width
+from newton_qd.cli.arguments import (
+    FAILED,
+    OK,
+    Commands,
+    complain,
+    print_table,
+    terminal_width,
+)
 
 
 def add_parser(commands: Commands) -> None:
@@ -33,6 +41,8 @@ def add_parser(commands: Commands) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Prints the table or a description, and returns the exit code.
 
+    The table has what can be made. Standard error says what cannot, and why.
+
     Raises:
         UnknownEnvironment: No environment has this name.
     """
@@ -42,10 +52,24 @@ def run(arguments: argparse.Namespace) -> int:
         found = _facts(arguments.name, whole=True)
         print(json.dumps(found, indent=2) if arguments.json else _description(found))
         return OK
-    rows = [_facts(name, whole=False) for name in newton_qd.registered_envs()]
+    rows: list[dict[str, Any]] = []
+    failures: list[str] = []
+    for name in newton_qd.registered_envs():
+        try:
+            rows.append(_facts(name, whole=False))
+        except Exception as error:  # the code of a user may raise any
+            failures.append(f"{name} cannot be made: {type(error).__name__}: {error}")
     if arguments.json:
         print(json.dumps(rows, indent=2))
-        return OK
+    else:
+        _print_table(rows)
+    for failure in failures:
+        complain(arguments, failure, FAILED)
+    return FAILED if failures else OK
+
+
+def _print_table(rows: Sequence[dict[str, Any]]) -> None:
+    """Prints the table of environments."""
     table = []
     for row in rows:
         descriptor = offset = "-"
@@ -56,7 +80,6 @@ def run(arguments: argparse.Namespace) -> int:
         table.append((row["name"], *sizes, descriptor, offset))
     head = ("name", "observation", "action", "descriptor", "reward offset")
     print_table(head, table)
-    return OK
 
 
 def _facts(name: str, *, whole: bool) -> dict[str, Any]:
