@@ -1,8 +1,10 @@
-"""The errors that the package defines; all derive from built-in ones."""
+"""The errors that the package defines, all from built-in ones, and its warnings."""
 
 from __future__ import annotations
 
 import importlib.util
+import inspect
+import warnings
 from collections.abc import Sequence
 
 
@@ -63,3 +65,17 @@ def require_extra(package: str, extra: str) -> None:
     """
     if importlib.util.find_spec(package) is None:
         raise MissingExtra(package, extra)
+
+
+def warn(text: str, category: type[Warning] = UserWarning) -> None:
+    """Warns at the line that called the package, however deep in it this function is.
+
+    Args:
+        text: The warning.
+        category: Its class.
+    """
+    package, level = __name__.partition(".")[0], 1  # level 1 is this function
+    frame = inspect.currentframe()
+    while frame and frame.f_globals.get("__name__", "").partition(".")[0] == package:
+        frame, level = frame.f_back, level + 1
+    warnings.warn(text, category, stacklevel=level)

@@ -38,8 +38,9 @@ def test_a_run_without_some_files(reference: Path, tmp_path: Path) -> None:
     for name, column in whole.metrics.items():
         assert np.array_equal(np.float32(column), np.float32(again.metrics[name]))
     (out / "checkpoint.bin").write_bytes(b"damaged")
-    with pytest.warns(UserWarning, match=r"is read from archive\.npz instead"):
+    with pytest.warns(UserWarning, match=r"is read from archive\.npz instead") as seen:
         opened(out)
+    assert seen[0].filename == __file__
     (out / "archive.npz").unlink()
     with pytest.raises(CheckpointError):
         opened(out)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import linecache
 import warnings
 from pathlib import Path
+from typing import Any
 
 import energy_helpers as energies
 import jax
@@ -18,6 +20,7 @@ from subjects import ACTIONS, from_system
 from urdf_text import joint, link, robot_text, row, sphere, write
 
 from newton_qd import physics
+from newton_qd.envs.base import PhysicsEnv
 from newton_qd.physics import reference
 from newton_qd.physics.model import build_system
 from newton_qd.physics.model.substeps import (
@@ -156,6 +159,22 @@ def test_none_takes_the_recommended_number(tmp_path: Path) -> None:
     assert physics.recommended_substeps(again) == 17
     assert system.h == pytest.approx(0.02 / 17)
     assert physics.load_system(robot) is system
+
+
+def test_a_warning_is_about_the_line_that_called_the_package(tmp_path: Path) -> None:
+    """Not about a line of the package, however deep in it the reason is."""
+    robot = hexapod(tmp_path, 0.0)
+
+    class Own(PhysicsEnv):
+        def outcome(self, before: Any, after: Any, action: Any) -> Any:
+            return after.q[0], False, {}
+
+    for call in (physics.load_system, Own):
+        with pytest.warns(physics.FewSubstepsWarning) as seen:
+            call(robot)
+        assert len(seen) == 1 and seen[0].filename == __file__
+        line = linecache.getline(__file__, seen[0].lineno)
+        assert line.strip() == "call(robot)"
 
 
 def test_few_substeps_give_a_warning(tmp_path: Path) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,6 +18,7 @@ import numpy as np
 from newton_qd import checks
 from newton_qd.assets import find_urdf
 from newton_qd.checks import Fact, listed, message
+from newton_qd.errors import warn
 from newton_qd.physics.model.arrays import body_arrays, dof_arrays
 from newton_qd.physics.model.contacts import contact_tables
 from newton_qd.physics.model.description import (
@@ -388,6 +388,6 @@ def load_system(
     contents = tuple(file.read_bytes() for file in files)
     system = _cached_system(robot, dtype, scene, contents)
     for text, category in _cached_warnings(system):
-        warnings.warn(text, category, stacklevel=2)
+        warn(text, category)
     width = system.feet_width if feet_width is None else feet_width
     return _cached_variant(system, width, feet_tail, reports_bodies)

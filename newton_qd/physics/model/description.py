@@ -8,12 +8,12 @@ them to one kinematic tree. The reading does not depend on Newton.
 from __future__ import annotations
 
 import dataclasses
-import warnings
 from pathlib import Path
 
 import numpy as np
 
 from newton_qd.checks import Fact, listed, message
+from newton_qd.errors import warn
 from newton_qd.physics.model.elements import (
     Joint,
     Link,
@@ -246,14 +246,14 @@ def _check_floating(path: Path, joint: Joint, fixed: bool) -> None:
 def warn_about(description: Description) -> None:
     """Warns about misspelt names, and about revolute joints without bounds."""
     for text in description.misspelt:
-        warnings.warn(text, RobotDescriptionWarning, stacklevel=3)
+        warn(text, RobotDescriptionWarning)
     if description.unbounded:
         names = listed(description.unbounded)
         name = f"{description.path}: limits of revolute joint(s) {names}"
         allowed = "lower and upper in <limit>, or the type continuous"
         why = "so they turn freely"
         text = message(name, Fact("none"), allowed, why=why)
-        warnings.warn(text, RobotDescriptionWarning, stacklevel=3)
+        warn(text, RobotDescriptionWarning)
 
 
 def read_description(path: Path, fixed_base: bool | None = None) -> Description:

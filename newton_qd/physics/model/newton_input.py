@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from newton_qd.checks import Fact, message
+from newton_qd.errors import warn
 from newton_qd.physics.model.description import merged_inertia
 from newton_qd.physics.model.elements import WITHOUT_AXIS
 from newton_qd.physics.model.mesh_files import Folders
@@ -131,7 +131,7 @@ class NewtonInput:
         allowed = f"{allowed}; another one is not drawn"
         text = message("filename", Fact(name), allowed, why=why)
         error = self._reader.error(asset.element, text)
-        warnings.warn(str(error), RobotDescriptionWarning, stacklevel=4)
+        warn(str(error), RobotDescriptionWarning)
 
     def _keep(self, asset: Asset) -> None:
         """Keeps a mesh or a texture if it may be read."""

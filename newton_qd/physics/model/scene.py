@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import warnings
 from collections.abc import Iterator
 
 import numpy as np
@@ -12,6 +11,7 @@ import numpy as np
 from newton_qd import checks
 from newton_qd.assets import find_urdf
 from newton_qd.checks import Fact, listed, message
+from newton_qd.errors import warn
 from newton_qd.physics import reference
 from newton_qd.physics.model.description import WORLD, find_root, read_joints
 from newton_qd.physics.model.elements import Link, Shape, by_name, read_link
@@ -91,7 +91,7 @@ def read_scene(scene: Scene) -> tuple[SceneLink, ...]:
     if not elements:
         raise reader.error(reader.root, "element <link> is missing")
     for text in misspelt(reader):
-        warnings.warn(text, RobotDescriptionWarning, stacklevel=2)
+        warn(text, RobotDescriptionWarning)
     links = {name: read_link(reader, element) for name, element in elements.items()}
     for name, link in links.items():
         if (name == WORLD and link.shapes) or link.mass > 0:
@@ -104,7 +104,7 @@ def read_scene(scene: Scene) -> tuple[SceneLink, ...]:
     frames = _link_frames(reader, links)
     if not any(link.shapes for link in links.values()):
         text = f"{reader.path}: no link has a collider, so nothing touches the scene"
-        warnings.warn(text, RobotDescriptionWarning, stacklevel=2)
+        warn(text, RobotDescriptionWarning)
     return tuple(
         SceneLink(name, frames[name], _placed(links[name], frames[name]))
         for name in links

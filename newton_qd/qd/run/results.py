@@ -6,13 +6,13 @@ import csv
 import dataclasses
 import json
 import os
-import warnings
 from pathlib import Path
 
 import numpy as np
 
 from newton_qd import checks
 from newton_qd.checks import Fact, message
+from newton_qd.errors import warn
 from newton_qd.qd.config import ConfigError, EvolveConfig
 from newton_qd.qd.run.archive import ARCHIVE, Archive, archive_of, load_archive
 from newton_qd.qd.run.checkpoint import Checkpoint, CheckpointError, load_checkpoint
@@ -84,7 +84,7 @@ def _newest(path: Path) -> Checkpoint | None:
             raise
         text = f"{error}; its archive is read from {ARCHIVE} instead, and its metrics "
         text += f"up to that archive from {METRICS}"
-        warnings.warn(text, stacklevel=4)
+        warn(text)
         return None
 
 
@@ -154,7 +154,7 @@ def read_reevaluated(path: Path) -> Reevaluated | None:
         names = ", ".join(f.name for f in dataclasses.fields(Reevaluated))
         text = message(str(path), Fact("other content"), f"an object of {names}")
         text += f" ({error}); the run is opened without these metrics"
-        warnings.warn(text, stacklevel=3)
+        warn(text)
         return None
 
 
