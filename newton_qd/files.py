@@ -54,11 +54,11 @@ def write_atomically(path: Path, content: bytes) -> None:
             raise
         # The message of the system does not always name the file.
         raise OSError(error.errno, error.strerror, str(path)) from error
-    _remove_abandoned(path)
+    remove_abandoned(path)
 
 
-def _remove_abandoned(path: Path) -> None:
-    """Removes what killed writers of a file left behind."""
+def remove_abandoned(path: Path) -> None:
+    """Removes what killed writers of a file left behind an hour ago or earlier."""
     newest = time.time() - _ABANDONED
     for part in temporary_files(path):
         with contextlib.suppress(OSError):

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+import time
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -11,7 +14,8 @@ import numpy as np
 import pytest
 
 import newton_qd
-from newton_qd.viewing import Trajectory, camera, joined, record
+from newton_qd.files import temporary_name
+from newton_qd.viewing import Trajectory, camera, joined, record, render
 from newton_qd.viewing.camera import pictures, times
 
 KEY = jax.random.key(0)
@@ -99,3 +103,19 @@ def test_a_finished_world_stands_still(drawn: list[np.ndarray]) -> None:
     walk = dataclasses.replace(walk, lengths=np.array([1, 4], np.int32))
     list(pictures(walk, np.array([3]), width=1, height=1))
     assert np.array_equal(drawn, [walk.q[0, 1], walk.q[1, 3]])
+
+
+def test_a_picture_removes_parts_of_killed_commands(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another command, which may be at work, keeps its part."""
+    image = np.zeros((4, 4, 3), np.uint8)
+    monkeypatch.setattr("newton_qd.viewing.video.pictures", lambda *_, **__: [image])
+    target = tmp_path / "one.png"
+    old, new = temporary_name(target), temporary_name(target)
+    for part, age in ((old, 7200), (new, 60)):
+        part.write_bytes(b"half")
+        then = time.time() - age
+        os.utime(part, (then, then))
+    render(point(2), target)
+    assert {path.name for path in tmp_path.iterdir()} == {"one.png", new.name}

@@ -13,7 +13,7 @@ import numpy as np
 from newton_qd import checks
 from newton_qd.checks import listed, message
 from newton_qd.errors import require_extra
-from newton_qd.files import temporary_name
+from newton_qd.files import remove_abandoned, temporary_name
 from newton_qd.viewing.camera import pictures, times
 from newton_qd.viewing.trajectory import Trajectory
 
@@ -117,6 +117,7 @@ def render(
         os.replace(temporary, target)
     finally:
         temporary.unlink(missing_ok=True)
+    remove_abandoned(target)
     return target
 
 
