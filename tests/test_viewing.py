@@ -268,6 +268,18 @@ def test_render_refuses_what_it_would_ignore(
     assert message in capsys.readouterr().err
 
 
+def test_render_does_not_replace_the_picture_of_a_run(
+    reference: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    picture = reference / "archive.png"
+    before = picture.read_bytes()
+    for shown in (reference, "ant"):
+        arguments = ["render", str(shown), "--png", "--out", str(picture)]
+        assert cli.main(arguments, task_factory=point_task) == cli.BAD_ARGUMENTS
+        assert "which is the picture of the archive of a run" in capsys.readouterr().err
+    assert picture.read_bytes() == before
+
+
 def test_a_gif_has_the_speed_of_its_rate() -> None:
     """Its unit is a hundredth of a second, and errors must not add up."""
     for rate in (7.0, 20.0, 30.0, 50.0):

@@ -23,6 +23,7 @@ from newton_qd.cli.arguments import (
 from newton_qd.cli.progress import ProgressCount
 from newton_qd.cli.runs import checked_starts, opened
 from newton_qd.qd.config import ConfigError, EvolveConfig
+from newton_qd.qd.run.folder import PICTURE, RunFolder
 
 if TYPE_CHECKING:
     from newton_qd.qd.run.opened import Run
@@ -256,7 +257,7 @@ def _target(arguments: argparse.Namespace, name: str, ending: str) -> Path:
     """Returns the file to write: ``name`` in a results folder, or ENV with an ending.
 
     Raises:
-        ConfigError: It is a folder, or lies in no folder.
+        ConfigError: It is a folder, lies in no folder, or is a file of a run.
     """
     folder = Path(arguments.what)
     out = arguments.out
@@ -270,7 +271,7 @@ def _check_target(out: Path, *, given: bool) -> None:
     """Checks the file to write, before the slow part.
 
     Raises:
-        ConfigError: It is a folder, or lies in no folder.
+        ConfigError: It is a folder, lies in no folder, or is a file of a run.
     """
     if out.is_dir():
         why = "which is a folder"
@@ -278,6 +279,9 @@ def _check_target(out: Path, *, given: bool) -> None:
     if given and not out.parent.is_dir():
         why = f"and {out.parent} is no folder"
         raise ConfigError(message("--out", str(out), "a file in a folder", why=why))
+    if out.name == PICTURE and RunFolder(out.parent).has_config:
+        why = "which is the picture of the archive of a run"
+        raise ConfigError(message("--out", str(out), "a file of another name", why=why))
     require_writable("--out", out)
 
 
