@@ -242,6 +242,11 @@ def test_wrong_arguments_of_replay(capsys: pytest.CaptureFixture[str]) -> None:
     assert "--cell: got 3; allowed: a results folder" in capsys.readouterr().err
     assert cli.main(["replay", "ant", "--best", "0"]) == 2
     assert "--best: got 0; allowed: None, or integers" in capsys.readouterr().err
+    for command in (["replay"], ["render", "--best", "2"]):  # several gigabytes
+        assert cli.main([*command, "pointmaze", "--steps", "100000000"]) == 2
+        most = 500_000 if "2" in command else 1_000_000
+        said = f"--steps: got 100000000; allowed: integers from 1 to {most}\n"
+        assert said in capsys.readouterr().err
 
 
 def test_frames_of_bodies_are_those_of_the_reference() -> None:

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
 _MOST_WORLDS = 50  # that a page shows at once
 _RANDOM_STEPS = 250  # of an environment without a policy
+_MOST_STEPS = 1_000_000  # of all its worlds: a page of an ant has 91 bytes for each
 
 
 def add_parsers(commands: Commands) -> None:
@@ -151,7 +152,8 @@ def _add_choice(parser: argparse.ArgumentParser) -> None:
         type=int,
         metavar="N",
         help="control steps (default: an episode of the run, or "
-        f"{_RANDOM_STEPS} of an environment)",
+        f"{_RANDOM_STEPS} of an environment, whose worlds have up to {_MOST_STEPS:,} "
+        "together)",
     )
     parser.add_argument(
         "--seed",
@@ -387,6 +389,7 @@ def _random_trajectory(arguments: argparse.Namespace) -> Trajectory:
     from newton_qd.viewing.recording import check_memory
 
     steps, worlds = arguments.steps or _RANDOM_STEPS, arguments.best or 1
+    checks.integer("--steps", steps, most=_MOST_STEPS // worlds, error=ConfigError)
     env = newton_qd.create(arguments.what, episode_length=steps, auto_reset=False)
     check_memory(env, steps, worlds)
     start, noise = jax.random.split(jax.random.key(arguments.seed or 0))
