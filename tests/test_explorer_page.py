@@ -258,6 +258,20 @@ def test_a_large_archive_is_thinned(monkeypatch: pytest.MonkeyPatch) -> None:
     assert f" of {count} elites move, so that the page is below 10 MB" in text
 
 
+@pytest.mark.parametrize(("generations", "cells"), [(200_000, 5), (10, 60)])
+def test_curves_and_maps_are_part_of_the_size(
+    generations: int, cells: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = opened("grid", 2, (cells, cells), steps=40)
+    metrics = {name: np.arange(float(generations)) for name in run.metrics}
+    run = dataclasses.replace(run, metrics=metrics)
+    monkeypatch.setattr("newton_qd.viewing.explorer._LARGEST_PAGE", 1.1e6)
+    text = explorer_html([run])
+    assert len(text) < 1.1e6
+    thinned = f" of {len(run.cells)} elites move" in text
+    assert thinned is (cells == 60)
+
+
 def pushed(run: Run, worlds: int) -> Trajectory:
     """Four steps, of which an episode may have fewer."""
     return record(run.task.env, jnp.tile(jnp.array([0.5, 0.0]), (worlds, 4, 1)), KEY)

@@ -23,7 +23,10 @@ if TYPE_CHECKING:
 
 _EVERY = 2  # steps between two frames of the page
 _LARGEST_PAGE = 10e6  # [bytes]
-_FIXED = 1.2e6  # scripts, map and curves of a run [bytes]
+_FIXED = 0.7e6  # scripts, shapes and texts of a page [bytes]
+_MOST_POINTS = 2000  # of a curve, which has fewer pixels
+_MOST_GENOTYPES = 0.6e6  # [bytes]
+_COUNTS = 16  # lengths of an episode, as text [bytes]
 _TEXT = 4 / 3  # characters of base64 for a byte
 _MOST_RUNS = 2
 _CURVES = ("qd_score", "coverage", "max_fitness")
@@ -77,8 +80,8 @@ def explorer_html(
     # half rate would lose the last step of an episode of an odd length
     odd = any(run.config.episode_length % _EVERY for run in runs)
     every = 1 if odd else _EVERY
-    budget = _LARGEST_PAGE / len(runs) - _FIXED
-    chosen = [_moving(run, budget, every) for run in runs]
+    budget = (_LARGEST_PAGE - _FIXED) / len(runs)
+    chosen = [_moving(run, budget - _still_size(run, starts), every) for run in runs]
     total, before = sum(map(len, chosen)), 0
     found, first = [], None
     for run, cells in zip(runs, chosen, strict=True):
@@ -150,6 +153,17 @@ def _check_same(first: Trajectory, other: Trajectory, names: list[str]) -> None:
         raise ValueError(message("runs", given, allowed))
 
 
+def _still_size(run: Run, starts: int) -> float:
+    """Returns the size of map, values, curves and genotypes in the page [bytes]."""
+    elites, dimensions = run.archive.descriptors[run.cells].shape
+    values = 4 + (2 if starts else 0) + dimensions  # of the metrics of an elite
+    points = min(run.iteration + 1, _MOST_POINTS) * (1 + len(_CURVES))
+    numbers = elites * (2 + dimensions + values) + run.archive.centroids.size + points
+    if _has_genotypes(run):
+        numbers += run.archive.genotypes[run.cells].size
+    return 4 * numbers * _TEXT
+
+
 def _moving(run: Run, budget: float, every: int) -> np.ndarray:
     """Returns the cells whose elites move in the page: all, or as many as fit.
 
@@ -163,7 +177,7 @@ def _moving(run: Run, budget: float, every: int) -> np.ndarray:
     system = getattr(env, "system", None)
     numbers = (2, 0) if system is None else (system.nq, len(system.feet))
     # int16 for coordinates and reward, a byte for each foot
-    size = frames * (2 * numbers[0] + 2 + numbers[1]) * _TEXT
+    size = frames * (2 * numbers[0] + 2 + numbers[1]) * _TEXT + _COUNTS
     most = max(1, math.floor(budget / size))
     cells = run.cells
     if len(cells) <= most:
@@ -186,7 +200,10 @@ def _run_data(
     low, high = (np.asarray(ends, float) for ends in run.task.limits)
     archive, config = run.archive, run.config
     filled = run.cells
-    curves = {name: encode(run.metrics[name]) for name in ("evaluations", *_CURVES)}
+    count = len(run.metrics["evaluations"])
+    points = np.linspace(0, count - 1, min(count, _MOST_POINTS)).astype(int)
+    columns = ("evaluations", *_CURVES)
+    curves = {name: encode(run.metrics[name][points]) for name in columns}
     again = run.reevaluated
     return {
         "name": str(run.path),
@@ -226,8 +243,12 @@ def _notice(elites: int, moving: int) -> str:
 
 def _genotypes(run: Run) -> dict[str, Any] | None:
     """Returns the genotypes of the elites, if they are small."""
-    values = run.archive.genotypes[run.cells]
-    return encode(values) if values.nbytes < _FIXED / 2 else None
+    return encode(run.archive.genotypes[run.cells]) if _has_genotypes(run) else None
+
+
+def _has_genotypes(run: Run) -> bool:
+    """Returns whether the page has the genotypes of the elites."""
+    return run.archive.genotypes[run.cells].nbytes < _MOST_GENOTYPES
 
 
 def _map_data(run: Run) -> dict[str, Any]:
