@@ -22,7 +22,7 @@ from newton_qd.qd.run.archive import Archive
 from newton_qd.qd.run.folder import COLUMNS
 from newton_qd.qd.run.opened import Run
 from newton_qd.qd.run.reevaluation import Reevaluated
-from newton_qd.viewing import Trajectory, record, write_explorer
+from newton_qd.viewing import Trajectory, record, write_explorer, write_replay
 from newton_qd.viewing.elites import record_elites
 from newton_qd.viewing.explorer import (
     _metrics,
@@ -198,6 +198,36 @@ def test_two_runs_filter_colour_and_hostile_names(pages: Pages, tmp_path: Path) 
         page.locator(".tools button").first.click()
     stored = info.value.path().read_text(encoding="utf-8")
     assert f'"cell":{runs[0].best()[0].cell}' in stored and '"genotype":[' in stored
+
+
+@pytest.mark.slow
+@pytest.mark.browser
+def test_a_screen_reader_has_names(pages: Pages, tmp_path: Path) -> None:
+    """Of every picture, and of every button whose text is a symbol."""
+    run = opened(HOSTILE, 2, (5, 4))
+    page = pages.open(write_explorer([run], tmp_path / "e.html"))
+    names = "[...document.querySelectorAll('canvas')].map((e) => "
+    names += "e.getAttribute('role') + ': ' + e.getAttribute('aria-label'))"
+    assert page.evaluate(names) == [
+        f"application: archive of {run.path}, arrow keys choose an elite",
+        *(f"img: curve of {name}" for name in ("qd score", "coverage", "max fitness")),
+        "img: pointmaze in motion",
+        "img: chart of reward of a step",
+    ]
+    words = page.get_by_role("button", name=re.compile(r"^[\w ]+$"))
+    assert words.count() == page.locator("button").count() == 4
+    said = page.get_by_role("status").inner_text()
+    page.locator("canvas.map").focus()
+    page.keyboard.press("ArrowUp")
+    page.keyboard.press("ArrowDown")
+    page.keyboard.press("ArrowRight")
+    page.keyboard.press("ArrowLeft")
+    assert said.startswith("cell ") and said != page.get_by_role("status").inner_text()
+    plan = jnp.zeros((2, 2))
+    replay = write_replay(record(run.task.env, plan, KEY), tmp_path / "r.html")
+    page = pages.open(replay)
+    assert not [text for text in page.evaluate(names) if "null" in text]
+    assert page.get_by_role("button", name=re.compile(r"^[\w ]+$")).count() == 3
 
 
 @pytest.mark.slow

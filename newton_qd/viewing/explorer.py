@@ -33,7 +33,8 @@ _CURVES = ("qd_score", "coverage", "max_fitness")
 _SCRIPTS = ("map.js", "explorer.js")
 _BODY = """
 <header><h1 id="title"></h1><div id="facts"></div>
-<button id="theme" type="button" title="Light or dark">&#9680;</button></header>
+<button id="theme" type="button" title="Light or dark" aria-label="Light or dark">
+&#9680;</button></header>
 <main><section id="maps"></section><div id="player" class="player"></div></main>
 """
 

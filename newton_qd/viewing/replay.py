@@ -13,7 +13,8 @@ from newton_qd.viewing.trajectory import Trajectory
 
 _BODY = """
 <header><h1 id="title"></h1><div id="facts"></div>
-<button id="theme" type="button" title="Light or dark">&#9680;</button></header>
+<button id="theme" type="button" title="Light or dark" aria-label="Light or dark">
+&#9680;</button></header>
 <div id="player" class="player"></div>
 """
 

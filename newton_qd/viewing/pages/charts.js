@@ -38,7 +38,7 @@
     const row = NQD.element("div", charts, { name: "chart" });
     const names = NQD.element("div", row, { name: "names" });
     NQD.element("span", names, { text: title, name: "title", title: hint });
-    const canvas = NQD.element("canvas", row);
+    const canvas = NQD.element("canvas", row, { role: "img", label: "chart of " + title });
     const ratio = Math.min(window.devicePixelRatio || 1, 2);
     const width = Math.max(50, charts.clientWidth);
     canvas.width = width * ratio;

@@ -193,7 +193,9 @@
       if (name === "evaluations") continue;
       const part = NQD.element("div", curves, { name: "curve" });
       NQD.element("div", part, { text: name.replaceAll("_", " "), name: "soft" });
-      const canvas = NQD.element("canvas", part);
+      const canvas = NQD.element("canvas", part, {
+        role: "img", label: "curve of " + name.replaceAll("_", " "),
+      });
       const wide = canvas.width = Math.max(60, part.clientWidth), tall = canvas.height = 70;
       const pen = canvas.getContext("2d");
       const all = runs.flatMap((run) => Array.from(run.curves[name].data))

@@ -133,6 +133,9 @@ const NQD = {};
     if (given.name !== undefined) made.className = given.name;
     if (given.title !== undefined) made.title = given.title;
     if (given.type !== undefined) made.type = given.type;
+    if (given.role !== undefined) made.setAttribute("role", given.role);
+    // what a screen reader says of a picture or a symbol
+    if (given.label !== undefined) made.setAttribute("aria-label", given.label);
     if (parent) parent.appendChild(made);
     return made;
   };

@@ -37,10 +37,13 @@
     this.selected = 0;
     this.hovered = EMPTY;
     this.shown = new Uint8Array(this.count).fill(1); // passes the filter
-    this.canvas = NQD.element("canvas", container, { name: "map" });
+    this.canvas = NQD.element("canvas", container, {
+      name: "map", role: "application", // a screen reader leaves the arrow keys to it
+      label: "archive of " + run.name + ", arrow keys choose an elite",
+    });
     this.canvas.tabIndex = 0;
     this.pen = this.canvas.getContext("2d");
-    this.tip = NQD.element("div", container, { name: "tip" });
+    this.tip = NQD.element("div", container, { name: "tip", role: "status" });
     this.kind = run.map.grid ? "grid" : run.low.length <= 2 ? "cells" : "lines";
     this.place();
     this.canvas.addEventListener("pointermove", (event) => this.hover(event));

@@ -30,11 +30,13 @@
     const bar = NQD.element("div", container, { name: "bar" });
     this.button = NQD.element("button", bar, {
       name: "play", text: "\u275a\u275a", title: "Play or pause (space)", type: "button",
+      label: "Play or pause",
     });
-    this.slider = NQD.element("input", bar, { name: "scrub", type: "range" });
+    this.slider = NQD.element("input", bar, {
+      name: "scrub", type: "range", label: "time",
+    });
     this.slider.step = "any";
     this.slider.min = "0";
-    this.slider.setAttribute("aria-label", "time");
     this.clock = NQD.element("span", bar, { name: "clock" });
     this.rate = NQD.element("select", bar, { title: "Speed (+ and -)" });
     for (const speed of SPEEDS) {
@@ -54,7 +56,7 @@
     if (hidden) this.box(bar, "colliders", "colliders", "Colliders (k)", false);
     this.box(bar, "origins", "link frames", "Axes at the origins of the links (o)", false);
     const home = NQD.element("button", bar, {
-      text: "\u2302", title: "First view (h)", type: "button",
+      text: "\u2302", title: "First view (h)", type: "button", label: "First view",
     });
     home.addEventListener("click", () => this.act("h"));
     const metres = this.options.unit === " steps" ? "" : " m"; // a maze has no unit

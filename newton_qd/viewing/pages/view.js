@@ -89,7 +89,10 @@
     view.renderer = new THREE.WebGLRenderer({ antialias: true });
     view.renderer.shadowMap.enabled = true;
     view.renderer.setPixelRatio(Math.min(window.devicePixelRatio || 1, 2));
-    container.appendChild(view.renderer.domElement);
+    const canvas = view.renderer.domElement;
+    canvas.setAttribute("role", "img");
+    canvas.setAttribute("aria-label", drawing.name + " in motion");
+    container.appendChild(canvas);
     view.controls = new THREE.OrbitControls(view.camera, view.renderer.domElement);
     view.changed = true; // whether the next frame has to draw
     const again = () => { view.changed = true; };
