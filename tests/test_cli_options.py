@@ -128,6 +128,29 @@ def test_a_resumed_run_of_the_study_keeps_its_generations(
         assert config == kept.replace(iterations=iterations)
 
 
+def test_a_resumed_run_of_the_study_knows_what_it_is(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    arguments = ["evolve", "--study", "--resume", "--quiet", "--out", str(out)]
+    assert cli.main(arguments) == cli.BAD_ARGUMENTS
+    assert f"out: got {out}, which holds no run" in capsys.readouterr().err
+    assert cli.main(["evolve", "--study", "--quiet"]) == cli.BAD_ARGUMENTS
+    assert "ENV: got None" in capsys.readouterr().err
+    kept = study_config("hopper_uni", "me-actor-critic").replace(iterations=250)
+    out.mkdir()
+    (out / "config.json").write_text(config_to_json(kept, environment_facts()))
+    with pytest.raises(Seen) as seen:
+        cli.main(arguments, task_factory=stop)
+    assert seen.value.config == kept
+    for wrong, said in (
+        ("antmaze", "env_name: got 'antmaze'; allowed: 'hopper_uni', as the run in"),
+        ("--algorithm=me-es", "algorithm: got 'me-es'; allowed: algorithms of the st"),
+    ):
+        assert cli.main([*arguments, wrong]) == cli.BAD_ARGUMENTS
+        assert said in capsys.readouterr().err
+
+
 def test_cells_replace_those_of_a_config(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -117,7 +117,7 @@ def _add_beginnings(parser: argparse.ArgumentParser) -> None:
         "--study",
         action="store_true",
         help="take the settings that the algorithm has for ENV in the study "
-        "(docs/study.md), which are for a GPU",
+        "(docs/study.md), which are for a GPU; with --resume, the run knows both",
     )
 
 
@@ -288,10 +288,7 @@ def settle(arguments: argparse.Namespace) -> tuple[EvolveConfig, Path]:
         base, facts = read_config(arguments.config, given.get("env_name"))
         warn_of_changes(facts, "when this config was written")
     if arguments.study:
-        if "env_name" not in given:
-            raise ConfigError(_UNNAMED)
-        algorithm = given.get("algorithm", _DEFAULTS.algorithm)
-        base = study_config(given["env_name"], algorithm)
+        base = _of_study(arguments, given)
     out = arguments.out
     if out is None:
         named = _other_cells(base or _DEFAULTS, given).replace(**given)
@@ -320,6 +317,30 @@ def settle(arguments: argparse.Namespace) -> tuple[EvolveConfig, Path]:
     if "env_options" in given:
         given["env_options"] = _merged(dict(base.env_options), given["env_options"])
     return base.replace(**given), out
+
+
+def _of_study(
+    arguments: argparse.Namespace, given: Mapping[str, Any]
+) -> EvolveConfig | None:
+    """Returns the settings of the study; ``None`` if no environment is named.
+
+    The run to resume names what the arguments do not: environment and algorithm.
+
+    Raises:
+        ConfigError: The study has no such run, or the run to resume is of another
+            environment.
+    """
+    from newton_qd.qd.run.folder import CONFIG, RunFolder
+
+    names = {"algorithm": _DEFAULTS.algorithm}
+    if arguments.resume and arguments.out is not None:
+        folder = RunFolder(arguments.out)
+        if folder.has_config:
+            kept = read_config(folder.path / CONFIG)[0]
+            names = {"env_name": kept.env_name, "algorithm": kept.algorithm}
+            folder.compare_environment(given.get("env_name", kept.env_name))
+    names |= {name: given[name] for name in ("env_name", "algorithm") if name in given}
+    return study_config(**names) if "env_name" in names else None
 
 
 def _other_cells(base: EvolveConfig, given: Mapping[str, Any]) -> EvolveConfig:
