@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 from point_runs import (
     SMALL,
+    PointEnv,
     assert_same_results,
     compile_once,
     copy,
@@ -27,7 +29,7 @@ from newton_qd.qd import load_run, make_policy, to_ribs
 from newton_qd.qd.config import ConfigError, read_config, same_run, settings_text
 from newton_qd.qd.run.archive import Archive, load_archive
 from newton_qd.qd.run.checkpoint import CheckpointError
-from newton_qd.qd.run.evolution import EvolveResult
+from newton_qd.qd.run.evolution import EvolveResult, evolve
 from newton_qd.qd.run.folder import RunFolder
 from newton_qd.qd.run.search import Search
 from newton_qd.qd.run.warm_start import digest_of, start_genotypes
@@ -56,6 +58,34 @@ def test_a_run_goes_on_beyond_its_end(reference: Path, tmp_path: Path) -> None:
         ConfigError, match=r"^iterations: got 5; allowed: 12 or more, as"
     ):
         run(SHORT, out=out, resume=True)
+
+
+class Other(PointEnv):
+    """Another environment of the same name, as another module may register it."""
+
+
+class Longer(Other):
+    observation_size = 4
+
+
+@pytest.mark.parametrize(
+    ("env", "width", "shown"),
+    [
+        (Other(), 2.0, r"cells go from \[0.25 0.25\] to .* go from \[0.125 0.125\] to"),
+        (Longer(), 1.0, "policy has 30 weights; .* policy has 26"),
+    ],
+)
+def test_a_run_goes_on_in_its_environment(
+    env: Any, width: float, shown: str, reference: Path, tmp_path: Path
+) -> None:
+    out = copy(reference, tmp_path)
+    limits = np.zeros(2, np.float32), np.full(2, width, np.float32)
+    task = dataclasses.replace(point_task(SMALL, env), limits=limits)
+    before = snapshot(out)
+    more, options = SMALL.replace(iterations=14), {"out": out, "resume": True}
+    with pytest.raises(ConfigError, match=f"^env_name: got 'point', whose {shown}"):
+        evolve(more, task_factory=lambda _: task, progress=False, **options)
+    assert snapshot(out) == before
 
 
 def test_a_stopped_run_may_end_earlier(
