@@ -39,7 +39,7 @@ class MixedGradients(EpisodeGradients):
     neither order was finite.
 
     Attributes:
-        order: (N, 1 + D) weight of the first-order estimate, 0 to 1 [-].
+        order: (N, 1 + D) alpha, the weight of the first-order estimate, 0 to 1 [-].
         first_variance: (N, 1 + D) variance of a first-order sample, summed over the
             genotype. It is infinite if a sample was not finite, or if the variance is
             too large for the dtype.

@@ -40,7 +40,7 @@ class HorizonRow:
         bias: Share of the first-order slope along the gradient without noise that the
             zeroth order does not confirm, mean over the worlds [-].
         bias_error: Standard error of ``bias`` [-].
-        order: Weight of the first order by inverse variances, median [-].
+        order: Alpha, the weight of the first order by inverse variances, median [-].
         length: Length of the gradient along these directions divided by that of the
             central differences [-], of the world where it is farthest from 1.
     """
