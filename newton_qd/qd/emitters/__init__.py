@@ -1,4 +1,4 @@
-"""Emitters for QDax that use exact gradients.
+"""Emitters for QDax. All but ``AsciiEmitter`` use exact gradients.
 
 - ``ActorCriticEmitter``: policies of actors that learn over short windows with
   ``ActorCritic``, and then from whole episodes with ``EpisodeLearning``
