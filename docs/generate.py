@@ -1,7 +1,7 @@
 """Write what the documentation says of environments and algorithms from their code.
 
 python docs/generate.py            writes docs/environments.md, and parts of
-                                   docs/evolve.md
+                                   docs/evolve.md and docs/algorithm_options.md
 python docs/generate.py --check    fails if a page is out of date
 """
 
@@ -32,6 +32,7 @@ from newton_qd.tasks import ENVIRONMENTS
 
 PAGE = Path(__file__).with_name("environments.md")
 EVOLVE_PAGE = Path(__file__).with_name("evolve.md")
+OPTIONS_PAGE = Path(__file__).with_name("algorithm_options.md")
 
 SEEN = "entries of the observation", "meaning"
 
@@ -291,29 +292,34 @@ def _defaults(tuned: Mapping[str, object]) -> str:
 
 
 def evolve_page() -> str:
-    """Returns the text of the page on ``evolve``, with its generated parts anew.
+    """Returns the text of the page on ``evolve``, with its generated part anew."""
+    return _renewed(EVOLVE_PAGE, "algorithms", _algorithms())
+
+
+def options_page() -> str:
+    """Returns the text of the page of options, with its generated part anew."""
+    return _renewed(OPTIONS_PAGE, "options", _algorithm_options())
+
+
+def _renewed(path: Path, name: str, part: str) -> str:
+    """The text of a page with another part between two comments.
 
     Raises:
-        ValueError: The page has no place for one of them.
+        ValueError: The page has no place for it.
     """
-    text = EVOLVE_PAGE.read_text(encoding="utf-8")
-    for name, part in (
-        ("algorithms", _algorithms()),
-        ("options", _algorithm_options()),
-    ):
-        begin, end = f"<!-- {name}: docs/generate.py ", f"<!-- end of {name} -->"
-        found = re.search(rf"(?s)({re.escape(begin)}.*?-->\n).*?({end})", text)
-        if found is None:
-            raise ValueError(f"{EVOLVE_PAGE.name}: no part {begin!r} to {end!r}")
-        text = f"{text[: found.end(1)]}\n{part}\n{text[found.start(2) :]}"
-    return text
+    text = path.read_text(encoding="utf-8")
+    begin, end = f"<!-- {name}: docs/generate.py ", f"<!-- end of {name} -->"
+    found = re.search(rf"(?s)({re.escape(begin)}.*?-->\n).*?({end})", text)
+    if found is None:
+        raise ValueError(f"{path.name}: no part {begin!r} to {end!r}")
+    return f"{text[: found.end(1)]}\n{part}\n{text[found.start(2) :]}"
 
 
 def main() -> int:
     """Writes the pages, or compares them."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--check", action="store_true")
-    texts = {PAGE: page(), EVOLVE_PAGE: evolve_page()}
+    texts = {PAGE: page(), EVOLVE_PAGE: evolve_page(), OPTIONS_PAGE: options_page()}
     if parser.parse_args().check:
         return int(any(p.read_text(encoding="utf-8") != t for p, t in texts.items()))
     for path, text in texts.items():

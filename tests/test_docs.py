@@ -43,6 +43,11 @@ def test_algorithms_on_the_evolve_page_are_up_to_date(generate: ModuleType) -> N
     assert written == generate.evolve_page(), "run: python docs/generate.py"
 
 
+def test_options_of_the_algorithms_are_up_to_date(generate: ModuleType) -> None:
+    written = (DOCS / "algorithm_options.md").read_text(encoding="utf-8")
+    assert written == generate.options_page(), "run: python docs/generate.py"
+
+
 PAGES = [path.name for path in sorted(DOCS.glob("*.md"))]
 
 
