@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +12,21 @@ import numpy as np
 import pytest
 
 import newton_qd
-from newton_qd import tasks
+from newton_qd import physics, tasks
 from newton_qd.assets import find_urdf
 from newton_qd.envs.ant import Ant
 from newton_qd.envs.locomotion import Locomotion
 from newton_qd.envs.pointmaze import PointMaze
-from newton_qd.robots import ANT, HOPPER, QUADRUPED, REACHER, Material, RobotSpec
+from newton_qd.envs.swimmer import Swimmer
+from newton_qd.robots import (
+    ANT,
+    HOPPER,
+    QUADRUPED,
+    REACHER,
+    SWIMMER,
+    Material,
+    RobotSpec,
+)
 
 KEY = jax.random.key(0)
 
@@ -43,6 +53,36 @@ def test_another_robot_in_the_same_task(hurt: RobotSpec) -> None:
     after = jax.jit(changed.step)(changed.reset(KEY), np.zeros(8, np.float32))
     assert float(after.metrics["reward_survive"]) == 7.0
     assert changed.with_robot(ANT).system is ant.system
+
+
+def _changed(robot: RobotSpec, path: Path, pattern: str, by: str) -> RobotSpec:
+    """Returns the robot with another text in its URDF file, under the name of it."""
+    text = find_urdf(robot.urdf).read_text(encoding="utf-8")
+    changed, count = re.subn(pattern, by, text, flags=re.DOTALL)
+    assert count
+    path.write_text(changed, encoding="utf-8")
+    return dataclasses.replace(robot, name=path.stem, urdf=str(path))
+
+
+def test_the_centre_of_a_swimmer_is_that_of_its_masses(tmp_path: Path) -> None:
+    pattern = r'(<link name="back">\s*<inertial>.*?<mass value=")[^"]*'
+    heavy = _changed(SWIMMER, tmp_path / "heavy.urdf", pattern, r"\g<1>9.0")
+    env = Swimmer().with_robot(heavy)
+    start = jax.jit(env.reset)(KEY)
+    after = jax.jit(env.step)(start, np.array([1.0, -1.0], np.float32))
+    share = env.system.mass / env.system.mass.sum()
+    assert share.max() > 0.9
+
+    def centre(state: Any) -> np.ndarray:
+        found = state.pipeline_state
+        seen = physics.forward_kinematics(env.system, found.q, found.v)
+        return share @ np.asarray(seen.com, np.float64)[:, :2]
+
+    velocity = (centre(after) - centre(start)) / env.dt
+    named = after.metrics["x_velocity"], after.metrics["y_velocity"]
+    np.testing.assert_allclose(named, velocity, atol=1e-4)
+    place = after.metrics["x_position"], after.metrics["y_position"]
+    np.testing.assert_allclose(place, centre(after), atol=1e-6)
 
 
 def test_tasks_keep_wrappers_scene_and_softness(hurt: RobotSpec) -> None:

@@ -57,7 +57,8 @@ class WithChanges(Env):
             robot: Spec of a robot with the same joints, links, feet and actuators, in
                 the same order. Lengths, masses, limits, gears and contacts may differ.
                 The tips that ``Reacher`` and ``InvertedDoublePendulum`` read stay where
-                they are on the links of their own robots.
+                they are on the links of their own robots, and ``Swimmer`` keeps the
+                drag of its own links.
 
         Raises:
             TypeError: ``robot`` is not a ``RobotSpec``.

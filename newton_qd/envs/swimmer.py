@@ -161,8 +161,12 @@ class Swimmer(PhysicsEnv):
         return forward - control, jnp.zeros_like(forward), metrics
 
     def _centre_of_mass(self, seen: Kinematics) -> jax.Array:
-        """Returns x and y of the centre of mass (2,) [m]; all links have equal mass."""
-        return ordered_sum(seen.com[self._bodies, :2]) / len(_LINKS)
+        """Returns x and y of the centre of mass (2,) [m]."""
+        mass = self.system.mass[self._bodies]
+        share = mass / mass[0]  # exactly 1 for links of equal mass
+        weights = jnp.asarray(share, self.dtype)[:, None]
+        total = np.asarray(share.sum(), self.dtype)
+        return ordered_sum(rounded(weights * seen.com[self._bodies, :2])) / total
 
     @property
     def _bodies(self) -> np.ndarray:
