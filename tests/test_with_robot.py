@@ -21,6 +21,8 @@ from newton_qd.envs.swimmer import Swimmer
 from newton_qd.robots import (
     ANT,
     HOPPER,
+    HUMANOID,
+    PUSHER,
     QUADRUPED,
     REACHER,
     SWIMMER,
@@ -149,3 +151,24 @@ def test_robots_that_do_not_fit_are_refused(hurt: RobotSpec, tmp_path: Path) -> 
         PointMaze().with_robot(ANT)
     with pytest.raises(NotImplementedError, match="pointmaze is not a simulated robot"):
         newton_qd.create("pointmaze", robot=ANT)
+
+
+def test_robots_with_other_observations_are_refused(tmp_path: Path) -> None:
+    """The humanoid observes each link with mass, the pusher a link that is fixed."""
+    moments = 'ixx="1e-5" iyy="1e-5" izz="1e-5" ixy="0" ixz="0" iyz="0"'
+    inertial = f'<mass value="0.001"/><inertia {moments}/>'
+    by = rf'<link name="\1"><inertial>{inertial}</inertial></link>'
+    full = _changed(HUMANOID, tmp_path / "full.urdf", r'<link name="(\w+)"/>', by)
+    words = (
+        "robot: got full, whose observations have length 332; allowed: a robot whose "
+        "observations have length 227"
+    )
+    with pytest.raises(ValueError, match=words):
+        newton_qd.create("humanoid", robot=full)
+    aimless = _changed(PUSHER, tmp_path / "aimless.urdf", '"goal"', '"aim"')
+    words = "robot: got aimless, whose fixed links are mount, aim; allowed: .* goal"
+    with pytest.raises(ValueError, match=words):
+        newton_qd.create("pusher", robot=aimless)
+    footless = dataclasses.replace(ANT, feet=())
+    with pytest.raises(ValueError, match="whose feet are none; allowed"):
+        newton_qd.create("ant", robot=footless)

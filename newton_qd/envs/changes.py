@@ -8,7 +8,7 @@ import dataclasses
 from typing import Any, Self
 
 from newton_qd import checks
-from newton_qd.checks import Fact, message
+from newton_qd.checks import Fact, listed, message
 from newton_qd.envs.env import Env
 from newton_qd.physics.system import JointKind, System
 from newton_qd.robots import Material, RobotSpec
@@ -62,8 +62,8 @@ class WithChanges(Env):
 
         Raises:
             TypeError: ``robot`` is not a ``RobotSpec``.
-            ValueError: Its joints, links, feet or actuators differ, or it cannot be
-                built.
+            ValueError: Its joints, links, feet or actuators differ, its observations
+                have another length, or it cannot be built.
             FileNotFoundError: Its URDF file is missing.
         """
         checks.instance("robot", robot, RobotSpec, ROBOT)
@@ -72,6 +72,11 @@ class WithChanges(Env):
         # before the task reads places that another robot does not have
         _require_fit(changed._built(self.system.scene), self.system)
         changed._load(self.system.scene)
+        new, own = changed.observation_size, self.observation_size
+        if new != own:
+            why = f"whose observations have length {new}"
+            allowed = f"a robot whose observations have length {own}, as in this task"
+            raise ValueError(message("robot", Fact(robot.name), allowed, why=why))
         return changed
 
     def with_material(self, material: Material) -> Self:
@@ -117,12 +122,13 @@ def _require_fit(system: System, task: System) -> None:
     for name, new, own in (
         ("joints", _joints(system), _joints(task)),
         ("links", list(system.body_names), list(task.body_names)),
+        ("fixed links", list(system.scene_links), list(task.scene_links)),
         ("feet", list(system.robot.feet), list(task.robot.feet)),
         ("actuators", _actuators(system), _actuators(task)),
     ):
         if new != own:
-            why = f"whose {name} are {', '.join(new)}"
-            allowed = f"a robot with the {name} of this task: {', '.join(own)}"
+            why = f"whose {name} are {listed(new)}"
+            allowed = f"a robot with the {name} of this task: {listed(own)}"
             raise ValueError(
                 message("robot", Fact(system.robot.name), allowed, why=why)
             )
