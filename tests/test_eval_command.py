@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from point_runs import compile_once, point_task, reference
+from point_runs import SMALL, compile_once, point_task, reference
 
 from newton_qd import cli
 from newton_qd.qd.run.opened import Run
+from newton_qd.qd.run.search import start_key
 
 __all__ = ["compile_once", "reference"]  # fixtures
 
@@ -63,3 +64,20 @@ def test_a_tenth_of_a_negative_fitness_is_lost_below_it(
     )
     assert call("eval", reference, "--best", 3, "--starts", 2) == cli.OK
     assert f", {share} lost more than a tenth" in capsys.readouterr().out
+
+
+def test_other_starts_are_not_the_start_of_the_run(
+    reference: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also with the seed of the run, which is the default of both."""
+    start = start_key(SMALL.seed)
+    evaluate, seen = Run.evaluate, []
+
+    def watched(found: Run, cells: Any, keys: Any) -> Any:
+        seen.append(keys)
+        return evaluate(found, cells, keys)
+
+    monkeypatch.setattr(Run, "evaluate", watched)
+    assert call("eval", reference, "--starts", 3) == cli.OK
+    assert [keys.shape for keys in seen] == [(3,)]
+    assert not np.any(seen[0] == start)

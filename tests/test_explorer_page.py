@@ -22,6 +22,7 @@ from newton_qd.qd.run.archive import Archive
 from newton_qd.qd.run.folder import COLUMNS
 from newton_qd.qd.run.opened import Run
 from newton_qd.qd.run.reevaluation import Reevaluated
+from newton_qd.qd.run.search import start_key
 from newton_qd.viewing import Trajectory, record, write_explorer, write_replay
 from newton_qd.viewing.elites import record_elites
 from newton_qd.viewing.explorer import (
@@ -317,6 +318,22 @@ def test_a_loss_is_positive_if_the_archive_is_better(
     run = opened("grid", 2, (5, 4))
     found = _metrics(run, run.cells, pushed(run, len(run.cells)), 2, 0)
     assert np.array_equal(found["loss from other starts"], found["fitness"])
+
+
+def test_other_starts_are_not_the_start_of_the_run(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    seen = []
+
+    def evaluate(run: Run, cells: Any, keys: Any) -> Any:
+        seen.append(keys)
+        return SimpleNamespace(fitnesses=np.zeros((len(cells), len(keys))))
+
+    monkeypatch.setattr(Run, "evaluate", evaluate)
+    run = opened("grid", 2, (5, 4))
+    _metrics(run, run.cells, pushed(run, len(run.cells)), 3, seed=0)
+    assert [keys.shape for keys in seen] == [(3,)]
+    assert not np.any(seen[0] == start_key(0))
 
 
 def test_distances_are_up_to_the_end() -> None:

@@ -122,9 +122,9 @@ def evaluate(arguments: argparse.Namespace, task_factory: TaskFactory = None) ->
     cells = [elite.cell for elite in elites]
     whole = arguments.cell is arguments.best is arguments.near is None
     if arguments.starts:
-        import jax
+        from newton_qd.qd.run.search import other_start_keys
 
-        keys = jax.random.split(jax.random.key(seed), arguments.starts)
+        keys = other_start_keys(seed, arguments.starts)
         _print_starts(run, elites, run.evaluate(cells, keys), whole)
         return OK
     return _print_repeated(run, elites, run.evaluate(cells), whole)

@@ -277,9 +277,9 @@ def _metrics(
 
     found = {"fitness": run.archive.fitnesses[filled]}
     if starts:
-        import jax
+        from newton_qd.qd.run.search import other_start_keys
 
-        keys = jax.random.split(jax.random.key(seed), starts)
+        keys = other_start_keys(seed, starts)
         again = np.median(run.evaluate(filled, keys).fitnesses, axis=1)
         found[f"median fitness from {starts} other starts"] = again
         found["loss from other starts"] = found["fitness"] - again

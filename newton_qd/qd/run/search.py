@@ -44,6 +44,8 @@ from newton_qd.types import (
     ScoringFunction,
 )
 
+_KEYS = 4  # keys that follow from the seed of a run
+
 
 class SearchError(RuntimeError):
     """The search cannot continue."""
@@ -364,9 +366,20 @@ def start_key(seed: int) -> jax.Array:
     return _keys(seed)[1]
 
 
+def other_start_keys(seed: int, count: int) -> jax.Array:
+    """Returns (count,) keys of resets that no run has trained with.
+
+    Args:
+        seed: The seed, which may be that of the run.
+        count: Number of keys.
+    """
+    # without the fold, the second key would be that of the resets of a run
+    return jax.random.split(jax.random.fold_in(jax.random.key(seed), _KEYS), count)
+
+
 def _keys(seed: int) -> jax.Array:
     """Returns keys of centroids, start state, initial population and generations."""
-    return jax.random.split(jax.random.key(seed), 4)
+    return jax.random.split(jax.random.key(seed), _KEYS)
 
 
 def _runnable(config: EvolveConfig) -> AlgorithmSpec[Any]:
