@@ -153,6 +153,20 @@ answer = [shapes_of(name) for name in ("ant_uni", "pointmaze")]
 
 
 @pytest.mark.slow
+def test_what_makes_genotypes_is_not_split(devices: Devices) -> None:
+    """Its rounding errors would depend on the number of devices."""
+    code = """
+import re
+mesh = device_mesh(3)
+score = shard_scoring(lambda x, key: (x.sum(axis=1), x, {}), mesh)
+everywhere = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec())
+x = jax.device_put(np.ones((12, 8), np.float32), everywhere)
+made = jax.jit(lambda x: score(x @ x.T, jax.random.key(0))[0]).lower(x).compile()
+answer = re.findall(r"f32\\[(\\d+),12\\]\\S* dot\\(", made.as_text())
+"""
+    assert devices.answer(code) == ["12"]
+
+
 def test_no_device_steps_more_worlds_than_its_share(devices: Devices) -> None:
     # of a robot that no other test here steps, because a plan counts from its start
     code = """

@@ -110,7 +110,8 @@ def evolve(
             longer where a checkpoint takes long; 0: one after each generation;
             infinite: one at the end. It does not change the result.
         devices: Number of devices that share each evaluation. It does not change the
-            result. ``None``: only the default device.
+            result, except that of ``cma-maega-actor-critic``, whose actors have other
+            rounding errors on several devices. ``None``: only the default device.
         device: Device of the whole run, such as ``"cpu"``, ``"gpu"`` or ``"gpu:1"``;
             ``None``: JAX's default device.
         task_factory: Makes the task; by default from registered environments.

@@ -96,8 +96,11 @@ def shard_scoring(score: ScoringFunction, mesh: Mesh) -> ScoringFunction:
             last = jnp.broadcast_to(leaf[-1:], (missing, *leaf.shape[1:]))
             return jnp.concatenate([leaf, last])
 
-        results = sharded(jax.tree.map(fill, genotypes), key)
         everywhere = NamedSharding(mesh, whole)
+        # without this, XLA would also split what computes the genotypes, which then has
+        # other rounding errors
+        genotypes = jax.lax.with_sharding_constraint(genotypes, everywhere)
+        results = sharded(jax.tree.map(fill, genotypes), key)
         return jax.tree.map(
             lambda leaf: jax.lax.with_sharding_constraint(leaf, everywhere)[:count],
             results,
