@@ -57,6 +57,25 @@ def test_options_are_checked_also_where_python_evaluates_annotations() -> None:
     kind(HOPPER, cost=None)
 
 
+def test_options_are_those_of_a_constructor() -> None:
+    with pytest.raises(TypeError, match=r"^init: got <class .*; allowed: an __init__"):
+        nq.checked_options(Plain)  # type: ignore[type-var]
+
+
+def test_attributes_are_set_before_the_methods_are_called() -> None:
+    class Late(Plain):
+        def __init__(self, robot: Any) -> None:
+            super().__init__(robot)
+            self._weight = 2.0
+
+        def outcome(self, before: Any, after: Any, action: Any) -> Any:
+            return self._weight * after.v[0], False, {}
+
+    with pytest.raises(AttributeError, match="no attribute '_weight'") as caught:
+        Late(HOPPER)
+    assert "before super().__init__(...)" in caught.value.__notes__[-1]
+
+
 @pytest.mark.parametrize(
     ("value", "error"), [(-1.0, ValueError), (np.nan, ValueError), ("a", TypeError)]
 )

@@ -113,7 +113,15 @@ class PhysicsEnv(WithChanges):
         action = jax.ShapeDtypeStruct((self.action_size,), self._dtype)
         self._layout: tuple[tuple[str, int], ...] = ()
         self._metrics: tuple[str, ...] = ()
-        jax.eval_shape(self._record_names, rest, action)
+        try:
+            jax.eval_shape(self._record_names, rest, action)
+        except AttributeError as error:
+            if error.obj is self:
+                error.add_note(
+                    "PhysicsEnv.__init__ calls observe and outcome: set the attributes "
+                    "that they read before super().__init__(...)"
+                )
+            raise
 
     def observe(self, state: PhysicsState, action: Action) -> dict[str, jax.Array]:
         """Returns the observation; by default all coordinates and velocities.

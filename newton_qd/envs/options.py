@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 from newton_qd import checks
+from newton_qd.checks import message
 from newton_qd.envs.shown import OPTIONS
 
 Constructor = TypeVar("Constructor", bound=Callable[..., None])
@@ -23,7 +24,13 @@ def checked_options(init: Constructor) -> Constructor:
 
     Args:
         init: An ``__init__`` whose options are keyword-only.
+
+    Raises:
+        TypeError: It decorates a class.
     """
+    if inspect.isclass(init):
+        allowed = "an __init__; write the decorator above it, inside of the class"
+        raise TypeError(message("init", init, allowed))
     parameters = inspect.signature(init).parameters
     kinds = {name: _kind(each.annotation) for name, each in parameters.items()}
 
