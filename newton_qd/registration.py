@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import inspect
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 from newton_qd import checks, tasks
 from newton_qd.checks import listed, message, shown
@@ -84,6 +84,25 @@ def descriptor_specs(
         descriptor = WrapperSpec(descriptor)
     _check_wrapper("descriptor", descriptor)
     return (descriptor,)
+
+
+def check_extractor_arguments(extractor: object) -> None:
+    """Checks that a descriptor extractor is a function of transitions and a mask.
+
+    Raises:
+        TypeError: It cannot be called, or does not take two arguments.
+    """
+    name = "descriptor_extractor"
+    allowed = "a function of (data, mask); in a class, staticmethod(function)"
+    checks.function(name, extractor, allowed, optional=True)
+    if extractor is None:
+        return
+    try:
+        inspect.signature(cast(Callable[..., object], extractor)).bind(None, None)
+    except TypeError as error:
+        raise TypeError(message(name, extractor, allowed, why=str(error))) from None
+    except ValueError:  # Python cannot read the arguments of some compiled functions
+        return
 
 
 def _refuse_robot(name: str, wrapper: object) -> None:

@@ -22,6 +22,7 @@ from newton_qd.moved import moved_name
 from newton_qd.registration import (
     ENVIRONMENT,
     check_class,
+    check_extractor_arguments,
     check_made,
     check_names,
     check_wrappers,
@@ -110,10 +111,6 @@ def register(
     check_names(env_name, base_name, replace)
     checks.function("base", base, "a class or a function")
     check_class(base)
-    allowed = "a function of (data, mask)"
-    checks.function(
-        "descriptor_extractor", descriptor_extractor, allowed, optional=True
-    )
     checks.instance("robot", robot, RobotSpec, ROBOT, optional=True)
     checks.number("reward_offset", reward_offset, optional=True)
     check_wrappers(wrappers)
@@ -122,6 +119,7 @@ def register(
         descriptor_extractor = getattr(
             described[0].wrapper, "descriptor_extractor", None
         )
+    check_extractor_arguments(descriptor_extractor)
     if robot is not None and takes_robot(base):
         options = {"robot": robot, **options}
     if options:

@@ -69,6 +69,13 @@ def test_tables_of_links_and_metrics_are_views(rows: None) -> None:
     assert not any("footless" in table for table in tables)
 
 
+EXTRACTOR = "descriptor_extractor"
+
+
+def of_method(self: Any, data: Any, mask: Any) -> Any:
+    """A function that was not meant to get ``self``."""
+
+
 def test_register(rows: None) -> None:
     newton_qd.register(
         "my_ant",
@@ -107,6 +114,16 @@ def test_register(rows: None) -> None:
             {"descriptor_extractor": 3},
             TypeError,
             r"descriptor_extractor: got 3; allowed",
+        ),
+        (
+            {"descriptor": type("A", (FeetContactWrapper,), {EXTRACTOR: "mean"})},
+            TypeError,
+            r"descriptor_extractor: got 'mean'; allowed: None, or a function of",
+        ),
+        (
+            {"descriptor": type("B", (FeetContactWrapper,), {EXTRACTOR: of_method})},
+            TypeError,
+            r"descriptor_extractor: got .*'mask'; allowed: .* staticmethod\(function\)",
         ),
         (
             {"wrappers": None},
