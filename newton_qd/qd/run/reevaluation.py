@@ -166,7 +166,7 @@ def _filled(archive: Elites) -> np.ndarray:
     if not all(
         hasattr(archive, name) for name in ("genotypes", "fitnesses", "centroids")
     ):
-        allowed = "an Archive, or a repertoire of QDax; from_ribs makes one"
+        allowed = "an Archive, or a repertoire of QDax with centroids"
         raise TypeError(message("archive", archive, allowed))
     fitnesses = np.asarray(archive.fitnesses)
     if fitnesses.size != len(fitnesses):
