@@ -71,8 +71,8 @@ class Longer(Other):
 @pytest.mark.parametrize(
     ("env", "width", "shown"),
     [
-        (Other(), 2.0, r"cells go from \[0.25 0.25\] to .* go from \[0.125 0.125\] to"),
-        (Longer(), 1.0, "policy has 30 weights; .* policy has 26"),
+        (Other(), 2.0, r"centres of cells from \[0.125 0.125\] to .* to \[2. 2.\]"),
+        (Longer(), 1.0, "genotypes of 26 numbers; allowed: 30, the weights"),
     ],
 )
 def test_a_run_goes_on_in_its_environment(
@@ -83,7 +83,7 @@ def test_a_run_goes_on_in_its_environment(
     task = dataclasses.replace(point_task(SMALL, env), limits=limits)
     before = snapshot(out)
     more, options = SMALL.replace(iterations=14), {"out": out, "resume": True}
-    with pytest.raises(ConfigError, match=f"^env_name: got 'point', whose {shown}"):
+    with pytest.raises(ConfigError, match=f"^checkpoint: got {shown}"):
         evolve(more, task_factory=lambda _: task, progress=False, **options)
     assert snapshot(out) == before
 

@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from point_runs import SMALL, point_task
+from point_runs import SMALL, point_task, run
 
-from newton_qd.qd import ConfigError, EvolveConfig, Task, evolve, make_task
+from newton_qd.qd import (
+    ConfigError,
+    EvolveConfig,
+    Task,
+    evolve,
+    load_run,
+    make_task,
+)
 
 CONFIG = EvolveConfig(
     env_name="pointmaze",
@@ -69,3 +77,29 @@ def test_limits_of_one_length() -> None:
     limits = np.zeros(2, np.float32), np.ones(3, np.float32)
     with pytest.raises(ConfigError, match="labels: got 2 names"):
         dataclasses.replace(point_task(SMALL), limits=limits)
+
+
+@pytest.mark.parametrize("cells", [{"grid": (4, 4)}, {"centroids": 8}])
+def test_an_archive_belongs_to_one_descriptor(cells: Any, tmp_path: Path) -> None:
+    small = SMALL.replace(**{"grid": None, **cells})
+
+    def narrow(config: EvolveConfig) -> Task:
+        limits = np.zeros(2, np.float32), np.full(2, 0.5, np.float32)
+        return dataclasses.replace(point_task(config), limits=limits)
+
+    def longer(config: EvolveConfig) -> Task:
+        limits = np.zeros(3, np.float32), np.ones(3, np.float32)
+        return dataclasses.replace(
+            narrow(config), limits=limits, labels=("a", "b", "c")
+        )
+
+    run(small.replace(iterations=1), out=tmp_path)
+    before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
+    for task_factory in (narrow, longer) if small.grid is None else (narrow,):
+        with pytest.raises(ConfigError, match=r"got centres of cells from \[0\."):
+            load_run(tmp_path, task_factory=task_factory)
+        again = {"out": tmp_path, "resume": True, "progress": False}
+        with pytest.raises(ConfigError, match=r"^checkpoint: got centres of cells"):
+            evolve(small.replace(iterations=2), task_factory=task_factory, **again)
+    assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
+    assert load_run(tmp_path, task_factory=point_task).iteration == 1

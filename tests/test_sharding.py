@@ -167,6 +167,7 @@ answer = re.findall(r"f32\\[(\\d+),12\\]\\S* dot\\(", made.as_text())
     assert devices.answer(code) == ["12"]
 
 
+@pytest.mark.slow
 def test_no_device_steps_more_worlds_than_its_share(devices: Devices) -> None:
     # of a robot that no other test here steps, because a plan counts from its start
     code = """

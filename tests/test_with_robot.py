@@ -133,7 +133,7 @@ def test_robots_that_do_not_fit_are_refused(hurt: RobotSpec, tmp_path: Path) -> 
     with pytest.raises(ValueError, match=words):
         newton_qd.create("ant_uni", robot=turned)
     lame = dataclasses.replace(hurt, feet=hurt.feet[:2])
-    words = "robot: got hurt, whose feet are .*; allowed: .* the feet of this task: "
+    words = "whose torso and feet are .*; allowed: .* the torso and feet of this task: "
     with pytest.raises(ValueError, match=words):
         newton_qd.create("ant_uni", robot=lame)
     text = find_urdf(REACHER.urdf).read_text(encoding="utf-8")
@@ -169,6 +169,7 @@ def test_robots_with_other_observations_are_refused(tmp_path: Path) -> None:
     words = "robot: got aimless, whose fixed links are mount, aim; allowed: .* goal"
     with pytest.raises(ValueError, match=words):
         newton_qd.create("pusher", robot=aimless)
-    footless = dataclasses.replace(ANT, feet=())
-    with pytest.raises(ValueError, match="whose feet are none; allowed"):
-        newton_qd.create("ant", robot=footless)
+    for change in ({"feet": ()}, {"torso": ANT.feet[0]}):
+        other = dataclasses.replace(ANT, **change)
+        with pytest.raises(ValueError, match=r"whose torso and feet are .*; allowed"):
+            newton_qd.create("ant", robot=other)

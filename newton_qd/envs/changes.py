@@ -54,16 +54,16 @@ class WithChanges(Env):
         """Returns the same task for another robot, such as a damaged one.
 
         Args:
-            robot: Spec of a robot with the same joints, links, feet and actuators, in
-                the same order. Lengths, masses, limits, gears and contacts may differ.
-                The tips that ``Reacher`` and ``InvertedDoublePendulum`` read stay where
-                they are on the links of their own robots, and ``Swimmer`` keeps the
-                drag of its own links.
+            robot: Spec of a robot with the same joints, links, torso, feet and
+                actuators, in the same order. Lengths, masses, limits, gears and
+                contacts may differ. The tips that ``Reacher`` and
+                ``InvertedDoublePendulum`` read stay where they are on the links of
+                their own robots, and ``Swimmer`` keeps the drag of its own links.
 
         Raises:
             TypeError: ``robot`` is not a ``RobotSpec``.
-            ValueError: Its joints, links, feet or actuators differ, its observations
-                have another length, or it cannot be built.
+            ValueError: Its joints, links, torso, feet or actuators differ, its
+                observations have another length, or it cannot be built.
             FileNotFoundError: Its URDF file is missing.
         """
         checks.instance("robot", robot, RobotSpec, ROBOT)
@@ -117,13 +117,13 @@ def _require_fit(system: System, task: System) -> None:
     """Checks that a task may read the state of a robot by places and names.
 
     Raises:
-        ValueError: The joints, the links, the feet or the actuators differ.
+        ValueError: The joints, the links, the torso, the feet or the actuators differ.
     """
     for name, new, own in (
         ("joints", _joints(system), _joints(task)),
         ("links", list(system.body_names), list(task.body_names)),
         ("fixed links", list(system.scene_links), list(task.scene_links)),
-        ("feet", list(system.robot.feet), list(task.robot.feet)),
+        ("torso and feet", _watched(system), _watched(task)),
         ("actuators", _actuators(system), _actuators(task)),
     ):
         if new != own:
@@ -139,6 +139,10 @@ def _joints(system: System) -> list[str]:
     return [
         f"{name or 'root'} ({JointKind(kind).name.lower()})" for name, kind in kinds
     ]
+
+
+def _watched(system: System) -> list[str]:
+    return [system.robot.torso, *system.robot.feet]
 
 
 def _actuators(system: System) -> list[str]:

@@ -154,8 +154,9 @@ class Env(abc.ABC):
         """Returns the same wrappers around the same task for another robot.
 
         Args:
-            robot: Spec of a robot with the same joints, links, feet and actuators, in
-                the same order. This environment and its wrappers do not change.
+            robot: Spec of a robot with the same joints, links, torso, feet and
+                actuators, in the same order. This environment and its wrappers do not
+                change.
 
         Raises:
             NotImplementedError: The environment inside is not a simulated robot.

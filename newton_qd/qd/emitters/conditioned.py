@@ -57,7 +57,7 @@ class ConditionedActorEmitter(Emitter):
     The actor learns over short windows through the physics (Xu et al. 2022). Its worlds
     aim at cells of the archive, filled ones and empty ones near them. It increases
 
-    .. math:: (1 - \lambda_d) \sum_t r_t - \lambda_d T |m - d|
+    .. math:: T \left((1 - \lambda_d) \sum_t r_t / u - \lambda_d |m - d|\right)
 
     for a target d and the descriptor m of the episode. The multiplier
     :math:`\lambda_d` of a cell rises while policies for this cell miss it by more than

@@ -8,7 +8,6 @@ import numpy as np
 
 from newton_qd.checks import Fact, message
 from newton_qd.qd.config import ConfigError, EvolveConfig
-from newton_qd.qd.run.checkpoint import Checkpoint
 
 _CVT_SAMPLES_PER_CELL = 50
 _CVT_MIN_SAMPLES = 10_000
@@ -40,41 +39,6 @@ def cell_centroids(
             config.grid, low.tolist(), high.tolist()
         )
     return jnp.asarray(centroids, jnp.float32)
-
-
-def require_same_task(
-    config: EvolveConfig, stored: Checkpoint, centroids: jax.Array, size: int
-) -> None:
-    """Checks that an environment is that of a run to resume, as far as files show it.
-
-    A module may register another environment of the same name.
-
-    Args:
-        config: Settings of the run.
-        stored: Its checkpoint.
-        centroids: (cells, D) centres of the cells for this environment.
-        size: Weights of a policy for this environment.
-
-    Raises:
-        ConfigError: Policies have other sizes, or descriptors have other limits.
-    """
-    name = f"{config.env_name!r}, whose"
-    again = "the environment of the run to resume, whose"
-    if stored.genotypes.shape[1] != size:
-        given = Fact(f"{name} policy has {size:,} weights")
-        allowed = f"{again} policy has {stored.genotypes.shape[1]:,}"
-        raise ConfigError(message("env_name", given, allowed))
-    old, new = (
-        np.stack([cells.min(axis=0), cells.max(axis=0)])
-        for cells in (stored.centroids, np.asarray(centroids))
-    )
-    # Another machine may find another tessellation: about a cell's width is allowed.
-    width = 0.0 if config.grid else len(centroids) ** (-1 / centroids.shape[1])
-    error = 1e-4 * abs(new).max() + width * (new[1] - new[0])
-    if old.shape != new.shape or (abs(old - new) > error).any():
-        shown = [f"cells go from {low} to {high}" for low, high in (old, new)]
-        given, allowed = Fact(f"{name} {shown[1]}"), f"{again} {shown[0]}"
-        raise ConfigError(message("env_name", given, allowed))
 
 
 def _voronoi_centroids(

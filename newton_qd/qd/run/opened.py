@@ -18,12 +18,13 @@ from newton_qd.checks import Fact, message
 from newton_qd.envs.inputs import require_key
 from newton_qd.errors import require_extra
 from newton_qd.qd.algorithms import ALGORITHMS, algorithm_named
-from newton_qd.qd.config import ConfigError, EvolveConfig, read_config
+from newton_qd.qd.config import EvolveConfig, read_config
 from newton_qd.qd.run.archive import Archive, repertoire_of
 from newton_qd.qd.run.folder import CONFIG, REEVALUATED
 from newton_qd.qd.run.plot_grid import grid_indices
 from newton_qd.qd.run.reevaluation import Reevaluated
 from newton_qd.qd.run.results import read_reevaluated, read_results
+from newton_qd.qd.run.same_task import require_same_task
 from newton_qd.qd.run.search import start_key
 from newton_qd.qd.scoring.networks import policy_for
 from newton_qd.qd.scoring.robust import robust, run_scoring
@@ -372,11 +373,7 @@ def load_run(
     task = randomized(config, task_factory(config))
     config = config.resolve(task.descriptor_length)
     policy = policy_for(task, config.hidden)
-    if archive.genotypes.shape[1] != policy.size:
-        given = Fact(f"genotypes of {archive.genotypes.shape[1]} numbers")
-        allowed = f"{policy.size}, the weights of a policy of {config.env_name!r} with "
-        allowed += f"hidden layers {config.hidden}"
-        raise ConfigError(message(str(path), given, allowed))
+    require_same_task(str(path), archive, config, task.limits, policy.size)
     return Run(
         path=path,
         config=config,

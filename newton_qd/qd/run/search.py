@@ -19,7 +19,7 @@ from newton_qd.qd.algorithms import AlgorithmSpec, algorithm_named
 from newton_qd.qd.algorithms.options import refused_options
 from newton_qd.qd.config import ConfigError, EvolveConfig, settings_text
 from newton_qd.qd.run.archive import Archive, repertoire_of
-from newton_qd.qd.run.cells import cell_centroids, require_same_task
+from newton_qd.qd.run.cells import cell_centroids
 from newton_qd.qd.run.checkpoint import Checkpoint
 from newton_qd.qd.run.folder import COLUMNS, complete_metrics
 from newton_qd.qd.run.generation_parts import Drawn, GenerationParts
@@ -29,6 +29,7 @@ from newton_qd.qd.run.reevaluation import (
     corrected_fitnesses,
     reevaluate,
 )
+from newton_qd.qd.run.same_task import require_same_task
 from newton_qd.qd.scoring.checked import checked_scoring, why_empty
 from newton_qd.qd.scoring.networks import policy_for
 from newton_qd.qd.scoring.robust import robust, run_scoring
@@ -296,10 +297,10 @@ class Search:
 
         Raises:
             CheckpointError: Its arrays do not fit this version of the algorithm.
-            ConfigError: It is of another environment of the same name.
+            ConfigError: It is of another task.
         """
-        size = self._policy.size
-        require_same_task(self._config, checkpoint, self._centroids, size)
+        limits, size = self._task.limits, self._policy.size
+        require_same_task("checkpoint", checkpoint, self._config, limits, size)
         return SearchState(
             checkpoint.iteration,
             repertoire_of(checkpoint),
