@@ -35,12 +35,8 @@ ScoringFunction: TypeAlias = Callable[
 """QDax's contract: maps N genotypes and a key to fitnesses (N,), descriptors (N, D)."""
 
 
-class Policy(Protocol):
-    """Chooses an action."""
-
-    def __call__(self, parameters: PyTree, obs: Observation, /) -> Action:
-        """Maps parameters and an observation (no,) to an action (nu,)."""
-        ...
+PolicyFunction: TypeAlias = Callable[[PyTree, Observation], Action]
+"""Maps parameters and an observation (no,) to an action (nu,)."""
 
 
 class StateDescriptors(Protocol):

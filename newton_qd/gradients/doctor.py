@@ -26,7 +26,7 @@ from newton_qd.gradients.measurements import (
 )
 from newton_qd.gradients.mixed import Mixture, normal_noise
 from newton_qd.gradients.report import ContactRow, GradientReport, HorizonRow
-from newton_qd.types import Genotype, Policy, RNGKey
+from newton_qd.types import Genotype, PolicyFunction, RNGKey
 
 _ROUNDING = 100  # of a return, in units of its last digit
 _BREAK = 0.1  # relative error above which the derivative of a step is broken
@@ -35,7 +35,7 @@ _BREAK = 0.1  # relative error above which the derivative of a step is broken
 def diagnose_gradients(
     env: Env | str,
     *,
-    policy: Policy | None = None,
+    policy: PolicyFunction | None = None,
     genotypes: Genotype | None = None,
     horizons: Sequence[int] = (1, 2, 4, 8, 16, 32, 64),
     worlds: int = 8,

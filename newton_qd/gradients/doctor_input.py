@@ -14,7 +14,7 @@ from newton_qd.checks import Fact, message
 from newton_qd.envs.base import Env
 from newton_qd.errors import FaultError
 from newton_qd.registry import create
-from newton_qd.types import Genotype, Policy
+from newton_qd.types import Genotype, PolicyFunction
 
 
 def refuse_faults(faulty: np.ndarray) -> None:
@@ -56,7 +56,7 @@ def checked_horizons(horizons: Sequence[int] | np.ndarray) -> tuple[int, ...]:
 
 
 def checked_genotypes(
-    genotypes: Genotype | None, env: Env, policy: Policy | None, length: int
+    genotypes: Genotype | None, env: Env, policy: PolicyFunction | None, length: int
 ) -> Genotype:
     """Returns genotypes in the dtype of the environment; cuts plans to ``length``.
 

@@ -38,7 +38,7 @@ from newton_qd.types import (
     ExtraScores,
     Genotype,
     Params,
-    Policy,
+    PolicyFunction,
     PyTree,
     RNGKey,
     ScoringFunction,
@@ -113,7 +113,7 @@ class Episode:
     """
 
     env: Environment
-    policy: Policy | None = None
+    policy: PolicyFunction | None = None
     descriptor_extractor: DescriptorExtractor | None = None
     _: dataclasses.KW_ONLY
     episode_length: int

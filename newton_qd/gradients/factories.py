@@ -17,7 +17,7 @@ from newton_qd.types import (
     DescriptorExtractor,
     Environment,
     Genotype,
-    Policy,
+    PolicyFunction,
     PyTree,
     RNGKey,
 )
@@ -25,7 +25,7 @@ from newton_qd.types import (
 
 def make_episode(
     env: Environment,
-    policy: Policy | None,
+    policy: PolicyFunction | None,
     descriptor_extractor: DescriptorExtractor | None,
     *,
     episode_length: int,
@@ -64,7 +64,7 @@ def make_episode(
 
 def make_episode_gradient(
     env: Environment,
-    policy: Policy | None,
+    policy: PolicyFunction | None,
     descriptor_extractor: DescriptorExtractor | None,
     *,
     episode_length: int,
@@ -98,7 +98,7 @@ def make_episode_gradient(
 
 def make_directional_gradient(
     env: Environment,
-    policy: Policy | None,
+    policy: PolicyFunction | None,
     descriptor_extractor: DescriptorExtractor,
     *,
     episode_length: int,
@@ -131,7 +131,7 @@ def make_directional_gradient(
 
 def make_mixed_gradient(
     env: Environment,
-    policy: Policy | None,
+    policy: PolicyFunction | None,
     descriptor_extractor: DescriptorExtractor | None,
     *,
     episode_length: int,

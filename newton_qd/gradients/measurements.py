@@ -17,7 +17,7 @@ from newton_qd.gradients.flow import tree_norm
 from newton_qd.gradients.mixed import Mixture, mixture, normal_noise
 from newton_qd.gradients.outcome import Tally
 from newton_qd.physics.system import PhysicsState
-from newton_qd.types import Genotype, Policy, PyTree, RNGKey
+from newton_qd.types import Genotype, PolicyFunction, PyTree, RNGKey
 
 DISTANCES = (1e-4, 1e-6, 1e-8, 1e-10)
 """Steps of the central differences; the step that agrees best counts.
@@ -34,7 +34,7 @@ class Subject:
     """The rewards of an episode as a function of a genotype, to be differentiated."""
 
     env: Env
-    policy: Policy | None
+    policy: PolicyFunction | None
     steps: int
     key: jax.Array
 

@@ -18,7 +18,7 @@ from newton_qd.types import ExtraScores, Genotype, RNGKey, ScoringFunction
 
 def make_gradient_scoring_function(
     task: Task,
-    policy: Policy | types.Policy | None,
+    policy: Policy | types.PolicyFunction | None,
     episode_length: int,
     options: GradientOptions | None = None,
     *,
