@@ -54,6 +54,20 @@ def test_a_run_has_everything(found: Run, reference: Path) -> None:
     assert found.metrics["coverage"][-1] == np.float32(100 * archive.filled.mean())
 
 
+def test_a_run_is_shown_in_one_line(found: Run, reference: Path) -> None:
+    last = {name: values[-1] for name, values in found.metrics.items()}
+    words = (
+        f"me on point, {SMALL.iterations} generations, "
+        f"QD score {last['qd_score']:,.0f}, "
+        f"coverage {last['coverage']:.1f} %, best fitness {last['max_fitness']:,.1f}"
+    )
+    assert repr(found) == f"<Run {reference}: {words}>"
+    assert repr(run(SMALL)) == f"<EvolveResult: {words}>"
+    filled, cells = len(found.cells), len(found.archive.centroids)
+    shown = f"<Archive: {filled} of {cells} cells, {found.policy.size} weights each>"
+    assert repr(found.archive) == shown
+
+
 def test_elites_are_found(found: Run) -> None:
     archive = found.archive
     assert found.cells.tolist() == np.flatnonzero(archive.filled).tolist()

@@ -42,6 +42,10 @@ class Archive:
     descriptors: np.ndarray
     centroids: np.ndarray
 
+    def __repr__(self) -> str:
+        cells, size = self.genotypes.shape
+        return f"<Archive: {self.filled.sum()} of {cells} cells, {size:,} weights each>"
+
     @property
     def filled(self) -> np.ndarray:
         """(cells,) whether a cell holds an individual."""

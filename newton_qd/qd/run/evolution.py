@@ -28,7 +28,7 @@ from newton_qd.qd.run.folder import COLUMNS, EVENTS, RunFolder
 from newton_qd.qd.run.interrupt import StopFlag, graceful_stop
 from newton_qd.qd.run.loop import Saver, run_generations
 from newton_qd.qd.run.plot import archive_png
-from newton_qd.qd.run.progress import Progress
+from newton_qd.qd.run.progress import Progress, results_text
 from newton_qd.qd.run.reevaluation import Reevaluated
 from newton_qd.qd.run.search import Search, SearchState
 from newton_qd.qd.run.sizes import check_memory
@@ -65,6 +65,9 @@ class EvolveResult:
     out: Path | None
     seconds: float
     reevaluated: Reevaluated | None = None
+
+    def __repr__(self) -> str:
+        return f"<EvolveResult: {results_text(self.config, self.metrics)}>"
 
     @property
     def corrected(self) -> Reevaluated | None:

@@ -22,6 +22,7 @@ from newton_qd.qd.config import EvolveConfig, read_config
 from newton_qd.qd.run.archive import Archive, repertoire_of
 from newton_qd.qd.run.folder import CONFIG, REEVALUATED
 from newton_qd.qd.run.plot_grid import grid_indices
+from newton_qd.qd.run.progress import results_text
 from newton_qd.qd.run.reevaluation import Reevaluated
 from newton_qd.qd.run.results import read_reevaluated, read_results
 from newton_qd.qd.run.same_task import require_same_task
@@ -100,6 +101,9 @@ class Run:
     metrics: dict[str, np.ndarray]
     reevaluated: Reevaluated | None
     start_key: RNGKey
+
+    def __repr__(self) -> str:
+        return f"<Run {self.path}: {results_text(self.config, self.metrics)}>"
 
     @property
     def iteration(self) -> int:

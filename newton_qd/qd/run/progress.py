@@ -1,4 +1,7 @@
-"""Progress of an evolution: one redrawn line on a terminal, plain lines elsewhere."""
+"""Progress of an evolution: one redrawn line on a terminal, plain lines elsewhere.
+
+A finished run has one line as well.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,12 @@ import shutil
 import sys
 import textwrap
 import time
+from collections.abc import Mapping
 from typing import TextIO
+
+import numpy as np
+
+from newton_qd.qd.config import EvolveConfig
 
 _PLAIN_SECONDS = 10.0
 _REDRAW_SECONDS = 0.1
@@ -157,6 +165,24 @@ class Progress:
             self._stream.flush()
         except OSError:  # as in: newton-qd evolve ant_uni 2>&1 | head
             self._enabled = False
+
+
+def results_text(config: EvolveConfig, metrics: Mapping[str, np.ndarray]) -> str:
+    """Returns what a run is and what it has found, in one line.
+
+    Args:
+        config: Its settings.
+        metrics: Name of each column of ``metrics.csv`` to its values.
+    """
+    run = f"{config.algorithm} on {config.env_name}"
+    if not len(metrics["iteration"]):
+        return run
+    last = {name: values[-1] for name, values in metrics.items()}
+    return (
+        f"{run}, {last['iteration']:.0f} generations, "
+        f"QD score {last['qd_score']:,.0f}, coverage {last['coverage']:.1f} %, "
+        f"best fitness {last['max_fitness']:,.1f}"
+    )
 
 
 def _clock(seconds: float | None) -> str:
