@@ -267,6 +267,9 @@ def test_plot_writes_both_pictures(
     assert drawn == (reference / "archive.png").read_bytes()
     assert (out / "curves.png").read_bytes().startswith(b"\x89PNG")
     assert call("plot", reference, "--out", out / "archive.png") == cli.BAD_ARGUMENTS
+    shutil.copy(reference / "config.json", out)
+    assert call("plot", reference, "--out", out) == cli.BAD_ARGUMENTS
+    assert f"got {out}, the folder of another run" in capsys.readouterr().err
 
 
 def test_curves_have_all_values() -> None:

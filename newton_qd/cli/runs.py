@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from newton_qd import checks
-from newton_qd.checks import message
+from newton_qd.checks import Fact, message
 from newton_qd.cli import modules
 from newton_qd.cli.arguments import (
     BAD_ARGUMENTS,
@@ -27,6 +27,7 @@ from newton_qd.cli.arguments import (
 )
 from newton_qd.files import write_atomically
 from newton_qd.qd.config import ConfigError, EvolveConfig
+from newton_qd.qd.run.folder import RunFolder
 
 if TYPE_CHECKING:
     from newton_qd.qd.run.opened import Elite, Evaluation, Run
@@ -253,8 +254,13 @@ def _text(descriptor: Any) -> str:
 def plot(arguments: argparse.Namespace, task_factory: TaskFactory = None) -> int:
     """Writes the pictures of a run. Returns the exit code."""
     out = arguments.folder if arguments.out is None else arguments.out
+    another, allowed = RunFolder(out), "a folder, or a new name"
     if out.exists() and not out.is_dir():
-        refused = f"--out: got {out}, a file; allowed: a folder, or a new name"
+        refused = message("--out", Fact(str(out)), allowed, why="a file")
+        return complain(arguments, refused, BAD_ARGUMENTS)
+    if another.has_config and not out.samefile(arguments.folder):
+        why = "the folder of another run, which has a picture of its own"
+        refused = message("--out", Fact(str(out)), allowed, why=why)
         return complain(arguments, refused, BAD_ARGUMENTS)
     run = opened(arguments.folder, task_factory)
     out.mkdir(parents=True, exist_ok=True)
