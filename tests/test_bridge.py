@@ -220,6 +220,18 @@ def test_no_forward_mode(transform: Any) -> None:
         jax.jit(transform(lambda a: advance(a).sum()))(jnp.asarray(ACTIONS[0, 0]))
 
 
+def test_no_forward_mode_inside_of_a_gradient() -> None:
+    """As in the product of a Hessian and a vector."""
+    action = jnp.asarray(ACTIONS[0, 0])
+
+    def slope(a: jax.Array) -> jax.Array:
+        return jax.jvp(lambda x: advance(x).sum(), (a,), (a,))[1]
+
+    for again in (jax.grad(slope), jax.jit(jax.grad(slope))):
+        with pytest.raises(TypeError, match=r"first derivatives in reverse mode only"):
+            again(action)
+
+
 def test_no_second_derivative() -> None:
     def first(action: jax.Array) -> jax.Array:
         return jax.grad(lambda a: advance(a).sum())(action).sum()

@@ -82,4 +82,5 @@ _tangent.def_abstract_eval(lambda x: x)
 _tangent.def_impl(_refuse)
 mlir.register_lowering(_tangent, _refuse)
 batching.primitive_batchers[_tangent] = _refuse
+ad.primitive_jvps[_tangent] = _refuse
 ad.primitive_transposes[_tangent] = lambda cotangent, _: (cotangent,)
