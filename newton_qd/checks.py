@@ -358,7 +358,10 @@ def array(
     instance(
         name, value, (*kinds, np.generic, int, float) if scalars else kinds, allowed
     )
-    found: Any = jnp.asarray(value)
+    try:
+        found: Any = jnp.asarray(value)
+    except TypeError:  # a dtype that only NumPy has, such as object
+        raise TypeError(message(name, value, allowed)) from None
     kind = jnp.number if scalars else jnp.floating
     weak = found.weak_type and jnp.issubdtype(found.dtype, kind)
     if found.dtype != dtype and not weak:

@@ -104,6 +104,8 @@ REFUSED: list[Case] = [
     (SHAPE, np.ones(2, np.int32), TypeError, ARRAY),
     (SHAPE, np.ones(2, np.float16), TypeError, ARRAY),
     (SHAPE, np.ones(2, bool), TypeError, ARRAY),
+    (SHAPE, np.array([1.0, None]), TypeError, ARRAY),
+    (SHAPE, np.array(["1", "2"]), TypeError, ARRAY),
     (SHAPE, jnp.full((2,), 1), TypeError, ARRAY),
     (SHAPE, np.ones(3, np.float32), ValueError, ARRAY),
     (SHAPE, np.ones((2, 2), np.float32), ValueError, f"{ARRAY} (for a batch, use jax"),
