@@ -291,6 +291,23 @@ def test_forward_mode_and_batches_are_errors(torch: Any, door: Any, maze: Any) -
         jacobian(loss, actions, vectorize=True)
 
 
+def test_a_step_inside_of_a_compiled_function(torch: Any, door: Any, maze: Any) -> None:
+    """With what docs/pytorch.md says; the slopes are those without a compiler."""
+    reset, step = door.make_torch_step(maze)
+    first = reset(0)
+
+    def slopes(step: Any, around: Any) -> Any:
+        actions = torch.full((WORLDS, 2), 0.3, requires_grad=True)
+        around(lambda a: step(first, torch.tanh(a)).reward.sum())(actions).backward()
+        return actions.grad
+
+    found = slopes(
+        torch.compiler.disable(step), lambda f: torch.compile(f, backend="eager")
+    )
+    assert torch.equal(found, slopes(step, lambda f: f))
+    assert found.any()
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("torch")
 def test_the_example_runs(
