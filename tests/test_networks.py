@@ -121,3 +121,23 @@ def test_errors() -> None:
         policy_of(env, 3)
     with pytest.raises(ValueError, match=r"network: got actions of shape \(3,\)"):
         policy_of(env, lambda key: jax.tree_util.Partial(jnp.dot, jnp.ones((3, 2))))
+    with pytest.raises(TypeError, match=r"network: the module for a key: got None"):
+        policy_of(env, lambda key: None)
+
+
+@pytest.mark.parametrize("name", ["nnx", "equinox"])
+def test_a_module_that_is_made_already_is_refused(name: str) -> None:
+    module = NETWORKS[name]()(jax.random.key(0))
+    env: Any = newton_qd.create("pointmaze")
+    with pytest.raises(
+        TypeError, match=r"network: got .*; allowed: .*function of a key"
+    ):
+        policy_of(env, module)
+
+
+def test_a_function_of_a_key_may_have_arrays() -> None:
+    env: Any = newton_qd.create("pointmaze")
+    network = jax.tree_util.Partial(
+        lambda weights, key: jax.tree_util.Partial(jnp.dot, weights), jnp.ones((2, 2))
+    )
+    assert policy_of(env, network).size == 4

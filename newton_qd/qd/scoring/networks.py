@@ -17,6 +17,9 @@ from newton_qd.qd.scoring.rollout import Policy, flattened, make_policy
 from newton_qd.qd.scoring.task import Task
 from newton_qd.types import Environment, Observation, PyTree, RNGKey
 
+_ALLOWED = "a module of Flax linen, or a function of a key that makes a module"
+_MODULE = "a module that maps an observation to an action"
+
 
 def policy_of(env: Environment, network: Any) -> Policy:
     """Makes a policy with one vector of weights from a network.
@@ -29,7 +32,8 @@ def policy_of(env: Environment, network: Any) -> Policy:
             that of the module of ``jax.random.key(0)``.
 
     Raises:
-        TypeError: ``env`` is not an environment, or ``network`` is neither.
+        TypeError: ``env`` is not an environment, or ``network`` is neither, such as a
+            module of Flax nnx or Equinox that is made already.
         ValueError: Actions of the network have the wrong shape.
     """
     checks.environment(env, needs="observation_size")
@@ -43,11 +47,13 @@ def policy_of(env: Environment, network: Any) -> Policy:
             return lambda tree: lambda obs: module.apply(tree, obs), weights
 
     else:
-        allowed = "a module of Flax linen, or a function of a key that makes a module"
-        checks.function("network", network, allowed)
+        if not callable(network) or _is_module(network):
+            raise TypeError(message("network", network, _ALLOWED))
 
         def parts(key: RNGKey) -> tuple[Callable[[PyTree], Any], PyTree]:
-            return _split(network(key))
+            model = network(key)
+            checks.function("network: the module for a key", model, _MODULE)
+            return _split(model)
 
     rebuild, tree = parts(jax.random.key(0))
     leaves, structure = jax.tree.flatten(tree)
@@ -101,6 +107,15 @@ def policy_for(task: Task, hidden: tuple[int, ...]) -> Policy:
 def _is_weight(leaf: object) -> bool:
     """Returns whether a leaf is an array of floating-point numbers."""
     return checks.is_array(leaf) and jnp.issubdtype(jnp.result_type(leaf), jnp.floating)
+
+
+def _is_module(network: Any) -> bool:
+    """Returns whether a network is a module of Flax nnx or Equinox, not its maker."""
+    nnx: Any = sys.modules.get("flax.nnx")
+    if nnx is not None and isinstance(network, nnx.Module):
+        return True
+    function = isinstance(network, (type, jax.tree_util.Partial))
+    return not function and any(map(_is_weight, jax.tree.leaves(network)))
 
 
 def _split(model: Any) -> tuple[Callable[[PyTree], Any], PyTree]:
