@@ -15,6 +15,7 @@ import pytest
 import newton_qd
 from newton_qd.gradients import Episode
 from newton_qd.qd import (
+    ConfigError,
     EvolveConfig,
     evolve,
     load_run,
@@ -141,3 +142,13 @@ def test_a_function_of_a_key_may_have_arrays() -> None:
         lambda weights, key: jax.tree_util.Partial(jnp.dot, weights), jnp.ones((2, 2))
     )
     assert policy_of(env, network).size == 4
+
+
+@pytest.mark.parametrize("algorithm", ["pga-me", "dcrl-me"])
+def test_a_critic_needs_linen(algorithm: str) -> None:
+    task = dataclasses.replace(make_task(CONFIG), network=nnx())
+    config = dataclasses.replace(CONFIG, algorithm=algorithm)
+    with pytest.raises(
+        ConfigError, match=f"algorithm: got '{algorithm}', which .*linen"
+    ):
+        evolve(config, progress=False, task_factory=lambda config: task)

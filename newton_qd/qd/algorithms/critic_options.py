@@ -7,6 +7,7 @@ import dataclasses
 from newton_qd.checks import message
 from newton_qd.qd.algorithms.options import Options
 from newton_qd.qd.config import ConfigError, EvolveConfig
+from newton_qd.qd.scoring.rollout import Policy
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -55,6 +56,18 @@ def require_buffer(config: EvolveConfig, size: int) -> None:
     if size < steps:
         allowed = f"integers from {steps} (batch_size * starts * episode_length)"
         raise ConfigError(message("options: replay_buffer_size", size, allowed))
+
+
+def require_linen(config: EvolveConfig, policy: Policy) -> None:
+    """Checks that the policy is a module of Flax linen, as QDax's emitters need.
+
+    Raises:
+        ConfigError: It is another network.
+    """
+    if policy.network is None:
+        why = "which trains a module of Flax linen"
+        allowed = "a task whose network is None or such a module, or another algorithm"
+        raise ConfigError(message("algorithm", config.algorithm, allowed, why=why))
 
 
 def require_batch_size(config: EvolveConfig, name: str, value: int | None) -> None:

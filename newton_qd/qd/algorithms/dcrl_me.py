@@ -6,7 +6,11 @@ import dataclasses
 from typing import TYPE_CHECKING, Any
 
 from newton_qd.checks import listed, message
-from newton_qd.qd.algorithms.critic_options import CriticOptions, require_buffer
+from newton_qd.qd.algorithms.critic_options import (
+    CriticOptions,
+    require_buffer,
+    require_linen,
+)
 from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext
 from newton_qd.qd.algorithms.variation import isoline, with_own_isoline
 from newton_qd.qd.config import ConfigError, EvolveConfig
@@ -63,8 +67,9 @@ def _make(context: EmitterContext, options: DCRLMEOptions) -> Any:
     """DCRL-ME: critic and actor depend on the descriptor (Faldor et al. 2024).
 
     Raises:
-        ConfigError: The options do not fit the size of a generation, or the descriptor
-            has another length than the state descriptor.
+        ConfigError: The options do not fit the size of a generation, the descriptor has
+            another length than the state descriptor, or the network is no module of
+            Flax linen.
     """
     import jax
     import jax.numpy as jnp
@@ -81,6 +86,7 @@ def _make(context: EmitterContext, options: DCRLMEOptions) -> Any:
 
     config, task = context.config, context.task
     task.require_length()
+    require_linen(config, context.policy)
     require_buffer(config, options.replay_buffer_size)
     actor = MLPDC(
         layer_sizes=(*config.hidden, task.env.action_size),

@@ -10,6 +10,7 @@ from newton_qd.qd.algorithms.critic_options import (
     CriticOptions,
     require_batch_size,
     require_buffer,
+    require_linen,
 )
 from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext
 from newton_qd.qd.algorithms.variation import isoline, with_own_isoline
@@ -35,7 +36,8 @@ def _make(context: EmitterContext, options: PGAMEOptions) -> Any:
     """PGA-ME: half of the variations follow a critic (Nilsson and Cully 2021).
 
     Raises:
-        ConfigError: The options do not fit the size of a generation.
+        ConfigError: The options do not fit the size of a generation, or the network is
+            no module of Flax linen.
     """
     from newton_qd import compat
 
@@ -46,6 +48,7 @@ def _make(context: EmitterContext, options: PGAMEOptions) -> Any:
     from newton_qd.qd.algorithms.network_emitter import OfParameters
 
     size = context.config.batch_size
+    require_linen(context.config, context.policy)
     require_batch_size(context.config, "env_batch_size", options.env_batch_size)
     require_buffer(context.config, options.replay_buffer_size)
     if not 0 < int(options.proportion_mutation_ga * size) < size:
