@@ -152,3 +152,11 @@ def test_a_critic_needs_linen(algorithm: str) -> None:
         ConfigError, match=f"algorithm: got '{algorithm}', which .*linen"
     ):
         evolve(config, progress=False, task_factory=lambda config: task)
+
+
+def test_a_task_factory_makes_a_task() -> None:
+    nothing: Any = lambda config: None  # noqa: E731
+    with pytest.raises(
+        ConfigError, match=r"task_factory: got .* returned None; allowed"
+    ):
+        evolve(CONFIG, progress=False, task_factory=nothing)

@@ -36,7 +36,7 @@ from newton_qd.qd.run.tensorboard import EventLog
 from newton_qd.qd.run.warm_start import StartFrom, digest_of, start_genotypes
 from newton_qd.qd.scoring.networks import policy_for
 from newton_qd.qd.scoring.sharding import device_mesh, device_named
-from newton_qd.qd.scoring.task import Task, make_task, randomized
+from newton_qd.qd.scoring.task import Task, made_task, make_task, randomized
 
 
 @dataclasses.dataclass(frozen=True)
@@ -147,7 +147,7 @@ def evolve(
     with ExitStack() as stack:
         stop = stack.enter_context(graceful_stop())
         stack.enter_context(jax.default_device(chosen))
-        task = task_factory(config)
+        task = made_task(task_factory, config)
         config = config.resolve(task.descriptor_length)
         check_memory(config, task, chosen)
         config, start = _started(config, start_from, task, folder)

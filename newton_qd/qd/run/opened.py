@@ -30,7 +30,7 @@ from newton_qd.qd.run.search import start_key
 from newton_qd.qd.scoring.networks import policy_for
 from newton_qd.qd.scoring.robust import robust, run_scoring
 from newton_qd.qd.scoring.rollout import Policy, episode_of
-from newton_qd.qd.scoring.task import Task, make_task, randomized
+from newton_qd.qd.scoring.task import Task, made_task, make_task, randomized
 from newton_qd.real_numbers import real_numbers
 from newton_qd.types import Repertoire, RNGKey, ScoringFunction
 
@@ -374,7 +374,7 @@ def load_run(
     config, facts = read_config(path / CONFIG)
     algorithm_named(config.algorithm)
     archive, metrics = read_results(path, config)
-    task = randomized(config, task_factory(config))
+    task = randomized(config, made_task(task_factory, config))
     config = config.resolve(task.descriptor_length)
     policy = policy_for(task, config.hidden)
     require_same_task(str(path), archive, config, task.limits, policy.size)

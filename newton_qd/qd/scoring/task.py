@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from newton_qd import checks, tasks
-from newton_qd.checks import Fact, listed, message
+from newton_qd.checks import Fact, listed, message, shown
 from newton_qd.envs.shown import component_names
 from newton_qd.extractors import Trajectories, get_final_xy_position, reads_last
 from newton_qd.qd.config import ConfigError, EvolveConfig
@@ -161,6 +161,22 @@ def make_task(config: EvolveConfig) -> Task:
         reward_offset=float(newton_qd.tables.reward_offset[name]),
         episode_length=config.episode_length,
     )
+
+
+def made_task(
+    task_factory: Callable[[EvolveConfig], Task], config: EvolveConfig
+) -> Task:
+    """Returns the task that a function makes for a configuration.
+
+    Raises:
+        ConfigError: It makes something else.
+    """
+    task = task_factory(config)
+    allowed = "a function of the settings that returns a Task"
+    if not isinstance(task, Task):
+        given = Fact(f"one that returned {shown(task)}")
+        raise ConfigError(message("task_factory", given, allowed))
+    return task
 
 
 def randomized(config: EvolveConfig, task: Task) -> Task:
