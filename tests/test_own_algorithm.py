@@ -114,6 +114,11 @@ def test_scores_that_are_never_finite(task: Task) -> None:
             TypeError,
             r"Changed.emit: got .*; allowed: genotypes and a dictionary",
         ),
+        (
+            lambda genotypes, extra: (None, extra),
+            TypeError,
+            r"Changed.emit: genotypes: got None; allowed: an array \(N, size\)",
+        ),
     ],
 )
 def test_an_emitter_that_proposes_otherwise_is_refused(
@@ -135,6 +140,44 @@ def test_an_emitter_that_proposes_otherwise_is_refused(
     state = one.advance(one.empty())
     with pytest.raises(error, match=text):
         one.advance(state)
+
+
+@pytest.mark.parametrize(
+    ("part", "text"),
+    [
+        ({"make": None}, "spec.make: got None; allowed: a function"),
+        ({"scoring": 3}, "spec.scoring: got 3; allowed: None, or a function"),
+        ({"options": dict}, "spec.options: got <class 'dict'>; allowed: a dataclass"),
+        ({"options": {"a": 1}}, "spec.options: got {'a': 1}; allowed: a dataclass"),
+    ],
+)
+def test_a_part_of_a_wrong_type_is_refused(part: dict[str, Any], text: str) -> None:
+    with pytest.raises(TypeError, match=text):
+        algorithms.register_algorithm(dataclasses.replace(ME, name="own", **part))
+
+
+@pytest.mark.parametrize(
+    ("part", "error", "text"),
+    [
+        (
+            {"make": lambda context, options: None},
+            ConfigError,
+            "make of 'own': got one that returned None; allowed: a function that",
+        ),
+        (
+            {"scoring": lambda config, options, task, policy: None},
+            TypeError,
+            "scoring function of 'own': got None; allowed: a function of genotypes",
+        ),
+    ],
+)
+def test_a_part_that_makes_nothing_is_refused(
+    part: dict[str, Any], error: type[Exception], text: str, task: Task
+) -> None:
+    algorithms.register_algorithm(dataclasses.replace(ME, name="own", **part))
+    with pytest.raises(error, match=text):
+        one = Search(SETTINGS, task)
+        one.advance(one.empty())
 
 
 def test_options_have_types_that_a_command_line_can_give() -> None:

@@ -77,12 +77,17 @@ def register_algorithm(spec: AlgorithmSpec[Any], *, replace: bool = False) -> No
             notebook whose cells run again. Algorithms of the library stay.
 
     Raises:
-        TypeError: ``spec`` is not an ``AlgorithmSpec``, or a field of its options has a
-            type that an option cannot have.
+        TypeError: ``spec`` is not an ``AlgorithmSpec``, its functions cannot be called,
+            its options are no dataclass, or a field of them has a type that an option
+            cannot have.
         ValueError: The name is in use, or is not text.
     """
     checks.instance("spec", spec, AlgorithmSpec, "an AlgorithmSpec")
     checks.text("spec.name", spec.name)
+    allowed = "a function of a context and options that makes an emitter"
+    checks.function("spec.make", spec.make, allowed)
+    allowed = "a function that makes a scoring function"
+    checks.function("spec.scoring", spec.scoring, allowed, optional=True)
     check_fields(spec.options)
     checks.flag("replace", replace)
     library = [known.name for known in ALGORITHMS]

@@ -91,11 +91,14 @@ def read_options(
 
 
 def check_fields(kind: type[Options]) -> None:
-    """Checks the types of the fields of a user's options.
+    """Checks a user's options, and the types of their fields.
 
     Raises:
-        TypeError: A field cannot be an option.
+        TypeError: They are no dataclass, or a field cannot be an option.
     """
+    if not isinstance(kind, type) or not dataclasses.is_dataclass(kind):
+        allowed = "a dataclass that is derived from newton_qd.qd.Options"
+        raise TypeError(message("spec.options", kind, allowed))
     hints = typing.get_type_hints(kind)
     for name in [field.name for field in dataclasses.fields(kind)]:
         hint = hints[name]

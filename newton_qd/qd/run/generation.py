@@ -7,7 +7,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from newton_qd import checks
 from newton_qd.checks import Fact, message
 from newton_qd.qd.run import quality
 from newton_qd.qd.scoring.gradient_scores import finite_scores
@@ -48,6 +50,8 @@ class Generation:
                 message(f"{type(self.emitter).__name__}.emit", kind, allowed)
             )
         genotypes, remembered = found
+        name = f"{type(self.emitter).__name__}.emit: genotypes"
+        checks.instance(name, genotypes, (jax.Array, np.ndarray), "an array (N, size)")
         # With JAX x64, QDax draws its noise in double precision.
         return genotypes.astype(jnp.float32), remembered
 

@@ -7,8 +7,9 @@ from typing import Any
 
 import jax
 
+from newton_qd.checks import Fact, message, shown
 from newton_qd.qd.algorithms import AlgorithmSpec, EmitterContext
-from newton_qd.qd.config import EvolveConfig
+from newton_qd.qd.config import ConfigError, EvolveConfig
 from newton_qd.qd.run.generation import Generation
 from newton_qd.qd.scoring.checked import check_genotypes
 from newton_qd.qd.scoring.rollout import Policy
@@ -57,7 +58,11 @@ class GenerationParts:
     score: ScoringFunction
 
     def of(self, drawn: Drawn) -> Generation:
-        """Makes the emitter, and a generation with it."""
+        """Makes the emitter, and a generation with it.
+
+        Raises:
+            ConfigError: The algorithm makes something else.
+        """
 
         def score_again(genotypes: jax.Array, key: jax.Array) -> PyTree:
             # an emitter's own evaluations
@@ -72,8 +77,14 @@ class GenerationParts:
             drawn.reset_key,
             drawn.centroids,
         )
+        emitter = self.algorithm.make(context, self.options)
+        if not hasattr(emitter, "emit"):
+            name = f"make of {self.algorithm.name!r}"
+            allowed = "a function that returns an emitter of QDax"
+            given = Fact(f"one that returned {shown(emitter)}")
+            raise ConfigError(message(name, given, allowed))
         return Generation(
-            self.algorithm.make(context, self.options),
+            emitter,
             drawn.emitter_key,
             self.algorithm.takes_faulty,
             self.task.qd_offset(self.config.episode_length),

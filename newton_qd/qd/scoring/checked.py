@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from newton_qd import checks
 from newton_qd.checks import Fact, message
 from newton_qd.gradients.outcome import Outcome
 from newton_qd.qd.config import ConfigError
@@ -27,8 +28,12 @@ def checked_scoring(
     Returns:
         The same function. It raises ``ConfigError`` if the results are not fitnesses
         (N,), descriptors (N, D) and a dictionary.
+
+    Raises:
+        TypeError: ``score`` cannot be called.
     """
     name = f"scoring function of {algorithm!r}"
+    checks.function(name, score, "a function of genotypes and a key")
 
     def scored(
         genotypes: Genotype, key: RNGKey
