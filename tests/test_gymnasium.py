@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import pickle
 import sys
 import tomllib
@@ -372,3 +373,16 @@ def test_a_missing_gymnasium_says_its_command(monkeypatch: pytest.MonkeyPatch) -
         monkeypatch.delitem(sys.modules, f"newton_qd.adapters.{module}", raising=False)
         with pytest.raises(newton_qd.MissingExtra, match=r"newton_qd\[gym\]"):
             importlib.import_module(f"newton_qd.adapters.{module}")
+
+
+def test_a_forked_process_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """JAX would wait forever there, as in asynchronous vector environments."""
+    adapter = importlib.import_module("newton_qd.adapters.gymnasium")
+    monkeypatch.setattr(adapter, "_PROCESSES", [])
+    make_gymnasium("pointmaze").reset(seed=0)
+    with monkeypatch.context() as forked:
+        process = os.getpid() + 1
+        forked.setattr(os, "getpid", lambda: process)
+        with pytest.raises(RuntimeError, match=r"forked .*; start processes"):
+            make_gymnasium("pointmaze")
+    make_gymnasium("pointmaze").reset(seed=0)

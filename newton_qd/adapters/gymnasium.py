@@ -6,6 +6,7 @@ Importing this module registers every environment with Gymnasium, such as
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import jax
@@ -29,6 +30,26 @@ except ModuleNotFoundError as error:
 NAMESPACE = "newton_qd"
 RENDER_MODES = ("rgb_array",)
 _SHOWN = ("fault", "steps", *READINGS)  # keys of ``State.info`` that ``info`` has
+
+
+_PROCESSES: list[int] = []
+"""The process that made the first environment; a forked one inherits it."""
+
+
+def _require_no_fork() -> None:
+    """Refuses a process that was forked: JAX would wait in it forever.
+
+    Raises:
+        RuntimeError: Another process made environments before the fork.
+    """
+    if not _PROCESSES:
+        _PROCESSES.append(os.getpid())
+    if os.getpid() not in _PROCESSES:
+        raise RuntimeError(
+            "this process was forked after the first environment was made, and JAX "
+            "does not run in it; start processes with spawn, or step many worlds in "
+            "this one: gymnasium.make_vec(name, num_envs=N)"
+        )
 
 
 def spaces_of(env: Env) -> tuple[spaces.Box, spaces.Box]:
@@ -112,7 +133,9 @@ class GymnasiumEnv(Pickled, gymnasium.Env):
             ValueError: A value is not allowed, or the environment has a batch or
                 auto-reset.
             UnknownEnvironment: The name is not registered.
+            RuntimeError: The process was forked after the first environment was made.
         """
+        _require_no_fork()
         self.env = one_world(env, options)
         self.metadata = metadata_of(self.env, render_mode)
         self.render_mode = render_mode
