@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import TYPE_CHECKING
 
 from newton_qd.checks import message
 from newton_qd.qd.algorithms.options import Options
 from newton_qd.qd.config import ConfigError, EvolveConfig
-from newton_qd.qd.scoring.rollout import Policy
+
+if TYPE_CHECKING:  # importing a list of algorithms imports no JAX
+    from newton_qd.qd.scoring.rollout import Policy
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
