@@ -41,10 +41,10 @@ MAZE_STEPS = 30  # of the point maze, which has no time
 
 HEAD = """# Gallery
 
-Every environment, moving as sines of time: of 64 random gaits, the one with the highest
-return. Nothing is learned. `docs/gallery.py` makes the pictures from the code;
-`newton-qd replay NAME` makes a page on which you can turn the view.
-[Environments](environments.md) describes them.
+Each picture shows an environment whose joints move as sines of time. It is the gait
+with the highest return of 64 random ones. Nothing is learned.
+[Environments](environments.md) has the details. `newton-qd replay NAME` makes a page on
+which you can turn the view. `docs/gallery.py` makes the pictures from the code.
 
 <div class="gallery" markdown>
 """
