@@ -39,9 +39,10 @@ of {HIDDEN[0]} and tanh.
 - *5 % to 95 %*: quantiles of each component of the descriptors, with its limits.
 - *Lowest reward*: lowest reward of a step in these episodes, and in {WORLDS:,} more
   with uniformly random actions.
-- *Offset*: minus the lowest reward, rounded up. Evolved policies may be lower. It is
-  `newton_qd.tables.reward_offset`. *Original* is that of the original suite,
-  `newton_qd.tables.original_reward_offset`; a dash: it has no such task.
+- *Offset*: minus the lowest reward, rounded up, and at least 0. Evolved policies may
+  have lower rewards. It is `newton_qd.tables.reward_offset`.
+- *Original*: the offset of the original suite. It is
+  `newton_qd.tables.original_reward_offset`. A dash means that it has no such task.
 
 | task | coverage [%] | 5 % to 95 % (limits) | lowest reward | original | offset |
 |---|---|---|---|---|---|
