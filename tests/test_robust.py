@@ -251,8 +251,9 @@ def test_reevaluations_have_start_states_that_no_generation_had() -> None:
 @pytest.mark.parametrize("new", [False, True])
 def test_emitters_evaluate_from_the_start_states_of_the_generation(new: bool) -> None:
     made: list[Any] = []
+    emitter = SimpleNamespace(emit=None)  # which is not called
     algorithm: Any = SimpleNamespace(
-        make=lambda context, _: made.append(context), takes_faulty=False
+        make=lambda context, _: made.append(context) or emitter, takes_faulty=False
     )
     config = SMALL.replace(new_starts=new)
     score: Any = lambda genotypes, key: key  # noqa: E731
