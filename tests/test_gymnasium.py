@@ -375,14 +375,19 @@ def test_a_missing_gymnasium_says_its_command(monkeypatch: pytest.MonkeyPatch) -
             importlib.import_module(f"newton_qd.adapters.{module}")
 
 
-def test_a_forked_process_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("make", "count"), [(make_gymnasium, {}), (make_gymnasium_vector, {"num_envs": 2})]
+)
+def test_a_forked_process_is_refused(
+    make: Any, count: dict[str, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """JAX would wait forever there, as in asynchronous vector environments."""
     adapter = importlib.import_module("newton_qd.adapters.gymnasium")
     monkeypatch.setattr(adapter, "_PROCESSES", [])
-    make_gymnasium("pointmaze").reset(seed=0)
+    make("pointmaze", **count).reset(seed=0)
     with monkeypatch.context() as forked:
         process = os.getpid() + 1
         forked.setattr(os, "getpid", lambda: process)
         with pytest.raises(RuntimeError, match=r"forked .*; start processes"):
-            make_gymnasium("pointmaze")
-    make_gymnasium("pointmaze").reset(seed=0)
+            make("pointmaze", **count)
+    make("pointmaze", **count).reset(seed=0)

@@ -36,7 +36,7 @@ _PROCESSES: list[int] = []
 """The process that made the first environment; a forked one inherits it."""
 
 
-def _require_no_fork() -> None:
+def require_no_fork() -> None:
     """Refuses a process that was forked: JAX would wait in it forever.
 
     Raises:
@@ -135,7 +135,7 @@ class GymnasiumEnv(Pickled, gymnasium.Env):
             UnknownEnvironment: The name is not registered.
             RuntimeError: The process was forked after the first environment was made.
         """
-        _require_no_fork()
+        require_no_fork()
         self.env = one_world(env, options)
         self.metadata = metadata_of(self.env, render_mode)
         self.render_mode = render_mode

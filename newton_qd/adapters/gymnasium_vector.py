@@ -14,6 +14,7 @@ from newton_qd.adapters.gymnasium import (
     ends_of,
     info_of,
     metadata_of,
+    require_no_fork,
     spaces_of,
 )
 from newton_qd.adapters.live_camera import LiveCamera
@@ -88,7 +89,9 @@ class GymnasiumVectorEnv(Pickled, gymnasium.vector.VectorEnv):
             ValueError: A value is not allowed, or the environment has a batch or
                 auto-reset.
             UnknownEnvironment: The name is not registered.
+            RuntimeError: The process was forked after the first environment was made.
         """
+        require_no_fork()
         if max_episode_steps is not None:
             options["episode_length"] = max_episode_steps
         checks.integer("num_envs", num_envs)
