@@ -8,6 +8,8 @@ from typing import Any, Protocol, TypeAlias
 
 import jax
 
+from newton_qd.moved import moved_name
+
 RNGKey: TypeAlias = jax.Array
 Action: TypeAlias = jax.Array
 Observation: TypeAlias = jax.Array
@@ -37,6 +39,13 @@ ScoringFunction: TypeAlias = Callable[
 
 PolicyFunction: TypeAlias = Callable[[PyTree, Observation], Action]
 """Maps parameters and an observation (no,) to an action (nu,)."""
+
+_MOVED = {"Policy": "newton_qd.types.PolicyFunction"}
+
+
+def __getattr__(name: str) -> Any:
+    """Returns a moved object by its old name."""
+    return moved_name(__name__, name, _MOVED)
 
 
 class StateDescriptors(Protocol):

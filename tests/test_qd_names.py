@@ -58,3 +58,9 @@ def test_old_name_of_reevaluated() -> None:
     )
     with pytest.warns(DeprecationWarning, match=r"is now EvolveResult\.reevaluated"):
         assert result.corrected is again
+
+
+def test_old_name_of_the_type_of_a_policy() -> None:
+    types = importlib.import_module("newton_qd.types")
+    with pytest.warns(DeprecationWarning, match=r"is now newton_qd\.types\.PolicyF"):
+        assert types.Policy is types.PolicyFunction
