@@ -60,3 +60,11 @@ def test_a_tessellation_is_taken_within_its_limits(cells: int) -> None:
         for highest in ((2.0, 2.0), (1.0, 0.5)):
             with pytest.raises(ConfigError, match=REFUSED):
                 check(begun, config, *highest)
+
+
+def test_an_error_is_one_line_for_long_descriptors() -> None:
+    config = EvolveConfig(env_name="point", grid=None, centroids=8)
+    begun = jax.random.uniform(KEY, (8, 20))
+    with pytest.raises(ConfigError, match="centres of cells") as caught:
+        check(begun, config, *[30.0] * 20)
+    assert "\n" not in str(caught.value)

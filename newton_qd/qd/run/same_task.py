@@ -42,7 +42,10 @@ def require_same_task(
     cells, (low, high) = stored.centroids, limits
     if cells.shape[1] == len(low) and _fit(cells, config, limits):
         return
-    shown = [f"from {box[0]} to {box[1]}" for box in (_box(cells), (low, high))]
+    shown = [
+        f"from {_line(least)} to {_line(most)}"
+        for least, most in (_box(cells), (low, high))
+    ]
     given = Fact(f"centres of cells {shown[0]}")
     allowed = f"cells {shown[1]}, the limits of the task; start a new run for another "
     allowed += "descriptor; a run with a task_factory needs it again"
@@ -72,3 +75,8 @@ def _fit(
 def _box(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns the lowest and the highest centre, (D,) each."""
     return cells.min(axis=0), cells.max(axis=0)
+
+
+def _line(values: np.ndarray) -> str:
+    """Returns the text of values (D,), however many they are, in one line."""
+    return " ".join(str(values).split())
