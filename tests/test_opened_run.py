@@ -63,6 +63,8 @@ def test_a_run_is_shown_in_one_line(found: Run, reference: Path) -> None:
     )
     assert repr(found) == f"<Run {reference}: {words}>"
     assert repr(run(SMALL)) == f"<EvolveResult: {words}>"
+    bare = dataclasses.replace(found, metrics={})
+    assert repr(bare) == f"<Run {reference}: me on point>"
     filled, cells = len(found.cells), len(found.archive.centroids)
     shown = f"<Archive: {filled} of {cells} cells, {found.policy.size} weights each>"
     assert repr(found.archive) == shown
@@ -270,6 +272,11 @@ def test_plot_writes_both_pictures(
     shutil.copy(reference / "config.json", out)
     assert call("plot", reference, "--out", out) == cli.BAD_ARGUMENTS
     assert f"got {out}, the folder of another run" in capsys.readouterr().err
+    missing = tmp_path / "missing"
+    assert call("plot", missing) == cli.BAD_ARGUMENTS
+    error = capsys.readouterr().err
+    assert call("plot", missing, "--out", reference) == cli.BAD_ARGUMENTS
+    assert capsys.readouterr().err == error
 
 
 def test_curves_have_all_values() -> None:

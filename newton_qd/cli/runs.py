@@ -258,7 +258,8 @@ def plot(arguments: argparse.Namespace, task_factory: TaskFactory = None) -> int
     if out.exists() and not out.is_dir():
         refused = message("--out", Fact(str(out)), allowed, why="a file")
         return complain(arguments, refused, BAD_ARGUMENTS)
-    if another.has_config and not out.samefile(arguments.folder):
+    own = arguments.folder
+    if another.has_config and own.exists() and not out.samefile(own):
         why = "the folder of another run, which has a picture of its own"
         refused = message("--out", Fact(str(out)), allowed, why=why)
         return complain(arguments, refused, BAD_ARGUMENTS)

@@ -175,7 +175,7 @@ def results_text(config: EvolveConfig, metrics: Mapping[str, np.ndarray]) -> str
         metrics: Name of each column of ``metrics.csv`` to its values.
     """
     run = f"{config.algorithm} on {config.env_name}"
-    if not len(metrics["iteration"]):
+    if not len(metrics.get("iteration", ())):
         return run
     last = {name: values[-1] for name, values in metrics.items()}
     return (
