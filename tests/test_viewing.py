@@ -244,8 +244,10 @@ def test_wrong_arguments_of_replay(capsys: pytest.CaptureFixture[str]) -> None:
     assert "--best: got 0; allowed: None, or integers" in capsys.readouterr().err
     for command in (["replay"], ["render", "--best", "2"]):  # several gigabytes
         assert cli.main([*command, "pointmaze", "--steps", "100000000"]) == 2
-        most = 500_000 if "2" in command else 1_000_000
-        said = f"--steps: got 100000000; allowed: integers from 1 to {most}\n"
+        whose, most = "", 1_000_000
+        if "2" in command:
+            whose, most = " of each of 2 worlds", 500_000
+        said = f"--steps{whose}: got 100000000; allowed: integers from 1 to {most}\n"
         assert said in capsys.readouterr().err
 
 

@@ -253,17 +253,16 @@ def _text(descriptor: Any) -> str:
 
 def plot(arguments: argparse.Namespace, task_factory: TaskFactory = None) -> int:
     """Writes the pictures of a run. Returns the exit code."""
-    out = arguments.folder if arguments.out is None else arguments.out
-    another, allowed = RunFolder(out), "a folder, or a new name"
+    folder = arguments.folder
+    out, why = folder if arguments.out is None else arguments.out, ""
     if out.exists() and not out.is_dir():
-        refused = message("--out", Fact(str(out)), allowed, why="a file")
-        return complain(arguments, refused, BAD_ARGUMENTS)
-    own = arguments.folder
-    if another.has_config and own.exists() and not out.samefile(own):
+        why = "a file"
+    elif RunFolder(out).has_config and folder.exists() and not out.samefile(folder):
         why = "the folder of another run, which has a picture of its own"
-        refused = message("--out", Fact(str(out)), allowed, why=why)
+    if why:
+        refused = message("--out", Fact(str(out)), "a folder, or a new name", why=why)
         return complain(arguments, refused, BAD_ARGUMENTS)
-    run = opened(arguments.folder, task_factory)
+    run = opened(folder, task_factory)
     out.mkdir(parents=True, exist_ok=True)
     for name, figure in (
         ("archive.png", run.plot()),

@@ -389,7 +389,8 @@ def _random_trajectory(arguments: argparse.Namespace) -> Trajectory:
     from newton_qd.viewing.recording import check_memory
 
     steps, worlds = arguments.steps or _RANDOM_STEPS, arguments.best or 1
-    checks.integer("--steps", steps, most=_MOST_STEPS // worlds, error=ConfigError)
+    name = "--steps" if worlds == 1 else f"--steps of each of {worlds} worlds"
+    checks.integer(name, steps, most=_MOST_STEPS // worlds, error=ConfigError)
     env = newton_qd.create(arguments.what, episode_length=steps, auto_reset=False)
     check_memory(env, steps, worlds)
     start, noise = jax.random.split(jax.random.key(arguments.seed or 0))
