@@ -80,6 +80,7 @@ class Protocol:
 BASELINES = ("me", "ascii-me", "cma-me", "pga-me", "dcrl-me")
 OURS = (
     "me-actor-critic",
+    "dcrl-actor-critic",
     "ascii-me-exact",
     "me-conditioned",
     "cma-maega-actor-critic",

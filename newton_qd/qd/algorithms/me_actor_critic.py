@@ -64,7 +64,7 @@ _STEERED = {"steered": 1.0, "fitness": 0.0, **_LONG}
 _ACTORS = {"ant_omni": _LONG, **dict.fromkeys(MAZES, _STEERED)}
 
 
-def _make(context: EmitterContext, options: ActorCriticOptions) -> Any:
+def actor_emitter(context: EmitterContext, options: ActorCriticOptions) -> Any:
     """MAP-Elites with the policies of actors that learn over short windows.
 
     Raises:
@@ -98,22 +98,24 @@ def _make(context: EmitterContext, options: ActorCriticOptions) -> Any:
     return with_isoline(emitter, config, ascent_emitter(context, options, rest))
 
 
-def _gradients(config: EvolveConfig, options: ActorCriticOptions) -> int:
+def gradients(config: EvolveConfig, options: ActorCriticOptions) -> int:
     return options.episodes(config)
 
+
+evaluations = batch_and(gradients)
 
 ME_ACTOR_CRITIC = AlgorithmSpec(
     name="me-actor-critic",
     summary="MAP-Elites with actors that learn over short windows from gradients of "
     "the physics; some actors increase fitness, others move along directions of the "
     "descriptor; a part of the offspring lies between actors and elites",
-    make=_make,
+    make=actor_emitter,
     options=ActorCriticOptions,
     tuned={
         name: {**_ACTORS.get(name, {}), **CLIMBING.get(name, {})}
         for name in (*_ACTORS, "halfcheetah_uni")
     },
-    evaluations=batch_and(_gradients),
-    gradients=_gradients,
+    evaluations=evaluations,
+    gradients=gradients,
     initial_scale=initial_scale,
 )
