@@ -66,7 +66,7 @@ class Progress:
         from newton_qd.qd.algorithms import algorithm_named
         from newton_qd.qd.run.search import Search
 
-        if run.algorithm in ("pga-me", "dcrl-me", "dcrl-actor-critic"):
+        if run.algorithm in ("pga-me", "dcrl-me"):
             newton_qd.compat.install()
         given = {**protocol.settings_of(run.task), **variants()[run.variant]}
         config = EvolveConfig(

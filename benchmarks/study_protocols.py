@@ -80,7 +80,6 @@ class Protocol:
 BASELINES = ("me", "ascii-me", "cma-me", "pga-me", "dcrl-me")
 OURS = (
     "me-actor-critic",
-    "dcrl-actor-critic",
     "ascii-me-exact",
     "me-conditioned",
     "cma-maega-actor-critic",

@@ -18,7 +18,6 @@ from newton_qd.qd.algorithms.cma_maega import CMA_MAEGA
 from newton_qd.qd.algorithms.cma_maega_actor_critic import CMA_MAEGA_ACTOR_CRITIC
 from newton_qd.qd.algorithms.cma_me import CMA_ME
 from newton_qd.qd.algorithms.cma_mega import CMA_MEGA
-from newton_qd.qd.algorithms.dcrl_actor_critic import DCRL_ACTOR_CRITIC
 from newton_qd.qd.algorithms.dcrl_me import DCRL_ME
 from newton_qd.qd.algorithms.me import ME
 from newton_qd.qd.algorithms.me_actor_critic import ME_ACTOR_CRITIC
@@ -52,7 +51,6 @@ ALGORITHMS: tuple[AlgorithmSpec[Any], ...] = (
     ME_ASCENT,
     ASCII_ME_EXACT,
     ME_ACTOR_CRITIC,
-    DCRL_ACTOR_CRITIC,
     ME_CONDITIONED,
     OMG_MEGA,
     CMA_MEGA,

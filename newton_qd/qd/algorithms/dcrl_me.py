@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import types
 from typing import TYPE_CHECKING, Any
 
 from newton_qd.checks import listed, message
@@ -64,24 +63,7 @@ class DCRLMEOptions(CriticOptions):
         return found
 
 
-def _remember(self: Any, state: Any, **told: Any) -> Any:
-    """Puts the transitions of a generation of other individuals into the buffer."""
-    import jax.numpy as jnp
-
-    critic = self.emitters[0]
-    own, *others = state.emitter_states
-    transitions = told["extra_scores"]["transitions"]
-    reached = jnp.repeat(
-        critic._normalize_desc(told["descriptors"])[:, None],
-        transitions.obs.shape[1],
-        axis=1,
-    )
-    transitions = transitions.replace(desc=reached, desc_prime=reached)
-    own = own.replace(replay_buffer=own.replay_buffer.insert(transitions))
-    return state.replace(emitter_states=(own, *others))
-
-
-def dcrl_emitter(context: EmitterContext, options: DCRLMEOptions) -> Any:
+def _make(context: EmitterContext, options: DCRLMEOptions) -> Any:
     """DCRL-ME: critic and actor depend on the descriptor (Faldor et al. 2024).
 
     Raises:
@@ -132,9 +114,7 @@ def dcrl_emitter(context: EmitterContext, options: DCRLMEOptions) -> Any:
             task.env,
             isoline(config),
         )
-        emitter = with_own_isoline(emitter, config)
-        emitter.remember = types.MethodType(_remember, emitter)
-        return emitter
+        return with_own_isoline(emitter, config)
 
     emitter: Any = made(1)
     if config.starts > 1:
@@ -146,7 +126,7 @@ DCRL_ME = AlgorithmSpec(
     name="dcrl-me",
     summary="DCRL-ME: like `pga-me`, with a critic and an actor that depend on the "
     "descriptor; the critic and the actor each produce a quarter of the generation",
-    make=dcrl_emitter,
+    make=_make,
     options=DCRLMEOptions,
     least=1,
     transitions=True,

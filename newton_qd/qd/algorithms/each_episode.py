@@ -45,10 +45,6 @@ class EachEpisode:
         """Learns from all episodes of a generation."""
         return self._learner.state_update(emitter_state, **self._episodes(told))
 
-    def remember(self, emitter_state: PyTree, **told: PyTree) -> PyTree:
-        """Learns from all episodes of a generation of other individuals."""
-        return self._learner.remember(emitter_state, **self._episodes(told))
-
     def _episodes(self, told: dict[str, PyTree]) -> dict[str, PyTree]:
         """Returns what is told, with an individual in place of each episode.
 

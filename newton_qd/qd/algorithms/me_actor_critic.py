@@ -64,7 +64,7 @@ _STEERED = {"steered": 1.0, "fitness": 0.0, **_LONG}
 _ACTORS = {"ant_omni": _LONG, **dict.fromkeys(MAZES, _STEERED)}
 
 
-def actor_emitter(context: EmitterContext, options: ActorCriticOptions) -> Any:
+def _make(context: EmitterContext, options: ActorCriticOptions) -> Any:
     """MAP-Elites with the policies of actors that learn over short windows.
 
     Raises:
@@ -98,24 +98,22 @@ def actor_emitter(context: EmitterContext, options: ActorCriticOptions) -> Any:
     return with_isoline(emitter, config, ascent_emitter(context, options, rest))
 
 
-def gradients(config: EvolveConfig, options: ActorCriticOptions) -> int:
+def _gradients(config: EvolveConfig, options: ActorCriticOptions) -> int:
     return options.episodes(config)
 
-
-evaluations = batch_and(gradients)
 
 ME_ACTOR_CRITIC = AlgorithmSpec(
     name="me-actor-critic",
     summary="MAP-Elites with actors that learn over short windows from gradients of "
     "the physics; some actors increase fitness, others move along directions of the "
     "descriptor; a part of the offspring lies between actors and elites",
-    make=actor_emitter,
+    make=_make,
     options=ActorCriticOptions,
     tuned={
         name: {**_ACTORS.get(name, {}), **CLIMBING.get(name, {})}
         for name in (*_ACTORS, "halfcheetah_uni")
     },
-    evaluations=evaluations,
-    gradients=gradients,
+    evaluations=batch_and(_gradients),
+    gradients=_gradients,
     initial_scale=initial_scale,
 )

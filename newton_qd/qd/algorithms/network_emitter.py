@@ -48,10 +48,6 @@ class OfParameters:
         """Learns from a generation."""
         return self._emitter.state_update(emitter_state, **self._told(told))
 
-    def remember(self, emitter_state: PyTree, **told: PyTree) -> PyTree:
-        """Learns from a generation of other individuals."""
-        return self._emitter.remember(emitter_state, **self._told(told))
-
     def _seen(self, repertoire: Repertoire) -> Repertoire:
         return repertoire.replace(genotypes=self._unravel(repertoire.genotypes))
 
