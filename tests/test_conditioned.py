@@ -19,6 +19,7 @@ from qdax.core.containers.mapelites_repertoire import (
 from test_actor_critic import SETTINGS, compiled
 
 from newton_qd.extractors import get_final_xy_position
+from newton_qd.qd.algorithms.me_conditioned import ME_CONDITIONED
 from newton_qd.qd.config import ConfigError
 from newton_qd.qd.emitters import ActorCritic, ConditionedActorEmitter
 from newton_qd.qd.emitters.aims import AimedEnv, ConditionedPolicy, no_measure
@@ -238,7 +239,8 @@ def test_the_unit_is_the_largest_deviation_so_far() -> None:
     def later(fitnesses: jax.Array) -> jax.Array:
         held = grid(2)
         held = held.replace(fitnesses=held.fitnesses.at[:3, 0].set(fitnesses))
-        return made.state_update(state, held, descriptors=jnp.zeros((4, 2))).unit
+        told = {"fitnesses": jnp.ones(4), "descriptors": jnp.zeros((4, 2))}
+        return made.state_update(state, held, **told).unit
 
     several = later(jnp.float32([1.0, 7.0, 3.0]))
     np.testing.assert_allclose(several, np.std([1, 7, 3]), rtol=1e-6)
@@ -257,8 +259,18 @@ def test_multipliers_stay_within_bounds() -> None:
     logits = jnp.array([6.0, 5.9, 0.0, -6.0])
     state = types.SimpleNamespace(logits=logits, cells=jnp.arange(4))
     places = held.centroids.at[:3].add(5.0)  # the last one hits
-    found = made._multipliers(state, held, places)
+    found = made._multipliers(state, held, places, jnp.zeros(4))
     np.testing.assert_allclose(found, [6.0, 6.0, 0.3, -6.0], rtol=1e-6)
+
+
+def test_multipliers_do_not_count_faulty_copies() -> None:
+    """The descriptor of a faulty individual may be finite."""
+    made, held = emitter(), grid(2)
+    state = types.SimpleNamespace(logits=jnp.zeros(4), cells=jnp.arange(4))
+    fitnesses = jnp.float32([1.0, -jnp.inf, 1.0, -jnp.inf])
+    found = made._multipliers(state, held, held.centroids, fitnesses)
+    np.testing.assert_allclose(found, [-0.3, 0, -0.3, 0], rtol=1e-6)
+    assert ME_CONDITIONED.takes_faulty  # else fitnesses are finite in a run
 
 
 def test_a_return_of_one_unit_weighs_as_much_as_half_of_the_extent() -> None:
@@ -328,7 +340,7 @@ def test_multipliers_rise_where_policies_miss() -> None:
     places = np.array(held.centroids[state.cells])
     places[0] += 1.5  # misses; the others hit, the last one is broken
     places[3] = np.nan
-    after = parts()[3](state, held, None, None, jnp.asarray(places), {})
+    after = parts()[3](state, held, None, jnp.zeros(7), jnp.asarray(places), {})
     change = np.zeros(16)
     np.add.at(change, np.asarray(state.cells), [0.3, -0.3, -0.3, 0.0])
     np.testing.assert_allclose(after.logits, change, atol=1e-6)
@@ -341,7 +353,7 @@ def test_an_update_tells_targets_apart() -> None:
     held, state = begun()
     places = held.centroids[state.cells]
     for _ in range(3):
-        state = parts()[3](state, held, None, None, places, {})
+        state = parts()[3](state, held, None, jnp.zeros(7), places, {})
     assert int(state.failed[0]) == 0
     offspring, _ = parts()[2](held, state, jax.random.key(0))
     specialize = parts()[0]._policy.specialized

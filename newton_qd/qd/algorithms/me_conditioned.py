@@ -123,5 +123,6 @@ ME_CONDITIONED = AlgorithmSpec(
     tuned={"halfcheetah_uni": SHORT, **on_robots_that_fall(rate=3e-4)},
     evaluations=batch_and(_gradients),
     gradients=_gradients,
+    takes_faulty=True,
     initial_scale=initial_scale,
 )

@@ -207,10 +207,15 @@ class ConditionedActorEmitter(Emitter):
         extra_scores: ExtraScores | None = None,
     ) -> PyTree:
         """Changes the multipliers, draws new targets, and learns for a generation."""
-        del genotypes, fitnesses, extra_scores
+        del genotypes, extra_scores
         state = emitter_state
         key, aim_key, cell_key, learn_key = jax.random.split(state.key, 4)
-        logits = self._multipliers(state, repertoire, descriptors[: self._copies])
+        logits = self._multipliers(
+            state,
+            repertoire,
+            descriptors[: self._copies],
+            fitnesses.reshape(-1)[: self._copies],
+        )
         unit = jnp.maximum(state.unit, _spread(repertoire.fitnesses[:, 0]))
         # worlds take new targets when their episodes begin
         worlds = self._worlds(repertoire, logits, unit, aim_key)
@@ -271,14 +276,22 @@ class ConditionedActorEmitter(Emitter):
         return mean.at[size:].set(0), deviation.at[size:].set(0.5)
 
     def _multipliers(
-        self, state: PyTree, repertoire: Repertoire, descriptors: jax.Array
+        self,
+        state: PyTree,
+        repertoire: Repertoire,
+        descriptors: jax.Array,
+        fitnesses: jax.Array,
     ) -> jax.Array:
-        """Returns the logits after the last copies have reached their descriptors."""
+        """Returns the logits after the last copies have reached their descriptors.
+
+        A copy without a finite fitness had a fault, so its descriptor means nothing.
+        """
         place = self._env.scaled
         missed = place(descriptors) - place(repertoire.centroids[state.cells])
         distance = jnp.linalg.norm(missed, axis=1)
         excess = jnp.clip(distance / self._tolerance - 1, -1, 1)
-        change = jnp.where(jnp.isfinite(excess), self._dual_rate * excess, 0)
+        counts = jnp.isfinite(excess) & jnp.isfinite(fitnesses)
+        change = jnp.where(counts, self._dual_rate * excess, 0)
         logits = state.logits.at[state.cells].add(change)
         return jnp.clip(logits, -_LARGEST, _LARGEST)
 
