@@ -153,6 +153,27 @@ def test_robots_that_do_not_fit_are_refused(hurt: RobotSpec, tmp_path: Path) -> 
         newton_qd.create("pointmaze", robot=ANT)
 
 
+def test_more_links_may_be_fixed_to_the_world(tmp_path: Path) -> None:
+    """A robot in front of a lamp: no task reads the lamp."""
+    lamp = (
+        '<joint name="stand" type="fixed"><parent link="world"/><child link="lamp"/>'
+        '<origin xyz="0 9 1"/></joint><link name="lamp"/></robot>'
+    )
+    for name, robot in (("hopper", HOPPER), ("pusher", PUSHER)):
+        lit = _changed(robot, tmp_path / f"{name}_lit.urdf", "</robot>", lamp)
+        env: Any = newton_qd.create(name, robot=lit)
+        assert "lamp" in env.system.scene_links
+        after = jax.jit(env.reset)(KEY)
+        expected = jax.jit(newton_qd.create(name).reset)(KEY)
+        np.testing.assert_array_equal(after.obs, expected.obs)
+    free = '<link name="world"/><joint name="root" type="floating">'
+    free += '<parent link="world"/><child link="torso"/></joint>'
+    lit = _changed(ANT, tmp_path / "ant_lit.urdf", "</robot>", free + lamp)
+    newton_qd.create("ant", robot=lit, use_contact_forces=False)
+    with pytest.raises(ValueError, match="whose observations have length"):
+        newton_qd.create("ant", robot=lit)
+
+
 def test_robots_with_other_observations_are_refused(tmp_path: Path) -> None:
     """The humanoid observes each link with mass, the pusher a link that is fixed."""
     moments = 'ixx="1e-5" iyy="1e-5" izz="1e-5" ixy="0" ixz="0" iyz="0"'
