@@ -23,7 +23,14 @@ from newton_qd.qd.run.folder import COLUMNS
 from newton_qd.qd.run.opened import Run
 from newton_qd.qd.run.reevaluation import Reevaluated
 from newton_qd.qd.run.search import start_key
-from newton_qd.viewing import Trajectory, record, write_explorer, write_replay
+from newton_qd.viewing import (
+    Drawing,
+    Trajectory,
+    drawing_of,
+    record,
+    write_explorer,
+    write_replay,
+)
 from newton_qd.viewing.elites import record_elites
 from newton_qd.viewing.explorer import (
     _metrics,
@@ -301,6 +308,27 @@ def test_curves_and_maps_are_part_of_the_size(
     assert len(text) < 1.1e6
     thinned = f" of {len(run.cells)} elites move" in text
     assert thinned is (cells == 60)
+
+
+def test_meshes_are_part_of_the_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    run = opened("grid", 2, (20, 20), steps=40)
+    mesh = dataclasses.replace(
+        drawing_of(run.task.env).shapes[0],
+        kind="mesh",
+        vertices=np.zeros((10_000, 3), np.float32),
+        faces=np.zeros((5_000, 3), np.int32),
+    )
+
+    def with_mesh(env: Any) -> Drawing:
+        found = drawing_of(env)
+        return dataclasses.replace(found, shapes=(*found.shapes, mesh))
+
+    for module in ("explorer", "recording"):
+        monkeypatch.setattr(f"newton_qd.viewing.{module}.drawing_of", with_mesh)
+    monkeypatch.setattr("newton_qd.viewing.explorer._LARGEST_PAGE", 1.0e6)
+    text = explorer_html([run])
+    assert '"kind":"mesh"' in text and len(text) < 1.0e6
+    assert f" of {len(run.cells)} elites move" in text
 
 
 def pushed(run: Run, worlds: int) -> Trajectory:

@@ -13,7 +13,7 @@ import numpy as np
 from newton_qd import checks
 from newton_qd.checks import Fact, message
 from newton_qd.files import write_atomically
-from newton_qd.viewing.drawing import body_frames
+from newton_qd.viewing.drawing import Drawing, body_frames, drawing_of
 from newton_qd.viewing.elites import record_elites
 from newton_qd.viewing.html import drawing_data, encode, page
 from newton_qd.viewing.trajectory import Trajectory
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 _EVERY = 2  # steps between two frames of the page
 _LARGEST_PAGE = 10e6  # [bytes]
-_FIXED = 0.7e6  # scripts, shapes and texts of a page [bytes]
+_FIXED = 0.7e6  # scripts, simple shapes and texts of a page [bytes]
 _MOST_POINTS = 2000  # of a curve, which has fewer pixels
 _MOST_GENOTYPES = 0.6e6  # [bytes]
 _COUNTS = 16  # lengths of an episode, as text [bytes]
@@ -81,7 +81,8 @@ def explorer_html(
     # half rate would lose the last step of an episode of an odd length
     odd = any(run.config.episode_length % _EVERY for run in runs)
     every = 1 if odd else _EVERY
-    budget = (_LARGEST_PAGE - _FIXED) / len(runs)
+    meshes = _mesh_size(drawing_of(runs[0].task.env))  # those of both runs
+    budget = (_LARGEST_PAGE - _FIXED - meshes) / len(runs)
     chosen = [_moving(run, budget - _still_size(run, starts), every) for run in runs]
     total, before = sum(map(len, chosen)), 0
     found, first = [], None
@@ -152,6 +153,12 @@ def _check_same(first: Trajectory, other: Trajectory, names: list[str]) -> None:
         given = Fact(" and ".join(names))
         allowed = "two runs of the same robot in the same scene"
         raise ValueError(message("runs", given, allowed))
+
+
+def _mesh_size(drawing: Drawing) -> float:
+    """Returns the size of the meshes in the page [bytes]."""
+    numbers = sum(shape.vertices.size + shape.faces.size for shape in drawing.shapes)
+    return 4 * numbers * _TEXT
 
 
 def _still_size(run: Run, starts: int) -> float:
