@@ -102,7 +102,11 @@ def test_defaults_of_an_environment_are_accepted(env_name: str) -> None:
 @pytest.mark.usefixtures("sigint")
 @pytest.mark.parametrize("name", OPTIONS)
 def test_a_stop_changes_nothing(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compiled: list[str]
+    name: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    compiled: list[str],
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     config = EvolveConfig(
         env_name="pointmaze",
@@ -127,9 +131,12 @@ def test_a_stop_changes_nothing(
                 whole = evolve(config, out=tmp_path / "whole", **common)
             interrupt_after(patch, 3)
             assert evolve(config, out=tmp_path / "parts", **common).interrupted
+        common["progress"] = True
         evolve(config, out=tmp_path / "parts", resume=True, **common)
     finally:
         newton_qd.compat.uninstall()
+    shown = capsys.readouterr().err
+    assert "resuming" in shown and "other results" not in shown
     for file in ("checkpoint.bin", "archive.npz", "metrics.csv"):
         left, right = (tmp_path / run / file for run in ("whole", "parts"))
         assert left.read_bytes() == right.read_bytes(), file

@@ -2,15 +2,34 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from point_runs import (
+    SMALL,
+    PointEnv,
+    compile_once,
+    copy,
+    point_task,
+    reference,
+    run,
+)
 
 from newton_qd.qd.config import ConfigError, EvolveConfig
 from newton_qd.qd.run.archive import Archive
 from newton_qd.qd.run.cells import cell_centroids
+from newton_qd.qd.run.evolution import evolve
 from newton_qd.qd.run.same_task import require_same_task
+
+__all__ = ["compile_once", "reference"]  # fixtures
+
+# QDax and what it imports warn about their own use of other packages.
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
 
 KEY = jax.random.key(0)
 WEIGHTS = 3
@@ -68,3 +87,41 @@ def test_an_error_is_one_line_for_long_descriptors() -> None:
     with pytest.raises(ConfigError, match="centres of cells") as caught:
         check(begun, config, *[30.0] * 20)
     assert "\n" not in str(caught.value)
+
+
+class Shifted(PointEnv):
+    """The same point with another reward."""
+
+    def _state(self, position: jax.Array, reward: jax.Array) -> Any:
+        return super()._state(position, reward + 1)
+
+
+def test_another_reward_is_noticed(
+    reference: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, more = copy(reference, tmp_path), SMALL.replace(iterations=13)
+
+    def factory(env: Any) -> Any:
+        return lambda config: point_task(config, env)
+
+    words = "elites now have other results than in the archive; if the task has changed"
+    evolve(more, out=out, resume=True, task_factory=factory(PointEnv()))
+    assert words not in capsys.readouterr().err
+    more = SMALL.replace(iterations=14)
+    evolve(more, out=out, resume=True, task_factory=factory(Shifted()))
+    error = capsys.readouterr().err
+    found = re.search(r"warning: (\d+) of (\d+) " + words, error)
+    assert found is not None and found[1] == found[2]
+    # nothing is evaluated if no generation follows
+    evolve(more, out=out, resume=True, task_factory=factory(PointEnv()))
+    assert words not in capsys.readouterr().err
+
+
+def test_elites_of_other_starts_are_not_compared(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = SMALL.replace(iterations=1, new_starts=True)
+    run(config, out=tmp_path)
+    more = config.replace(iterations=2)
+    run(more, out=tmp_path, resume=True, progress=True)
+    assert "other results" not in capsys.readouterr().err

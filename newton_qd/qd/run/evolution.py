@@ -296,7 +296,25 @@ def _first(
         folder.go_on(config, anew=checkpoint is None)
     if state.iteration < config.iterations:
         display.note("compiling the physics and the rollout (longer on a first start)")
+        if checkpoint is not None:
+            _warn_of_another_task(search, checkpoint, display)
     return state
+
+
+def _warn_of_another_task(
+    search: Search, checkpoint: Checkpoint, display: Progress
+) -> None:
+    """Says whether elites have other results than before the stop.
+
+    A module may have the same task with another reward. The evaluation is that of a
+    generation, so it needs no other compiling.
+    """
+    changed, count = search.changed(checkpoint)
+    if changed:
+        display.note(
+            f"warning: {changed} of {count} elites now have other results than in the "
+            "archive; if the task has changed, start a new run in another folder"
+        )
 
 
 def _open(

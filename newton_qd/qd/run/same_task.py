@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from newton_qd.checks import Fact, message
@@ -50,6 +53,31 @@ def require_same_task(
     allowed = f"cells {shown[1]}, the limits of the task; start a new run for another "
     allowed += "descriptor; a run with a task_factory needs it again"
     raise ConfigError(message(name, given, allowed))
+
+
+def changed_elites(
+    stored: Archive | Checkpoint,
+    score: Callable[[jax.Array], tuple[jax.Array, jax.Array]],
+    count: int,
+) -> tuple[int, int]:
+    """Evaluates elites again, at most as many as there are in a generation.
+
+    Args:
+        stored: The results.
+        score: Maps genotypes (count, size) to fitnesses (count,) and descriptors
+            (count, D), from the start states of the run.
+        count: Individuals of a generation.
+
+    Returns:
+        How many of them have another fitness or descriptor, and how many there are.
+    """
+    cells = np.flatnonzero(stored.fitnesses > -np.inf)[:count]
+    rows = np.resize(cells, count)  # repeats cells, to have one size
+    fitnesses, found = map(np.asarray, score(jnp.asarray(stored.genotypes[rows])))
+    same = fitnesses.astype(stored.fitnesses.dtype) == stored.fitnesses[rows]
+    places = found.astype(stored.descriptors.dtype) == stored.descriptors[rows]
+    same &= places.all(axis=1)
+    return int((~same[: len(cells)]).sum()), len(cells)
 
 
 def _fit(

@@ -24,26 +24,15 @@ from newton_qd.qd.run.checkpoint import Checkpoint
 from newton_qd.qd.run.folder import COLUMNS, complete_metrics
 from newton_qd.qd.run.generation_parts import Drawn, GenerationParts
 from newton_qd.qd.run.leaves import leaf_to_host, tree_to_device
-from newton_qd.qd.run.reevaluation import (
-    Reevaluated,
-    corrected_fitnesses,
-    reevaluate,
-)
-from newton_qd.qd.run.same_task import require_same_task
+from newton_qd.qd.run.reevaluation import Reevaluated, corrected_fitnesses, reevaluate
+from newton_qd.qd.run.same_task import changed_elites, require_same_task
 from newton_qd.qd.scoring.checked import checked_scoring, why_empty
 from newton_qd.qd.scoring.networks import policy_for
 from newton_qd.qd.scoring.robust import robust, run_scoring
-from newton_qd.qd.scoring.rollout import (
-    episode_of,
-    make_scoring_function,
-)
+from newton_qd.qd.scoring.rollout import episode_of, make_scoring_function
 from newton_qd.qd.scoring.sharding import on_mesh, shard_scoring
 from newton_qd.qd.scoring.task import Task
-from newton_qd.types import (
-    PyTree,
-    Repertoire,
-    ScoringFunction,
-)
+from newton_qd.types import PyTree, Repertoire, ScoringFunction
 
 _KEYS = 4  # keys that follow from the seed of a run
 
@@ -306,6 +295,16 @@ class Search:
             repertoire_of(checkpoint),
             complete_metrics(checkpoint.metrics),
             self._restore_emitter(checkpoint.emitter),
+        )
+
+    def changed(self, checkpoint: Checkpoint) -> tuple[int, int]:
+        """Returns how many elites have other scores now, of how many evaluated ones."""
+        if self._config.new_starts:  # the start states of an elite are not known
+            return 0, 0
+        return changed_elites(
+            checkpoint,
+            lambda genotypes: self._score(genotypes, self._key_reset)[:2],
+            self._config.batch_size,
         )
 
     def _restore_emitter(self, leaves: tuple[np.ndarray, ...]) -> PyTree:
