@@ -6,6 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from newton_qd.qd import (
     load_run,
     make_task,
 )
+from newton_qd.qd.run.cells import cell_centroids
 
 CONFIG = EvolveConfig(
     env_name="pointmaze",
@@ -71,6 +73,23 @@ def test_map_elites_takes_any_length() -> None:
 def test_a_name_for_each_component(labels: tuple[str, ...]) -> None:
     with pytest.raises(ConfigError, match=r"labels: got \d names, and limits of shape"):
         dataclasses.replace(point_task(SMALL), labels=labels)
+
+
+@pytest.mark.parametrize("kind", [tuple, list])
+def test_limits_may_be_sequences(kind: type) -> None:
+    limits: Any = kind((kind((0, 0.0)), kind((1.0, 1))))
+    task = dataclasses.replace(point_task(SMALL), limits=limits)
+    assert cell_centroids(SMALL, task.limits, jax.random.key(0)).shape == (16, 2)
+    for found, known in zip(task.limits, point_task(SMALL).limits, strict=True):
+        assert found.dtype == known.dtype and found.tolist() == known.tolist()
+
+
+@pytest.mark.parametrize(
+    "limits", [None, (("a", "b"), (1, 2)), ((0, (0, 1)), (1, 1)), (None, None)]
+)
+def test_limits_that_are_no_numbers(limits: Any) -> None:
+    with pytest.raises(ConfigError, match=r"^limits: got .*; allowed: lowest and"):
+        dataclasses.replace(point_task(SMALL), limits=limits)
 
 
 def test_limits_of_one_length() -> None:

@@ -15,6 +15,7 @@ from newton_qd.checks import Fact, listed, message, shown
 from newton_qd.envs.shown import component_names
 from newton_qd.extractors import Trajectories, get_final_xy_position, reads_last
 from newton_qd.qd.config import ConfigError, EvolveConfig
+from newton_qd.real_numbers import real_numbers
 from newton_qd.robots import ROBOTS, Material
 from newton_qd.scenes import SCENES, Scene
 from newton_qd.types import DescriptorExtractor
@@ -39,7 +40,7 @@ class Task:
         descriptor_extractor: Maps ``(data, mask)`` to descriptors (N, D), with
             ``data.state_desc`` (N, T, D) and ``mask`` (N, T) equal to 1 after the
             end of an episode.
-        limits: Lowest and highest descriptor, (D,) each.
+        limits: Lowest and highest descriptor, (D,) each. Sequences become arrays.
         labels: D names for the axes of plots.
         reward_offset: Number per control step that makes returns positive, for the QD
             score only.
@@ -61,9 +62,19 @@ class Task:
         """Checks that limits and labels are of the same descriptor.
 
         Raises:
-            ConfigError: They are not.
+            ConfigError: They are not, or limits are no numbers.
         """
-        shapes = tuple(np.shape(limit) for limit in self.limits)
+        allowed = "lowest and highest descriptor, as two arrays of numbers"
+        kinds = (tuple, list, np.ndarray, jax.Array)
+        checks.instance("limits", self.limits, kinds, allowed, error=ConfigError)
+        if any(real_numbers(limit) is None for limit in self.limits):
+            raise ConfigError(message("limits", self.limits, allowed))
+        limits = tuple(
+            limit if checks.is_array(limit) else np.asarray(limit, np.float32)
+            for limit in self.limits
+        )
+        object.__setattr__(self, "limits", limits)
+        shapes = tuple(limit.shape for limit in limits)
         length = len(self.labels)
         if shapes != ((length,), (length,)):
             given = Fact(f"{length} names, and limits of shapes {listed(shapes)}")
