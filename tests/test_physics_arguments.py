@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import pytest
 
@@ -60,3 +61,15 @@ def test_coordinates_are_real_numbers() -> None:
             TypeError, match=r"^q: got 'abc'; allowed: an array of shap"
         ):
             function(SYSTEM, wrong, V)
+
+
+def test_the_result_of_a_rollout_is_no_parameters() -> None:
+    state = physics.initial_state(SYSTEM, Q, V)
+    controls = jnp.zeros((3, SYSTEM.nu))
+    found: Any = physics.rollout(SYSTEM, state, controls)
+    with pytest.raises(TypeError, match=r"^params: got Foreseen.*; allowed: None, or"):
+        physics.step(SYSTEM, state, controls[0], found)
+    env = newton_qd.create("hopper", auto_reset=False)
+    words = r"^params: got the result of a rollout of 3 steps; allowed: None, or"
+    with pytest.raises(ValueError, match=words):
+        env.step(env.reset(jax.random.key(0)), controls[0], found)

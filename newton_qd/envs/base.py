@@ -19,6 +19,7 @@ from newton_qd.envs.renamed import keep_old_names
 from newton_qd.envs.rollouts import RolloutOrder
 from newton_qd.envs.state import State, select
 from newton_qd.physics.explicit_mesh import split_as
+from newton_qd.physics.step import step_or_known
 from newton_qd.physics.system import Kinematics, PhysicsState, System
 from newton_qd.robots import RobotSpec
 from newton_qd.scenes import Scene
@@ -262,7 +263,7 @@ class PhysicsEnv(WithChanges):
         sound = jnp.all(jnp.isfinite(action)) & (state.info["fault"] == 0)
         control = self._number(self.control(start, action))
         control = jnp.where(sound, control, jnp.full_like(control, jnp.nan))
-        after, fault = physics.step(self.system, start, control, params)
+        after, fault = step_or_known(self.system, start, control, params)
         fault = jnp.maximum(state.info["fault"], fault)
         faulty = fault != 0
         action = jnp.where(faulty, jnp.zeros_like(action), action)

@@ -61,6 +61,8 @@ class PhysicsParams:
 
 FIELDS = tuple(field.name for field in dataclasses.fields(PhysicsParams))
 """Names of the parameters, in the order in which the kernels read them."""
+PARAMS = "None, or PhysicsParams, as env.default_params.replace(friction=0.5)"
+"""What a step takes, for errors."""
 _POSITIVE = ("mass_scale", "inertia_scale")
 
 
@@ -146,8 +148,7 @@ def parameter_row(system: System, params: PhysicsParams) -> jax.Array:
             that of the system.
         ValueError: A field has the wrong shape, or a value out of bounds.
     """
-    allowed = "None, or PhysicsParams, as env.default_params.replace(friction=0.5)"
-    checks.instance("params", params, PhysicsParams, allowed)
+    checks.instance("params", params, PhysicsParams, PARAMS)
     dtype = np.dtype(system.dtype)
     return jnp.concatenate(
         [

@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from newton_qd import checks
+from newton_qd.checks import Fact, message
 from newton_qd.physics import bridge
 from newton_qd.physics.inspection import checked_vector, forward_kinematics
 from newton_qd.physics.kinds import JointKind
-from newton_qd.physics.parameters import PhysicsParams, parameter_row
+from newton_qd.physics.parameters import PARAMS, PhysicsParams, parameter_row
 from newton_qd.physics.system import (
     CONTACT_FRACTION,
     PhysicsState,
@@ -123,7 +124,7 @@ def step(
     system: System,
     state: PhysicsState,
     control: jax.Array,
-    params: PhysicsParams | Foreseen | None = None,
+    params: PhysicsParams | None = None,
 ) -> tuple[PhysicsState, jax.Array]:
     """Advances one world by one control step.
 
@@ -132,8 +133,7 @@ def step(
         state: State of the world.
         control: (nu,) actions [-]. They are scaled by the gear and not clipped.
         params: Physical parameters of the world. ``None``: the parameters of the
-            system, with kernels that do not read parameters. ``Foreseen``: the result,
-            which is returned.
+            system, with kernels that do not read parameters.
 
     Returns:
         The next state, and the fault () int32. The fault is 1 if a value was not
@@ -150,12 +150,36 @@ def step(
             variable is not allowed.
     """
     require_physics_state(state)
-    if isinstance(params, Foreseen):
-        return params.after, params.fault
     own = None if params is None else parameter_row(system, params)
     run = bridge.control_step(system)
     after, fault = run(state.q, state.v, control, own)
     return after, fault.astype(jnp.int32)
+
+
+def step_or_known(
+    system: System,
+    state: PhysicsState,
+    control: jax.Array,
+    params: PhysicsParams | Foreseen | None,
+) -> tuple[PhysicsState, jax.Array]:
+    """Returns what :func:`step` returns, or what is known of this step.
+
+    Args:
+        system: The system.
+        state: State of the world.
+        control: (nu,) actions [-].
+        params: Parameters as in :func:`step`, or the result of this one step.
+
+    Raises:
+        TypeError: As :func:`step`.
+        ValueError: As :func:`step`. Or the result is that of several steps.
+    """
+    if not isinstance(params, Foreseen):
+        return step(system, state, control, params)
+    if jnp.shape(params.fault) != ():
+        given = Fact(f"the result of a rollout of {len(params.fault)} steps")
+        raise ValueError(message("params", given, PARAMS))
+    return params.after, params.fault
 
 
 @takes_system
