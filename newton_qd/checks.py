@@ -351,6 +351,7 @@ def array(
     """
     import jax
     import jax.numpy as jnp
+    from jax.core import Tracer
 
     dtype = np.dtype(dtype)
     allowed = f"an array of shape {shape}, {dtype}"
@@ -365,6 +366,9 @@ def array(
     kind = jnp.number if scalars else jnp.floating
     weak = found.weak_type and jnp.issubdtype(found.dtype, kind)
     if found.dtype != dtype and not weak:
+        if isinstance(found, Tracer) and found.shape == shape:
+            # under ``vmap``, the shape of one world would not be what the user sees
+            found, allowed = Fact(f"an array of {found.dtype}"), f"an array of {dtype}"
         raise TypeError(message(name, found, allowed))
     if found.shape != shape:
         batch = " (for a batch, use jax.vmap or create(..., batch_size=...))"

@@ -243,6 +243,21 @@ def test_actions_of_numpy_and_weak_types_are_taken(name: str) -> None:
     assert same(strong, env.step(state, jnp.full((env.action_size,), 0.5)))
 
 
+@pytest.mark.parametrize("batch_size", [None, 3])
+def test_a_wrong_dtype_in_a_batch_names_no_shape_of_one_world(
+    batch_size: int | None,
+) -> None:
+    env = newton_qd.create("pointmaze", batch_size=batch_size)
+    key, step = jax.random.key(0), env.step
+    state = env.reset(key)
+    if batch_size is None:
+        state, step = jax.vmap(env.reset)(jax.random.split(key, 3)), jax.vmap(step)
+    words = r"^action: got an array of int32; allowed: an array of float32\b"
+    for call in (step, jax.jit(step)):
+        with pytest.raises(TypeError, match=words):
+            call(state, jnp.zeros((3, 2), jnp.int32))
+
+
 @pytest.mark.parametrize("name", EVERY_NAME)
 def test_float64_action_is_refused_by_float32(name: str, x64: None) -> None:
     env = make(name)

@@ -192,7 +192,7 @@ def test_errors(torch: Any, door: Any, maze: Any) -> None:
         step(state, torch.zeros(WORLDS, 2, device="meta"))
     with pytest.raises(ValueError, match="action: got an array of shape"):
         step(state, torch.zeros(WORLDS, 3))
-    with pytest.raises(TypeError, match=r"action: got an array of shape .* float16"):
+    with pytest.raises(TypeError, match=r"action: got an array of float16"):
         step(state, torch.zeros(WORLDS, 2, dtype=torch.float16))
 
 
