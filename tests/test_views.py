@@ -15,6 +15,7 @@ from contract import row
 import newton_qd
 from newton_qd import wrappers
 from newton_qd.brax_views import (
+    BODY_NAMES,
     QP,
     BraxState,
     BraxViewsWrapper,
@@ -275,6 +276,20 @@ def test_names_of_bodies_of_an_own_robot() -> None:
     assert index["Claw"] == index["foot_2"] == 4 and "$ Torso" not in index
     with pytest.raises(TypeError, match=r"original_names: got .*BraxViewsWrapper\(env"):
         dataclasses.replace(ANT_SPEC, original_names=(("foot_2", "Claw"),))
+
+
+@pytest.mark.parametrize("name", BODY_NAMES)
+def test_names_of_bodies_of_a_robot_with_another_name(name: str) -> None:
+    own: Any = newton_qd.create(name, brax_views=True)
+    damaged = dataclasses.replace(own.robot, name="damaged")
+    env: Any = newton_qd.create(name, robot=damaged, brax_views=True)
+    assert env.sys.body.index == own.sys.body.index
+    assert own.with_robot(damaged).sys.body.index == own.sys.body.index
+
+
+def test_robots_without_original_names_have_none() -> None:
+    env: Any = newton_qd.create("reacher", brax_views=True)
+    assert "target" in env.sys.body.index and "Target" not in env.sys.body.index
 
 
 def places(env: Any) -> Any:

@@ -56,10 +56,15 @@ BODY_NAMES: Mapping[str, Mapping[str, str]] = types.MappingProxyType(
                 },
             }
         ),
-        "ur5e": types.MappingProxyType({"target": "Target"}),
+        "ur5e": types.MappingProxyType(
+            {"wrist_3_link": "wrist_3_link", "target": "Target"}
+        ),
     }
 )
-"""For each robot, the name of a link's body in the original suite."""
+"""For each robot, the name of a link's body in the original suite.
+
+No other robot of the suite has all links of an entry.
+"""
 
 
 class _Shown:
@@ -119,7 +124,8 @@ class BraxViewsWrapper(Wrapper):
         Args:
             env: The environment.
             body_names: Name of a link's body in the original, if it differs from the
-                name of the link; ``None``: the names in ``BODY_NAMES``.
+                name of the link; ``None``: the names in ``BODY_NAMES``, by the name of
+                the robot or by its links.
         """
         super().__init__(env)
         self._body_names = body_names
@@ -167,7 +173,7 @@ class BraxViewsWrapper(Wrapper):
             inside = inside.env
         names = self._body_names
         if names is None:
-            names = BODY_NAMES.get(system.robot.name, {})
+            names = _original_names(system)
         return SystemView(system, repeat, names)
 
     @property
@@ -186,3 +192,11 @@ class BraxViewsWrapper(Wrapper):
             for field in dataclasses.fields(State)
         }
         return BraxState(**fields, shown=_Shown(system))
+
+
+def _original_names(system: System) -> Mapping[str, str]:
+    """Returns the original names of bodies, also of a robot such as a damaged ant."""
+    if system.robot.name in BODY_NAMES:
+        return BODY_NAMES[system.robot.name]
+    links = set(system.body_names)
+    return next((x for x in BODY_NAMES.values() if x.keys() <= links), {})
