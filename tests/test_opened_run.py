@@ -269,7 +269,15 @@ def test_plot_writes_both_pictures(
     assert drawn == (reference / "archive.png").read_bytes()
     assert (out / "curves.png").read_bytes().startswith(b"\x89PNG")
     assert call("plot", reference, "--out", out / "archive.png") == cli.BAD_ARGUMENTS
+    foreign = out / "config.json"
+    foreign.write_text('{"name": "a site", "settings": {"theme": "dark"}}')
+    assert call("plot", reference, "--out", out) == cli.OK  # of another program
     shutil.copy(reference / "config.json", out)
+    assert call("plot", reference, "--out", out) == cli.BAD_ARGUMENTS
+    assert f"got {out}, the folder of another run" in capsys.readouterr().err
+    # a run of a version with other settings
+    foreign.write_text('{"format": 99, "settings": {}}')
+    shutil.copy(reference / "checkpoint.bin", out)
     assert call("plot", reference, "--out", out) == cli.BAD_ARGUMENTS
     assert f"got {out}, the folder of another run" in capsys.readouterr().err
     missing = tmp_path / "missing"

@@ -11,8 +11,10 @@ from pathlib import Path
 from typing import TextIO, TypeAlias
 
 from newton_qd.checks import message
-from newton_qd.qd.config import ConfigError
+from newton_qd.qd.config import ConfigError, read_config
 from newton_qd.qd.facts import changed_facts, environment_facts
+from newton_qd.qd.run.archive import ARCHIVE
+from newton_qd.qd.run.folder import CHECKPOINT, CONFIG
 from newton_qd.qd.run.interrupt import graceful_stop
 from newton_qd.qd.run.progress import for_stream
 
@@ -70,6 +72,22 @@ def warn_of_changes(facts: dict[str, object], when: str) -> None:
             f"warning: {name} was {old} {when} and is {new} now; the result may differ",
             sys.stderr,
         )
+
+
+def holds_run(folder: Path) -> bool:
+    """Returns whether a folder holds a run, also one of another version.
+
+    Other programs have files of the name ``config.json`` too.
+    """
+    if not (folder / CONFIG).is_file():
+        return False
+    if any((folder / name).is_file() for name in (CHECKPOINT, ARCHIVE)):
+        return True
+    try:
+        read_config(folder / CONFIG)  # of a run that has just begun
+    except ConfigError:
+        return False
+    return True
 
 
 def require_writable(name: str, path: Path) -> None:

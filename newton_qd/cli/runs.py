@@ -20,6 +20,7 @@ from newton_qd.cli.arguments import (
     Commands,
     add_elite_choice,
     complain,
+    holds_run,
     load_physics,
     print_table,
     say,
@@ -27,7 +28,6 @@ from newton_qd.cli.arguments import (
 )
 from newton_qd.files import write_atomically
 from newton_qd.qd.config import ConfigError, EvolveConfig
-from newton_qd.qd.run.folder import RunFolder
 
 if TYPE_CHECKING:
     from newton_qd.qd.run.opened import Elite, Evaluation, Run
@@ -257,7 +257,7 @@ def plot(arguments: argparse.Namespace, task_factory: TaskFactory = None) -> int
     out, why = folder if arguments.out is None else arguments.out, ""
     if out.exists() and not out.is_dir():
         why = "a file"
-    elif RunFolder(out).has_config and folder.exists() and not out.samefile(folder):
+    elif holds_run(out) and folder.exists() and not out.samefile(folder):
         why = "the folder of another run, which has a picture of its own"
     if why:
         refused = message("--out", Fact(str(out)), "a folder, or a new name", why=why)

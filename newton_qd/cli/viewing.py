@@ -16,6 +16,7 @@ from newton_qd.cli.arguments import (
     Commands,
     add_elite_choice,
     complain,
+    holds_run,
     load_physics,
     picture_size,
     require_writable,
@@ -23,7 +24,7 @@ from newton_qd.cli.arguments import (
 from newton_qd.cli.progress import ProgressCount
 from newton_qd.cli.runs import checked_starts, opened
 from newton_qd.qd.config import ConfigError, EvolveConfig
-from newton_qd.qd.run.folder import PICTURE, RunFolder
+from newton_qd.qd.run.folder import PICTURE
 
 if TYPE_CHECKING:
     from newton_qd.qd.run.opened import Run
@@ -281,7 +282,7 @@ def _check_target(out: Path, *, given: bool) -> None:
     if given and not out.parent.is_dir():
         why = f"and {out.parent} is no folder"
         raise ConfigError(message("--out", str(out), "a file in a folder", why=why))
-    if out.name == PICTURE and RunFolder(out.parent).has_config:
+    if out.name == PICTURE and holds_run(out.parent):
         why = "which is the picture of the archive of a run"
         raise ConfigError(message("--out", str(out), "a file of another name", why=why))
     require_writable("--out", out)
