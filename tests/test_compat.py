@@ -19,6 +19,7 @@ from line_env import Line
 
 import newton_qd
 import newton_qd.compat
+import newton_qd.compat.brax_envs
 from newton_qd.compat import finder
 from newton_qd.compat.contents import BRAX_V1, CONTENTS
 from newton_qd.compat.scoring import evaluate
@@ -142,6 +143,26 @@ def test_functions_of_jumpy() -> None:
     assert jp.random_uniform(jp.random_prngkey(0), (9,), -1.0, 0.0).max() <= 0
     assert jp.index_update(x, (1, 0), 7).tolist() == [[3, 4], [7, 0]]
     assert 2 <= jp.randint(jp.random_prngkey(0), low=2, high=4) < 4
+
+
+@pytest.mark.parametrize("name", ["ant", "ur5e"])
+def test_flax_saves_the_leaves_of_a_state(name: str) -> None:
+    from flax import serialization
+
+    env = newton_qd.compat.brax_envs.create(name, episode_length=5)
+    state, pattern = env.reset(jax.random.key(0)), env.reset(jax.random.key(1))
+    with pytest.raises(TypeError, match="State"):  # as the page for QDax says
+        serialization.to_bytes(state)
+    content = serialization.to_bytes(jax.tree.leaves(state))
+    leaves: Any = serialization.from_bytes(jax.tree.leaves(pattern), content)
+    read = jax.tree.unflatten(jax.tree.structure(pattern), leaves)
+    for found, known in zip(leaves, jax.tree.leaves(state), strict=True):
+        np.testing.assert_array_equal(found, known)
+        assert found.dtype == known.dtype
+    action = jnp.zeros(env.action_size)
+    np.testing.assert_array_equal(
+        env.step(read, action).obs, env.step(state, action).obs
+    )
 
 
 def test_installing_is_silent() -> None:
