@@ -104,7 +104,7 @@ def test_another_reward_is_noticed(
     def factory(env: Any) -> Any:
         return lambda config: point_task(config, env)
 
-    words = "elites now have other results than in the archive; if the task has changed"
+    words = "elites now have other results than in the archive. If the task has changed"
     evolve(more, out=out, resume=True, task_factory=factory(PointEnv()))
     assert words not in capsys.readouterr().err
     more = SMALL.replace(iterations=14)

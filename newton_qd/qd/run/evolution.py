@@ -313,7 +313,9 @@ def _warn_of_another_task(
     if changed:
         display.note(
             f"warning: {changed} of {count} elites now have other results than in the "
-            "archive; if the task has changed, start a new run in another folder"
+            "archive. If the task has changed, start a new run in another folder (other "
+            "software, another machine and a GPU can also change the last digits, which "
+            "grow during an episode)"
         )
 
 
