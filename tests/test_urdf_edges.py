@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from urdf_text import built, joint, link, refusal, robot_text, sphere
 
+from newton_qd import physics
 from newton_qd.physics import reference
 from newton_qd.physics.model.elements import is_real
 from newton_qd.physics.model.verify import _same_frame
@@ -54,6 +55,33 @@ def test_a_turned_box_touches_with_its_corners(tmp_path: Path) -> None:
     local = (system.contact_position - [0.1, 0.2, 0.3]) @ turn
     np.testing.assert_allclose(np.abs(local), np.tile([1.0, 2.0, 3.0], (8, 1)))
     assert len(np.unique(np.sign(local), axis=0)) == 8
+
+
+SLIDES = {  # joints from the world to the torso, and what places it on the ground
+    "a slide": ("z", (0, 1.0)),
+    "a slide behind a hinge": ("hz", None),
+    "a slide behind a hinge about it": ("tz", (1, 1.0)),
+    "a slide behind both": ("htz", None),
+    "a slide before the hinge": ("zh", (0, 1.0)),
+    "a slide before and one behind": ("zhz", (0, 1.0)),
+}
+AXES = {"z": "0 0 1", "t": "0 0 1", "h": "0 1 0"}
+
+
+@pytest.mark.parametrize("name", SLIDES)
+def test_a_slide_that_a_hinge_tilts_grounds_nothing(name: str, tmp_path: Path) -> None:
+    """In another pose it would move the torso sideways, and not onto the ground."""
+    kinds, expected = SLIDES[name]
+    names = ["world", *(f"link{i}" for i in range(len(kinds)))]
+    parts = ['<link name="world"/>', *(link(n, sphere(0.1)) for n in names[1:])]
+    for index, kind in enumerate(kinds):
+        axis = f'<axis xyz="{AXES[kind]}"/><origin xyz="0 0 0.3"/>'
+        role = "prismatic" if kind == "z" else "continuous"
+        parts.append(joint(f"j{index}", role, names[index], names[index + 1], axis))
+    torso = names[-1]
+    system = built(tmp_path, robot_text(*parts), torso, contacts=(Contact(torso),))
+    assert physics.grounding_coordinate(system) == expected
+    assert reference.lowest_contact(system, system.rest_q) == pytest.approx(0, abs=1e-9)
 
 
 REFUSED = {

@@ -16,7 +16,8 @@ from newton_qd.physics.system import JointKind, System, takes_system
 def raising_coordinate(system: System) -> tuple[int, float] | None:
     """Finds the coordinate that moves the torso up without rotating it.
 
-    It is that of a free root, or else of the first vertical slide before the torso.
+    It is that of a free root, or else of the first vertical slide before the torso. A
+    slide that a hinge tilts counts only if there is no other one.
 
     Args:
         system: The robot, in the pose ``rest_q``.
@@ -25,18 +26,31 @@ def raising_coordinate(system: System) -> tuple[int, float] | None:
         Index of the coordinate, and the sign that means up. ``None`` if the robot has
         no such coordinate.
     """
+    found = _raising(system)
+    return None if found is None else found[:2]
+
+
+def _raising(system: System) -> tuple[int, float, bool] | None:
+    """Finds the coordinate that moves the torso up in the pose ``rest_q``.
+
+    Returns:
+        Index of the coordinate, the sign that means up, and whether a hinge before it
+        tilts it in other poses. ``None`` if the robot has no such coordinate.
+    """
     frames = reference.body_frames(system, system.rest_q)
     body = system.torso
-    found = None
+    found: tuple[int, float, bool] | None = None
     while body >= 0:
-        start = int(system.q_start[body])
-        if system.joint_kind[body] == JointKind.FREE:
-            return start + 2, 1.0
+        start, kind = int(system.q_start[body]), system.joint_kind[body]
+        if kind == JointKind.FREE:
+            return start + 2, 1.0, False
         side = reference.compose(frames[body], system.child_frame[body])
         axis = reference.rotation_matrix(side[3:]) @ system.joint_axis[body]
-        vertical = system.joint_kind[body] == JointKind.PRISMATIC
-        if vertical and abs(axis[2]) > 1 - 1e-9:
-            found = found or (start, float(np.sign(axis[2])))
+        vertical = abs(axis[2]) > 1 - 1e-9
+        if kind == JointKind.PRISMATIC and vertical and (found is None or found[2]):
+            found = start, float(np.sign(axis[2])), False
+        elif kind == JointKind.REVOLUTE and not vertical and found is not None:
+            found = found[0], found[1], True
         body = int(system.parent[body])
     return found
 
@@ -50,12 +64,13 @@ def grounding_coordinate(system: System) -> tuple[int, float] | None:
 
     Returns:
         Index of the coordinate that moves the torso up, and the sign that means up.
-        ``None`` if the robot has no such coordinate, if its ``RobotSpec`` sets the
-        height, or if the robot has no ground contacts.
+        ``None`` if the robot has no such coordinate or a hinge tilts it, if its
+        ``RobotSpec`` sets the height, or if the robot has no ground contacts.
     """
     if system.robot.rest_height is not None or not len(own_ground_contacts(system)):
         return None
-    return raising_coordinate(system)
+    found = _raising(system)
+    return None if found is None or found[2] else found[:2]
 
 
 def own_ground_contacts(system: System) -> np.ndarray:
