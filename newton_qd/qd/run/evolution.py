@@ -313,9 +313,9 @@ def _warn_of_another_task(
     if changed:
         display.note(
             f"warning: {changed} of {count} elites now have other results than in the "
-            "archive. If the task has changed, start a new run in another folder. (Other "
-            "software, another machine or a GPU can change the last digits, and such a "
-            "change grows during an episode.)"
+            "archive. If the task has changed, start a new run in another folder. "
+            "(Other software, another machine or a GPU can change the last digits, and "
+            "such a change grows during an episode.)"
         )
 
 
