@@ -42,6 +42,28 @@ def test_a_pose_of_other_numbers_has_noise_too(kind: Any) -> None:
     assert np.all(np.asarray(states[0])[3:] != 0)
 
 
+@pytest.mark.parametrize("name", ["hopper", "pointmaze"])
+def test_nothing_is_found_by_debug_nans(name: str) -> None:
+    env = newton_qd.create(name, episode_length=3, eval_metrics=True)
+    with jax.debug_nans(True):
+        state = env.step(env.reset(KEY), jnp.zeros(env.action_size))
+        env.rollout(state, jnp.zeros((2, env.action_size)))
+
+
+def test_debug_nans_finds_the_line_of_a_reward() -> None:
+    class Root(Plain):
+        def outcome(self, before: Any, after: Any, action: Any) -> Any:
+            return jnp.sqrt(after.q[1] - 100.0), False, {}
+
+    env = Root(HOPPER)
+    state = env.reset(KEY)
+    with (
+        jax.debug_nans(True),
+        pytest.raises(FloatingPointError, match="encountered in sqrt"),
+    ):
+        jax.jit(env.step)(state, jnp.zeros(env.action_size))
+
+
 def test_options_are_checked_also_where_python_evaluates_annotations() -> None:
     def init(self: Any, robot: Any, *, cost: Any = 0.1, alive: Any = True) -> None:
         Plain.__init__(self, robot)

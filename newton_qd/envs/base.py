@@ -259,10 +259,11 @@ class PhysicsEnv(WithChanges):
         state, action, params = split_as([state.obs, action], given)
         # NaN control tells the physics to freeze a world. ``outcome`` gets finite
         # numbers instead, so that its gradient is 0 and not 0 * nan ("double where").
+        # The NaN is a constant: jax.debug_nans would find an array that is computed.
         start: PhysicsState = state.pipeline_state
         sound = jnp.all(jnp.isfinite(action)) & (state.info["fault"] == 0)
         control = self._number(self.control(start, action))
-        control = jnp.where(sound, control, jnp.full_like(control, jnp.nan))
+        control = jnp.where(sound, control, jnp.nan)
         after, fault = step_or_known(self.system, start, control, params)
         fault = jnp.maximum(state.info["fault"], fault)
         faulty = fault != 0

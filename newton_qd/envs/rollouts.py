@@ -126,7 +126,7 @@ def _foresee(base: Any, state: State, actions: Action, params: Params) -> Forese
     controls = jnp.asarray(controls, base.dtype)
     # as in ``PhysicsEnv.step``: such a control tells the physics to freeze a world
     sound = jnp.all(jnp.isfinite(actions), axis=1) & (state.info["fault"] == 0)
-    controls = jnp.where(sound[:, None], controls, jnp.full_like(controls, jnp.nan))
+    controls = jnp.where(sound[:, None], controls, jnp.nan)
     return physics_rollout(base.system, start, controls, params)
 
 

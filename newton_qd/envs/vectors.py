@@ -15,7 +15,10 @@ def rounded(product: jax.Array) -> jax.Array:
     batch. It cannot fuse through the selection used here. An optimization barrier does
     not help, because XLA removes barriers before it fuses.
     """
-    return jnp.where(product == product, product, jnp.full_like(product, jnp.nan))
+    if not jnp.issubdtype(jnp.result_type(product), jnp.inexact):
+        return product
+    # a constant, because jax.debug_nans finds an array of NaN that is computed
+    return jnp.where(product == product, product, jnp.nan)
 
 
 def ordered_sum(terms: jax.Array) -> jax.Array:

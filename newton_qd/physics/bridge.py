@@ -240,7 +240,7 @@ def _scanned(
         carry: tuple[jax.Array, jax.Array, jax.Array], control: jax.Array
     ) -> tuple[tuple, tuple]:
         q, v, faulty = carry
-        control = jnp.where(faulty, jnp.full_like(control, jnp.nan), control)
+        control = jnp.where(faulty, jnp.nan, control)
         after, fault = step(q, v, control, params)
         return (after.q, after.v, faulty | (fault > 0)), (after, fault)
 
