@@ -231,6 +231,17 @@ def test_a_descriptor_has_the_type_of_its_environment() -> None:
     assert found.dtype == np.float32 and found.tolist() == [0, 1]
 
 
+def test_a_second_descriptor_of_another_length_is_refused() -> None:
+    """It was accepted, and the first step named the state of another environment."""
+    env = Corners(newton_qd.create("ant_uni", auto_reset=False), "ant_uni")
+    with pytest.raises(
+        ValueError, match=r"^env: got .*FeetContactWrapper, of length 4"
+    ):
+        env.reset(KEY)
+    again = Corners(Corners(Line(), "line"), "line")
+    assert again.reset(KEY).info["state_descriptor"].tolist() == [0, 1]
+
+
 class Place(Corners):
     """A descriptor that is the observation itself."""
 

@@ -18,7 +18,7 @@ from newton_qd.envs.state import State
 from newton_qd.extractors import get_mean_state_descriptor
 from newton_qd.real_numbers import real_numbers, require_real
 from newton_qd.types import Action, Descriptor, DescriptorExtractor, Params, RNGKey
-from newton_qd.wrappers.base import Wrapper
+from newton_qd.wrappers.base import Wrapper, outermost
 
 
 class DescriptorWrapper(Wrapper, QDEnv):
@@ -73,9 +73,11 @@ class DescriptorWrapper(Wrapper, QDEnv):
 
         Raises:
             TypeError: ``describe`` does not return real numbers.
-            ValueError: ``describe`` returns another shape than the limits have, or the
+            ValueError: ``describe`` returns another shape than the limits have, a
+                wrapper inside writes a state descriptor of another length, or the
                 environment is float64 and JAX x64 is off.
         """
+        self._refuse_another_length()
         return self._described(self.env.reset(rng))
 
     def step(self, state: State, action: Action, params: Params = None) -> State:
@@ -93,6 +95,26 @@ class DescriptorWrapper(Wrapper, QDEnv):
             allowed = f"{OWN_STATE}, so a state descriptor of shape {size}"
             raise ValueError(message("state", given, allowed))
         return self._described(self.env.step(state, action, params))
+
+    def _refuse_another_length(self) -> None:
+        """Checks that this wrapper's state descriptor fits the wrappers inside.
+
+        The wrapper inside would refuse the next step, as one of another environment.
+
+        Raises:
+            ValueError: A wrapper inside writes one of another length.
+        """
+        inside = outermost(self.env, DescriptorWrapper)
+        if inside is None:
+            return
+        theirs, own = inside.state_descriptor_length, self.state_descriptor_length
+        if theirs != own:
+            given = Fact(
+                f"an environment with {type(inside).__name__}, of length {theirs}"
+            )
+            allowed = f"one without descriptor, or with one of length {own}"
+            why = f"and {type(self).__name__} would write another one in its place"
+            raise ValueError(message("env", given, allowed, why=why))
 
     def _described(self, state: State) -> State:
         describe = self._checked
