@@ -445,3 +445,37 @@ for count, entered in ((2, False), (4, True)):
 answer = True
 """
     assert devices.answer(code)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("axes", ["Auto", "Explicit"])
+def test_an_episode_with_its_reset_runs_on_a_mesh(devices: Devices, axes: str) -> None:
+    """The loop needs the same types before and after a step, also of parameters."""
+    if axes == "Explicit" and jax.__version_info__ < (0, 10):
+        pytest.skip("before, JAX cannot split random numbers so")
+    code = """
+import newton_qd
+from jax.sharding import AxisType, NamedSharding, PartitionSpec
+from newton_qd.wrappers import RandomParamsWrapper
+env = newton_qd.create("hopper_uni", episode_length=2, eval_metrics=True)
+env = RandomParamsWrapper(env, friction=(0.5, 1.0))
+keys = jax.random.split(jax.random.key(0), 8)
+
+def episode(key):
+    def advance(state, _):
+        state = env.step(state, jnp.full(env.action_size, 0.1))
+        return state, state.reward
+    return jax.lax.scan(advance, env.reset(key), None, length=3)[1]
+
+run, split = jax.vmap(episode), PartitionSpec("x")
+mesh = jax.make_mesh((2,), ("x",), (AxisType.AXES,), devices=jax.devices()[:2])
+expected = jax.jit(run)(keys)
+if AxisType.AXES == AxisType.Auto:
+    each = jax.shard_map(run, mesh=mesh, in_specs=split, out_specs=split)
+    found = jax.jit(each)(keys)
+else:
+    with jax.set_mesh(mesh):
+        found = jax.jit(run)(jax.device_put(keys, NamedSharding(mesh, split)))
+answer = bool(np.array_equal(expected, found))
+"""
+    assert devices.answer(code.replace("AXES", axes)) is True

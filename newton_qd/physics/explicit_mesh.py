@@ -8,6 +8,8 @@ how it is split, and JAX needs a rule for each operation:
   marked. It gives all worlds to every device for other calls.
 - Under ``vmap`` the type of a constant does not tell how the worlds are split. JAX then
   refuses to join a constant with values of the worlds.
+- Inside ``jax.shard_map`` the type of a constant does not vary over the devices. A loop
+  that begins with one then has other types after a step.
 """
 
 from __future__ import annotations
@@ -189,13 +191,14 @@ def mesh_of(values: Any) -> Iterator[None]:
 def split_as(likes: Sequence[jax.Array], values: Tree) -> Tree:
     """Returns values of one world, split over devices as other arrays of this world.
 
-    Nothing changes without a mesh with explicit axes. With one, the values stay the
-    same, bit by bit.
+    Nothing changes without a mesh with explicit axes and outside of ``jax.shard_map``.
+    With them, the values stay the same, bit by bit.
 
     Args:
         likes: Arrays of the world, or its random key.
         values: Pytree of numbers of the world.
     """
+    values = _varying_as(likes, values)
     likes = [like for like in likes if like.size and _on_explicit_mesh(like)]
     if not likes:
         return values
@@ -212,6 +215,32 @@ def split_as(likes: Sequence[jax.Array], values: Tree) -> Tree:
         return value
 
     return jax.tree.map(split, values)
+
+
+def _varying_as(likes: Sequence[jax.Array], values: Tree) -> Tree:
+    """Returns values whose types vary over the axes over which other arrays vary.
+
+    Only inside ``jax.shard_map`` a type varies. A loop over steps needs the same types
+    before and after a step.
+
+    Args:
+        likes: Arrays of the world, or its random key.
+        values: Pytree of numbers of the world.
+    """
+    varying = frozenset().union(*map(_varying, likes))
+    if not varying:
+        return values
+    own: Any = jax.lax
+
+    def vary(value: jax.Array) -> jax.Array:
+        missing = tuple(varying - _varying(value))
+        if not missing:
+            return value
+        if hasattr(own, "pcast"):
+            return own.pcast(value, missing, to="varying")
+        return own.pvary(value, missing)
+
+    return jax.tree.map(vary, values)
 
 
 def rows_split_as(like: jax.Array, values: Tree) -> Tree:

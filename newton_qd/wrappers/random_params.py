@@ -11,6 +11,7 @@ from newton_qd.envs.base import Env
 from newton_qd.envs.inputs import require_state
 from newton_qd.envs.randomization import Range, randomize_params
 from newton_qd.envs.state import State
+from newton_qd.physics.explicit_mesh import split_as
 from newton_qd.physics.parameters import FIELDS
 from newton_qd.types import Action, Params, RNGKey
 from newton_qd.wrappers.base import Wrapper, refuse_second
@@ -63,7 +64,7 @@ class RandomParamsWrapper(Wrapper):
             ValueError: The environment is float64 and JAX x64 is off.
         """
         state = self.env.reset(rng)
-        drawn = self._drawn(jax.random.fold_in(rng, _OWN_KEY))
+        drawn = split_as([rng], self._drawn(jax.random.fold_in(rng, _OWN_KEY)))
         return state.replace(info={**state.info, "params": drawn})
 
     def step(self, state: State, action: Action, params: Params = None) -> State:
