@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
-from urdf_text import built, joint, link, refusal, robot_text, sphere
+from urdf_text import built, joint, link, refusal, robot_text, sphere, write
 
 from newton_qd import physics
 from newton_qd.physics import reference
+from newton_qd.physics.model.description import read_description
 from newton_qd.physics.model.elements import is_real
 from newton_qd.physics.model.verify import _same_frame
 from newton_qd.robots import Contact
@@ -55,6 +57,14 @@ def test_a_turned_box_touches_with_its_corners(tmp_path: Path) -> None:
     local = (system.contact_position - [0.1, 0.2, 0.3]) @ turn
     np.testing.assert_allclose(np.abs(local), np.tile([1.0, 2.0, 3.0], (8, 1)))
     assert len(np.unique(np.sign(local), axis=0)) == 8
+
+
+def test_a_chain_of_many_links_is_read(tmp_path: Path) -> None:
+    """Longer than the calls inside each other that Python allows."""
+    names = [f"link{i}" for i in range(1200)]
+    joints = [joint(f"j_{b}", "continuous", a, b) for a, b in pairwise(names)]
+    path = write(tmp_path, robot_text(*map(link, names), *joints))
+    assert list(read_description(Path(path)).bodies) == names
 
 
 SLIDES = {  # joints from the world to the torso, and what places it on the ground

@@ -285,9 +285,11 @@ def read_description(path: Path, fixed_base: bool | None = None) -> Description:
     bodies: dict[str, Body] = {}
     still: dict[str, np.ndarray] = {}
 
-    def grow(
-        link: Link, joint: Joint | None, parent: str | None, *, fixed: bool = False
-    ) -> None:
+    # a stack, as Python has an end to calls inside each other
+    pending: list[tuple[Link, Joint | None, str | None, bool]]
+    pending = [(root, None, None, not floating)]
+    while pending:
+        link, joint, parent, fixed = pending.pop()
         merged, frames, shapes, moving = _merge_fixed(link, links, children)
         if fixed and link.name == WORLD and (link.shapes or link.mass > 0):
             given = Fact("a collider or a mass")
@@ -299,14 +301,16 @@ def read_description(path: Path, fixed_base: bool | None = None) -> Description:
             still.update((name, at) for name, at in frames.items() if name != WORLD)
         else:
             bodies[link.name] = Body(merged, joint, parent, frames, shapes)
+        holder = None if fixed else link.name
         for next_joint in moving:
             if next_joint.kind == "floating":
                 _check_floating(path, next_joint, fixed)
-                grow(links[next_joint.child], None, None)
+        for next_joint in reversed(moving):
+            child = links[next_joint.child]
+            if next_joint.kind == "floating":
+                pending.append((child, None, None, False))
             else:
-                grow(links[next_joint.child], next_joint, None if fixed else link.name)
-
-    grow(root, None, None, fixed=not floating)
+                pending.append((child, next_joint, holder, False))
     if not bodies:
         raise reader.error(reader.root, "nothing in it moves")
     _check_masses(path, bodies)
