@@ -375,6 +375,13 @@ def test_a_second_episode_wrapper_is_refused() -> None:
             EpisodeWrapper(inside, 3, 1)
 
 
+def test_an_episode_around_an_auto_reset_is_refused() -> None:
+    """Its worlds were done in every step from the end of the first episode on."""
+    inside = newton_qd.create("hopper", episode_length=None)
+    with pytest.raises(ValueError, match=r"^env: got .*AutoResetWrapper, which would"):
+        EpisodeWrapper(inside, 3, 1)
+
+
 def test_a_first_state_of_another_task_is_named() -> None:
     ours, other = (newton_qd.create(name) for name in ("anttrap", "antnotrap"))
     state = jax.eval_shape(other.reset, jax.random.key(0))

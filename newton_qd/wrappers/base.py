@@ -48,7 +48,7 @@ def refuse_second(env: Env, kind: type[Wrapper], why: str) -> None:
     Args:
         env: The environment.
         kind: The class.
-        why: What two of them would do, for the error.
+        why: What it would do inside the new wrapper, for the error.
 
     Raises:
         ValueError: It has one.

@@ -11,6 +11,7 @@ from newton_qd.envs.inputs import require_state
 from newton_qd.envs.rollouts import RolloutOrder
 from newton_qd.envs.state import State
 from newton_qd.types import Action, Params, RNGKey
+from newton_qd.wrappers.auto_reset import AutoResetWrapper
 from newton_qd.wrappers.base import Wrapper, refuse_second
 
 
@@ -38,10 +39,12 @@ class EpisodeWrapper(Wrapper):
 
         Raises:
             ValueError: A number is not an integer above 0, or ``env`` has an
-                ``EpisodeWrapper`` already.
+                ``EpisodeWrapper`` already, or an ``AutoResetWrapper``.
         """
         why = "and both would count in info['steps']; see create(episode_length=None)"
         refuse_second(env, EpisodeWrapper, why)
+        why = "which would not reset worlds at this length; put it around this wrapper"
+        refuse_second(env, AutoResetWrapper, why)
         checks.integer("episode_length", episode_length)
         checks.integer("action_repeat", action_repeat)
         super().__init__(env)
