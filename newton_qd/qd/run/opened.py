@@ -280,10 +280,10 @@ class Run:
     @functools.cached_property
     def _score(self) -> Callable[[jax.Array, jax.Array], tuple]:
         """The scoring function of the loop, compiled: genotypes and their keys."""
-        score = jax.jit(self._plain_scoring())
+        score = jax.jit(self._loop_scoring())
         return lambda genotypes, _: score(genotypes, self.start_key)[:2]
 
-    def _plain_scoring(self) -> ScoringFunction:
+    def _loop_scoring(self) -> ScoringFunction:
         """Returns the scoring function of the loop, without gradients.
 
         Those of the package have the same values with gradients; a registered

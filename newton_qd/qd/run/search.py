@@ -279,7 +279,9 @@ class Search:
     @functools.cached_property
     def _again(self) -> Callable[..., Any]:
         """The compiled scoring function of one start state."""
-        return self._compiled(self._plain_scoring())
+        length = self._config.episode_length
+        score = make_scoring_function(self._task, self._policy, length)
+        return self._compiled(self._split(score))
 
     def restore(self, checkpoint: Checkpoint) -> SearchState:
         """Makes the state of a checkpoint.
@@ -345,11 +347,6 @@ class Search:
         name, measures = self._algorithm.name, self._task.descriptor_length
         score = checked_scoring(score, name, measures)
         return self._split(robust(score, self._config, self._task))
-
-    def _plain_scoring(self) -> ScoringFunction:
-        """Returns a scoring function of one start state, split over the mesh."""
-        length = self._config.episode_length
-        return self._split(make_scoring_function(self._task, self._policy, length))
 
     def _split(self, score: ScoringFunction) -> ScoringFunction:
         return score if self._mesh is None else shard_scoring(score, self._mesh)
