@@ -52,7 +52,7 @@ def distribution(results: Results, stop: str, path: Path) -> None:
 
 
 def ratios(results: Results, stops: list[str], path: Path) -> None:
-    """Plots our ratio to the best other algorithm, by task and stop.
+    """Plots our ratio to the best baseline, by task and stop.
 
     A filled mark: the intervals do not overlap. Tasks with the highest ratios are at
     the top. A stop without a ratio is left out.
@@ -91,7 +91,7 @@ def ratios(results: Results, stops: list[str], path: Path) -> None:
     panel.set_yticks(range(len(order)), order)
     panel.grid(axis="x", color="0.9")
     panel.set_axisbelow(True)
-    panel.set_xlabel("corrected QD score: ours as a ratio to the best other algorithm")
+    panel.set_xlabel("corrected QD score: ours as a ratio to the best baseline")
     panel.plot([], [], "ow", markeredgecolor="0.4", label="hollow: not apart")
     panel.legend(fontsize=8, loc="lower right")
     drawing.tight_layout()

@@ -2,7 +2,7 @@
 
 A run that was made more than once is reported once. The first table says how much runs
 with the same settings and seed differ at a stop. The second one has the ratio of our
-chosen variant to the best other one with the reported runs, with the least favourable
+chosen variant to the best baseline with the reported runs, with the least favourable
 ones (the lowest of ours and the highest of the other, for each seed), and with the
 means of all:
 
@@ -86,7 +86,7 @@ def again(runs: Runs) -> tuple[str, str]:
 
 
 def ratios(runs: Runs, main: set[tuple[str, str]]) -> str:
-    """Markdown table of our chosen variant and the best other one of each task.
+    """Markdown table of our chosen variant and the best baseline of each task.
 
     Tasks where neither of them was made again are left out.
     """
@@ -105,7 +105,7 @@ def ratios(runs: Runs, main: set[tuple[str, str]]) -> str:
             continue
         cells = [_compared(*pair, *picks) for picks in PICKS.values()]
         rows.append([task, ours, best, *cells])
-    return markdown(["task", "ours", "best other", *PICKS], rows)
+    return markdown(["task", "ours", "best baseline", *PICKS], rows)
 
 
 def _best(side: dict[str, Seeds]) -> str:

@@ -213,7 +213,7 @@ def sides_of(
 def to_best_other(
     results: Results, task: str, stop: str, rival: str | None = None
 ) -> tuple[float, str, int] | None:
-    """Compares our best algorithm with the best other one; enough seeds count first.
+    """Compares our best algorithm with the best baseline; enough seeds count first.
 
     The arguments are those of ``sides_of``.
 

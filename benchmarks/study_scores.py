@@ -124,7 +124,7 @@ def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def overview(results: Results, rival: str | None = None) -> str:
-    """Markdown table: our ratio to the best other algorithm, by task and stop.
+    """Markdown table: our ratio to the best baseline, by task and stop.
 
     Those with enough seeds count first. With ``rival``, only this other algorithm
     counts. Bold: the intervals do not overlap. Stops where nothing can be compared are
@@ -182,12 +182,12 @@ def against(results: Results, rival: str, stops: Sequence[str]) -> str:
 
 
 def verdict(results: Results, stop: str) -> str:
-    """Markdown table: our best algorithm and the best other one of each task.
+    """Markdown table: our best algorithm and the best baseline of each task.
 
     Ours has the chosen variant. Others have the one that is best here, of those with
     enough seeds, if there are any.
     """
-    head = "task", "our best: corrected QD score", "best other", "ratio", "intervals"
+    head = "task", "our best: corrected QD score", "best baseline", "ratio", "intervals"
     rows = []
     for task in sorted({key[0] for key in results}):
         sides = sides_of(results, task, stop)
