@@ -8,10 +8,20 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from point_runs import SMALL, compile_once, point_task, reference, run
+from point_runs import (
+    SMALL,
+    PointEnv,
+    PointState,
+    compile_once,
+    point_task,
+    reference,
+    run,
+)
 
+import newton_qd
 from newton_qd import cli
 from newton_qd.qd import load_run, make_scoring_function
 from newton_qd.qd.config import EvolveConfig
@@ -68,6 +78,22 @@ def test_a_run_is_shown_in_one_line(found: Run, reference: Path) -> None:
     filled, cells = len(found.cells), len(found.archive.centroids)
     shown = f"<Archive: {filled} of {cells} cells, {found.policy.size} weights each>"
     assert repr(found.archive) == shown
+
+
+def test_a_run_takes_another_environment(found: Run) -> None:
+    class Weak(PointEnv):
+        def step(self, state: PointState, action: jax.Array) -> PointState:
+            return super().step(state, jnp.float32(0.5) * action)
+
+    other = found.with_env(Weak())
+    assert np.array_equal(other.archive.fitnesses, found.archive.fitnesses)
+    own, new = found.evaluate(), other.evaluate()
+    assert np.array_equal(own.fitnesses, found.archive.fitnesses[own.cells])
+    assert not np.array_equal(own.fitnesses, new.fitnesses)
+    with pytest.raises(ValueError, match=r"^env: got an environment with 11 obs"):
+        found.with_env(newton_qd.create("hopper", auto_reset=False))
+    with pytest.raises(TypeError, match=r"^env: got 3"):
+        found.with_env(3)  # type: ignore[arg-type]
 
 
 def test_elites_are_found(found: Run) -> None:

@@ -30,7 +30,8 @@ from newton_qd.files import write_atomically
 from newton_qd.qd.config import ConfigError, EvolveConfig
 
 if TYPE_CHECKING:
-    from newton_qd.qd.run.opened import Elite, Evaluation, Run
+    from newton_qd.qd.run.evaluation import Evaluation
+    from newton_qd.qd.run.opened import Elite, Run
     from newton_qd.qd.scoring.task import Task
 
     TaskFactory = Callable[[EvolveConfig], Task] | None

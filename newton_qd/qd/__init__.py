@@ -39,8 +39,9 @@ if TYPE_CHECKING:
     from newton_qd.qd.emitters.annealed_repertoire import AnnealedRepertoire
     from newton_qd.qd.run.archive import Archive, ArchiveError, load_archive
     from newton_qd.qd.run.checkpoint import CheckpointError
+    from newton_qd.qd.run.evaluation import Evaluation
     from newton_qd.qd.run.evolution import EvolveResult, evolve
-    from newton_qd.qd.run.opened import Elite, Evaluation, Run, load_run
+    from newton_qd.qd.run.opened import Elite, Run, load_run
     from newton_qd.qd.run.plot import plot_archive
     from newton_qd.qd.run.reevaluation import Reevaluated, reevaluate
     from newton_qd.qd.run.search import SearchError
@@ -108,7 +109,7 @@ _HOME = {
     "ConfigError": ".config",
     "Elite": ".run.opened",
     "EmitterContext": ".algorithms",
-    "Evaluation": ".run.opened",
+    "Evaluation": ".run.evaluation",
     "EvolveConfig": ".config",
     "EvolveResult": ".run.evolution",
     "Options": ".algorithms.options",

@@ -9,17 +9,17 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from newton_qd import checks
 from newton_qd.checks import Fact, message
 from newton_qd.envs.inputs import require_key
 from newton_qd.errors import require_extra
-from newton_qd.qd.algorithms import ALGORITHMS, algorithm_named
+from newton_qd.gradients.episode_input import check_length
+from newton_qd.qd.algorithms import algorithm_named
 from newton_qd.qd.config import EvolveConfig, read_config
 from newton_qd.qd.run.archive import Archive, repertoire_of
+from newton_qd.qd.run.evaluation import Evaluation, Evaluator
 from newton_qd.qd.run.folder import CONFIG, REEVALUATED
 from newton_qd.qd.run.plot_grid import grid_indices
 from newton_qd.qd.run.progress import results_text
@@ -28,11 +28,10 @@ from newton_qd.qd.run.results import read_reevaluated, read_results
 from newton_qd.qd.run.same_task import require_same_task
 from newton_qd.qd.run.search import start_key
 from newton_qd.qd.scoring.networks import policy_for
-from newton_qd.qd.scoring.robust import robust, run_scoring
-from newton_qd.qd.scoring.rollout import Policy, episode_of
+from newton_qd.qd.scoring.rollout import Policy
 from newton_qd.qd.scoring.task import Task, made_task, make_task, randomized
 from newton_qd.real_numbers import real_numbers
-from newton_qd.types import Repertoire, RNGKey, ScoringFunction
+from newton_qd.types import Environment, Repertoire, RNGKey
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -53,24 +52,6 @@ class Elite:
     genotype: np.ndarray
     fitness: float
     descriptor: np.ndarray
-
-
-@dataclasses.dataclass(frozen=True)
-class Evaluation:
-    """Results of elites that were evaluated again.
-
-    N is the number of cells and K the number of keys. A single cell has no axis N, and
-    a single key no axis K.
-
-    Attributes:
-        cells: (N,) rows of the archive.
-        fitnesses: (N, K) fitnesses, ``-inf`` after a fault.
-        descriptors: (N, K, D) descriptors.
-    """
-
-    cells: np.ndarray
-    fitnesses: np.ndarray
-    descriptors: np.ndarray
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -209,12 +190,33 @@ class Run:
         rows, alone = self._rows(cell)
         genotypes = np.stack([self.elite(row).genotype for row in rows.tolist()])
         if keys is None:
-            fitnesses, found = self._chunks(self._score, genotypes)
+            fitnesses, found = self._evaluator.as_in_run(genotypes)
         else:
-            fitnesses, found = self._from_keys(genotypes, keys)
+            fitnesses, found = self._evaluator.from_keys(genotypes, keys)
         if alone:
             return Evaluation(rows[0], fitnesses[0], found[0])
         return Evaluation(rows, fitnesses, found)
+
+    def with_env(self, env: Environment) -> Run:
+        """Returns the same run with another environment, such as a damaged robot.
+
+        Its elites keep their fitnesses and descriptors in the archive. ``evaluate`` and
+        ``record_elites`` use the new environment.
+
+        Args:
+            env: Environment of one world without auto-reset, with as many observations
+                and actions.
+
+        Raises:
+            TypeError: ``env`` is no environment.
+            ValueError: It has other sizes, or ends episodes before.
+        """
+        checks.environment(env)
+        check_length(env, self.config.episode_length)
+        new, own = (_sizes(one) for one in (env, self.task.env))
+        if new != own:
+            raise ValueError(message("env", Fact(new), own))
+        return dataclasses.replace(self, task=dataclasses.replace(self.task, env=env))
 
     def plot(self) -> Figure:
         """Draws the archive.
@@ -235,6 +237,10 @@ class Run:
         from newton_qd.qd.run.plot_curves import curves_figure
 
         return curves_figure(self.metrics, self.config, self.reevaluated)
+
+    @functools.cached_property
+    def _evaluator(self) -> Evaluator:
+        return Evaluator(self.config, self.task, self.policy, self.start_key)
 
     def _rows(
         self, cell: int | Sequence[int] | np.ndarray | None
@@ -277,72 +283,11 @@ class Run:
             raise IndexError(message("cell", cell, f"integers from 0 to {count - 1}"))
         return int(cell)
 
-    @functools.cached_property
-    def _score(self) -> Callable[[jax.Array, jax.Array], tuple]:
-        """The scoring function of the loop, compiled: genotypes and their keys."""
-        score = jax.jit(self._loop_scoring())
-        return lambda genotypes, _: score(genotypes, self.start_key)[:2]
 
-    def _loop_scoring(self) -> ScoringFunction:
-        """Returns the scoring function of the loop, without gradients.
-
-        Those of the package have the same values with gradients; a registered
-        algorithm may score differently.
-        """
-        config, spec = self.config, algorithm_named(self.config.algorithm)
-        if spec in ALGORITHMS or spec.scoring is None:
-            return run_scoring(config, self.task, self.policy)
-        options = spec.read_options(config)
-        score = spec.scoring(config, options, self.task, self.policy)
-        return robust(score, config, self.task)
-
-    @functools.cached_property
-    def _pairs(self) -> Callable[[jax.Array, jax.Array], tuple]:
-        """Evaluates genotypes (N, size), each from its own key (N,)."""
-        episode = episode_of(self.task, self.policy, self.config.episode_length)
-
-        def pairs(genotypes: jax.Array, keys: jax.Array) -> tuple:
-            found = jax.vmap(episode)(genotypes, keys)
-            return found.fitness, found.descriptor
-
-        return jax.jit(pairs)
-
-    def _from_keys(
-        self, genotypes: np.ndarray, keys: RNGKey
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Evaluates each genotype from each key."""
-        # keys of the old kind are integers (2,)
-        old = not jnp.issubdtype(keys.dtype, jax.dtypes.prng_key)
-        shape = keys.shape[:-1] if old else keys.shape
-        flat = keys.reshape((-1, keys.shape[-1]) if old else (-1,))
-        fitnesses, found = self._chunks(
-            self._pairs,
-            np.repeat(genotypes, len(flat), axis=0),
-            jnp.tile(flat, (len(genotypes), 1) if old else len(genotypes)),
-        )
-        leading = (len(genotypes), *shape)
-        return fitnesses.reshape(leading), found.reshape(*leading, -1)
-
-    def _chunks(
-        self,
-        evaluate: Callable[[jax.Array, jax.Array], tuple],
-        genotypes: np.ndarray,
-        keys: jax.Array | None = None,
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Evaluates in batches of the size of a generation.
-
-        One size is compiled once. It is the size of the run, because sums of a policy
-        could depend on it.
-        """
-        size, count = self.config.batch_size, len(genotypes)
-        fitnesses, descriptors = [], []
-        for begin in range(0, count, size):
-            rows = np.minimum(np.arange(begin, begin + size), count - 1)
-            some = self.start_key if keys is None else keys[rows]
-            fitness, descriptor = evaluate(jnp.asarray(genotypes[rows]), some)
-            fitnesses.append(np.asarray(fitness))
-            descriptors.append(np.asarray(descriptor))
-        return np.concatenate(fitnesses)[:count], np.concatenate(descriptors)[:count]
+def _sizes(env: Environment) -> str:
+    """Returns what a policy must fit, as text."""
+    sizes = f"{env.observation_size} observations and {env.action_size} actions"
+    return f"an environment with {sizes}"
 
 
 def load_run(
