@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from newton_qd.checks import listed, message
 from newton_qd.qd.algorithms.critic_options import (
@@ -17,6 +17,8 @@ from newton_qd.qd.config import ConfigError, EvolveConfig
 
 if TYPE_CHECKING:
     import jax
+
+    from newton_qd.qd.scoring.task import Task
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -61,6 +63,35 @@ class DCRLMEOptions(CriticOptions):
             allowed += f"({config.batch_size})"
             raise ConfigError(message(names, sizes, allowed))
         return found
+
+
+@dataclasses.dataclass(frozen=True)
+class _Described:
+    """What QDax's emitter reads of an environment, with the descriptor of the task.
+
+    Limits of the environment may be infinite, or missing.
+
+    Attributes:
+        observation_size: Length of an observation.
+        action_size: Length of an action.
+        descriptor_length: Number D of components of the descriptor.
+        descriptor_limits: Lowest and highest descriptor, (D,) each.
+    """
+
+    observation_size: int
+    action_size: int
+    descriptor_length: int
+    descriptor_limits: tuple[jax.Array, jax.Array]
+
+    @classmethod
+    def of(cls, task: Task) -> _Described:
+        """Returns the sizes and limits of a task."""
+        import jax.numpy as jnp
+
+        low, high = (jnp.asarray(limit, jnp.float32) for limit in task.limits)
+        env = task.env
+        sizes = env.observation_size, env.action_size, task.descriptor_length
+        return cls(*sizes, (low, high))
 
 
 def _make(context: EmitterContext, options: DCRLMEOptions) -> Any:
@@ -111,7 +142,7 @@ def _make(context: EmitterContext, options: DCRLMEOptions) -> Any:
             DCRLMEConfig(**{**dataclasses.asdict(options), **shares}),
             context.policy.network,
             actor,
-            task.env,
+            cast("Any", _Described.of(task)),
             isoline(config),
         )
         return with_own_isoline(emitter, config)

@@ -1,0 +1,57 @@
+"""Episodes with numbers that are not finite teach no emitter anything."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from point_runs import SMALL, PointEnv, point_task
+
+import newton_qd.compat
+from newton_qd.qd.run.search import Search
+
+# QDax and what it imports warn about their own use of other packages.
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
+
+CRITIC = {
+    "critic_hidden_layer_size": (8,),
+    "num_critic_training_steps": 4,
+    "num_pg_training_steps": 2,
+    "batch_size": 32,
+    "replay_buffer_size": 1024,
+}
+
+
+def critic_of(name: str, env: Any, starts: int = 1) -> tuple[Any, np.ndarray]:
+    """State of an emitter after some generations, and their rejected individuals."""
+    config = SMALL.replace(algorithm=name, options=CRITIC, starts=starts)
+    newton_qd.compat.install()
+    try:
+        search = Search(config, point_task(config, env))
+        state = search.empty()
+        for _ in range(4):
+            state = search.advance(state)
+    finally:
+        newton_qd.compat.uninstall()
+    return state.emitter, state.metrics[:, 3]
+
+
+class Unlimited(PointEnv):
+    """An environment whose descriptor has no limits, so the task sets them."""
+
+    state_descriptor_length = 2
+    descriptor_length = 2
+    descriptor_limits = (jnp.full(2, -jnp.inf), jnp.full(2, jnp.inf))
+
+
+@pytest.mark.parametrize("env", [PointEnv, Unlimited])
+def test_limits_of_a_task_are_those_of_dcrl_me(env: type) -> None:
+    state, rejected = critic_of("dcrl-me", env())
+    assert rejected.max() < SMALL.batch_size / 4
+    weights = [x for x in jax.tree.leaves(state) if jnp.ndim(x) == 2]
+    assert all(
+        np.isfinite(x).all() for x in weights if x.shape[0] != 1024 and len(x) < 1000
+    )
