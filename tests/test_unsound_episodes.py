@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from point_runs import SMALL, PointEnv, point_task
+from point_runs import SMALL, PointEnv, PointState, point_task
 
 import newton_qd.compat
 from newton_qd.qd.run.search import Search
@@ -25,6 +26,19 @@ CRITIC = {
 }
 
 
+class Broken(PointEnv):
+    """A point whose reward is NaN on the right."""
+
+    state_descriptor_length = 2
+
+    def step(self, state: PointState, action: jax.Array) -> PointState:
+        found = super().step(state, action)
+        right = found.pipeline_state[0] > 0.4
+        return dataclasses.replace(
+            found, reward=jnp.where(right, jnp.nan, found.reward)
+        )
+
+
 def critic_of(name: str, env: Any, starts: int = 1) -> tuple[Any, np.ndarray]:
     """State of an emitter after some generations, and their rejected individuals."""
     config = SMALL.replace(algorithm=name, options=CRITIC, starts=starts)
@@ -37,6 +51,30 @@ def critic_of(name: str, env: Any, starts: int = 1) -> tuple[Any, np.ndarray]:
     finally:
         newton_qd.compat.uninstall()
     return state.emitter, state.metrics[:, 3]
+
+
+@pytest.mark.parametrize("starts", [1, 2])
+@pytest.mark.parametrize("name", ["pga-me", "dcrl-me"])
+def test_a_nan_does_not_stay_in_a_critic(name: str, starts: int) -> None:
+    state, rejected = critic_of(name, Broken(), starts)
+    assert rejected[0] > 0
+    assert rejected[-1] < SMALL.batch_size / 2
+    state = jax.tree.map(
+        lambda x: (
+            jax.random.key_data(x)
+            if jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+            else x
+        ),
+        state,
+    )
+    weights = [x for x in jax.tree.leaves(state) if x.dtype == jnp.float32]
+    buffers = [x for x in weights if x.shape[0:1] == (1024,)]
+    assert len(buffers) == 1  # the rest of it is empty
+    filled = SMALL.batch_size * SMALL.episode_length * starts * 4
+    assert np.isfinite(buffers[0][: min(filled, 1024)]).all()
+    for leaf in weights:
+        if leaf.shape[0:1] != (1024,):
+            assert np.isfinite(leaf).all()
 
 
 class Unlimited(PointEnv):

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import jax
+import jax.numpy as jnp
 
 from newton_qd.qd.scoring.rollout import Policy
 from newton_qd.types import ExtraScores, Genotype, PyTree, Repertoire
@@ -55,6 +56,7 @@ class OfParameters:
         return jax.vmap(self._policy.unravel)(genotypes)
 
     def _told(self, told: dict[str, PyTree]) -> dict[str, PyTree]:
+        told = _without_unsound(told)
         extra = told["extra_scores"]
         return {
             **told,
@@ -65,3 +67,40 @@ class OfParameters:
                 "transitions": self._convert(extra["transitions"]),
             },
         }
+
+
+def _without_unsound(told: dict[str, PyTree]) -> dict[str, PyTree]:
+    """Replaces episodes with numbers that are not finite by those of others.
+
+    A replay buffer keeps what it is told, and a single NaN in it would make the weights
+    of the critic NaN for the rest of a run.
+
+    Args:
+        told: What the emitter is told, with ``transitions`` (N, T, ...).
+
+    Returns:
+        The same with the episodes and descriptors of sound individuals in place of
+        those of others, and zeros if no individual is sound.
+    """
+    extra = told["extra_scores"]
+    steps = extra["transitions"]
+    number = len(told["descriptors"])
+    sound = jnp.ones((number,), bool)
+    for leaf in jax.tree.leaves(steps):
+        sound = sound & jnp.all(jnp.isfinite(leaf.reshape(number, -1)), axis=1)
+    own = jnp.arange(number)
+    sound_first = jnp.argsort(~sound, stable=True)
+    other = sound_first[own % jnp.maximum(jnp.sum(sound), 1)]
+    source = jnp.where(sound, own, other)
+
+    def replaced(leaf: jax.Array) -> jax.Array:
+        return jnp.where(jnp.any(sound), leaf[source], jnp.zeros_like(leaf))
+
+    descriptors = ("episode_descriptors",) if "episode_descriptors" in extra else ()
+    names = ("transitions", *descriptors)
+    found = {name: jax.tree.map(replaced, extra[name]) for name in names}
+    return {
+        **told,
+        "descriptors": replaced(told["descriptors"]),
+        "extra_scores": {**extra, **found},
+    }
