@@ -12,6 +12,7 @@ import pytest
 from point_runs import SMALL, PointEnv, PointState, point_task
 
 import newton_qd.compat
+from newton_qd.qd.algorithms.me_es import _neutral
 from newton_qd.qd.run.search import Search
 
 # QDax and what it imports warn about their own use of other packages.
@@ -93,3 +94,18 @@ def test_limits_of_a_task_are_those_of_dcrl_me(env: type) -> None:
     assert all(
         np.isfinite(x).all() for x in weights if x.shape[0] != 1024 and len(x) < 1000
     )
+
+
+def test_failed_samples_of_me_es_lead_nowhere() -> None:
+    fitnesses = jnp.asarray([1.0, -jnp.inf, 3.0, 5.0])
+    found = jnp.asarray([[0.0, 2.0], [7.0, 7.0], [1.0, jnp.nan], [4.0, 4.0]])
+
+    def score(genotypes: Any, key: Any) -> Any:
+        del genotypes, key
+        return fitnesses, found, {}
+
+    ranked = _neutral(score, finite=False)(None, None)  # pyright: ignore[reportArgumentType]
+    assert ranked[0].tolist() == [1, -np.inf, 3, 5]
+    assert ranked[1].tolist() == [[0, 2], [2, 3], [2, 3], [4, 4]]
+    plain = _neutral(score, finite=True)(None, None)  # pyright: ignore[reportArgumentType]
+    assert plain[0].tolist() == [1, 1, 1, 5]

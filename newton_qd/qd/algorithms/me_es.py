@@ -14,6 +14,8 @@ from newton_qd.qd.config import ConfigError, EvolveConfig
 if TYPE_CHECKING:
     import jax
 
+    from newton_qd.types import ScoringFunction
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class MEESOptions(Options):
@@ -86,10 +88,43 @@ def _make(context: EmitterContext, options: MEESOptions) -> Any:
         total_generations=max(
             context.config.iterations + 1, options.novelty_nearest_neighbors
         ),
-        scoring_fn=context.score,
+        scoring_fn=_neutral(context.score, finite=not options.sample_rank_norm),
         num_descriptors=context.task.descriptor_length,
     )
     return _FromOne(emitter)
+
+
+def _neutral(score: ScoringFunction, *, finite: bool) -> ScoringFunction:
+    """Returns a scoring function whose failed samples lead a search nowhere.
+
+    The novelty of a NaN is a NaN, and would rank above all others.
+
+    Args:
+        score: Scoring function of the samples.
+        finite: Whether fitnesses must be finite, because they are no ranks.
+
+    Returns:
+        The same function. A sample without a finite fitness and descriptor gets the
+        mean descriptor of the others, and with ``finite`` their lowest fitness.
+    """
+    import jax.numpy as jnp
+
+    from newton_qd.qd.scoring.gradient_scores import finite_scores
+
+    def scored(
+        genotypes: jax.Array, key: jax.Array
+    ) -> tuple[jax.Array, jax.Array, dict[str, Any]]:
+        fitnesses, found, extra = score(genotypes, key)
+        sound = finite_scores(fitnesses, found)
+        kept = jnp.where(sound[:, None], found, 0)
+        mean = jnp.sum(kept, axis=0) / jnp.maximum(jnp.sum(sound), 1)
+        if finite:
+            lowest = jnp.min(jnp.where(sound, fitnesses, jnp.inf))
+            lowest = jnp.where(jnp.any(sound), lowest, 0)
+            fitnesses = jnp.where(sound, fitnesses, lowest)
+        return fitnesses, jnp.where(sound[:, None], found, mean), extra
+
+    return scored
 
 
 def _check_parents(options: MEESOptions, cells: int) -> None:
