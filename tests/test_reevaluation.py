@@ -46,6 +46,7 @@ SOUND = [(3.0, 0.3), (5.0, 0.6), (4.0, 0.7)]
         ([(EMPTY, np.nan)] * 2, 3.0),
         ([(EMPTY, 0.1)] * 2, 3.0),
         ([(EMPTY, 0.2), (EMPTY, np.nan)], 3.0),
+        ([(np.nan, 0.2), (np.inf, 0.2)], 3.0),
     ],
 )
 def test_descriptors_of_faults_do_not_count(faults: list, fitness: float) -> None:

@@ -122,8 +122,9 @@ def corrected_fitnesses(
 ) -> np.ndarray | None:
     """Returns the fitness (cells,) of each cell after the elites were evaluated again.
 
-    A fitness of ``-inf`` counts in the median of the fitnesses, but the descriptor of
-    such an evaluation has no meaning. An elite with no other evaluation is left out.
+    A fitness that is not finite counts as ``-inf`` in the median of the fitnesses. The
+    descriptor of such an evaluation has no meaning. An elite with no other evaluation
+    is left out.
 
     Args:
         archive: Archive with at least one elite.
@@ -148,8 +149,10 @@ def corrected_fitnesses(
         fitness, descriptor, _ = score(genotypes, call_key)
         fitnesses.append(np.asarray(fitness, np.float64).reshape(len(descriptor)))
         descriptors.append(np.asarray(descriptor, np.float64))
-    fitness = np.median(fitnesses, axis=0)
-    middle, known = _middle(np.stack(fitnesses), np.stack(descriptors))
+    found = np.stack(fitnesses)
+    found[~np.isfinite(found)] = -np.inf
+    fitness = np.median(found, axis=0)
+    middle, known = _middle(found, np.stack(descriptors))
     cells = _cells(middle, archive.centroids)
     best = np.full(len(archive.centroids), -np.inf)
     np.maximum.at(best, cells[known], fitness[known])
