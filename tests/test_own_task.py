@@ -56,6 +56,22 @@ def test_steering_needs_the_length_of_the_state_descriptor(name: str) -> None:
         evolve(CONFIG.replace(algorithm=name), task_factory=task_of, progress=False)
 
 
+@pytest.mark.parametrize("name", ["me", "me-es"])
+@pytest.mark.parametrize("starts", [1, 2])
+def test_descriptors_are_as_long_as_the_limits(name: str, starts: int) -> None:
+    """JAX would broadcast a single component into both columns of the archive."""
+
+    def task_of(config: EvolveConfig) -> Task:
+        def single(data: Any, mask: Any) -> Any:
+            return latent(data, mask)[:, :1]
+
+        return dataclasses.replace(make_task(config), descriptor_extractor=single)
+
+    config = CONFIG.replace(algorithm=name, starts=starts)
+    with pytest.raises(ConfigError, match=r"of length 1; allowed: length 2, as the"):
+        evolve(config, task_factory=task_of, progress=False)
+
+
 def test_a_run_is_no_longer_than_the_episodes_of_its_environment() -> None:
     longer = CONFIG.replace(episode_length=6)
     with pytest.raises(

@@ -17,6 +17,7 @@ from newton_qd.envs.inputs import require_key
 from newton_qd.errors import require_extra
 from newton_qd.gradients.episode import Episode
 from newton_qd.gradients.flow import EXACT, GradientOptions
+from newton_qd.qd.config import ConfigError
 from newton_qd.qd.scoring.task import Task
 from newton_qd.types import (
     Environment,
@@ -190,7 +191,8 @@ def make_scoring_function(
             each.
         If the world had a fault or a result is not finite, the fitness is ``-inf``, and
         archives do not take the individual. The function raises ``ValueError`` for
-        genotypes that are not weights of this policy.
+        genotypes that are not weights of this policy, and ``ConfigError`` for
+        descriptors of another length than the limits of the task.
 
     Raises:
         ValueError: ``episode_length`` is not an integer from 1.
@@ -201,6 +203,13 @@ def make_scoring_function(
     def score(
         genotypes: Genotype, key: RNGKey
     ) -> tuple[jax.Array, jax.Array, ExtraScores]:
-        return evaluate(policy.weights(genotypes), key)
+        found = evaluate(policy.weights(genotypes), key)
+        length = found[1].shape[-1]
+        if length != task.descriptor_length:
+            # JAX would broadcast a descriptor with one component into the archive
+            given = Fact(f"descriptors of length {length}")
+            allowed = f"length {task.descriptor_length}, as the limits of the task have"
+            raise ConfigError(message("descriptor_extractor", given, allowed))
+        return found
 
     return score
