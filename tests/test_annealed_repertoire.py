@@ -173,6 +173,14 @@ def test_a_fitness_at_the_threshold_does_not_enter() -> None:
     assert (found.result.fitnesses == FLOOR).sum() == 1
 
 
+def test_whole_fitnesses_do_not_round_thresholds() -> None:
+    one = jnp.ones((1, 2))
+    found = AnnealedRepertoire.init(
+        one, jnp.ones(1, jnp.int32), one, one, learning_rate=0.5, threshold_min=-0.5
+    )
+    assert found.thresholds.tolist() == [0.25]
+
+
 @pytest.mark.parametrize(
     ("rate", "floor", "message"),
     [

@@ -133,7 +133,9 @@ class AnnealedRepertoire(MapElitesRepertoire, kw_only=True):
             jax.tree.map(lambda leaf: leaf[0], extra_scores or {}),
             keys_extra_scores,
         )
+        # integers would round the thresholds
         dtype = jnp.asarray(fitnesses).dtype
+        dtype = dtype if jnp.issubdtype(dtype, jnp.floating) else jnp.float32
         repertoire = cls(
             genotypes=empty.genotypes,
             fitnesses=empty.fitnesses,
