@@ -254,3 +254,22 @@ def test_what_cannot_be_converted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ribs", None)
     with pytest.raises(MissingExtra, match=r"newton_qd\[ribs\]"):
         to_ribs(None, LIMITS)
+
+
+def test_an_objective_that_float32_cannot_hold_is_refused() -> None:
+    """Its cell would have the fitness inf, which counts as empty."""
+    from ribs.archives import GridArchive
+
+    ranges: Any = [(0, 1), (0, 1)]
+    archive = GridArchive(solution_dim=2, dims=(4, 4), ranges=ranges)
+    archive.add(np.zeros((1, 2)), np.full(1, 1e300), np.zeros((1, 2)))
+    with pytest.raises(
+        ValueError, match=r"objectives of archive: got 1e\+300; allowed"
+    ):
+        from_ribs(archive)
+
+
+def test_an_evaluation_needs_a_scoring_function() -> None:
+    wrong: Any = 7
+    with pytest.raises(TypeError, match="score: got 7; allowed: a function of genotyp"):
+        make_ribs_evaluation(wrong, jax.random.key(0), limits=LIMITS, worst=WORST)

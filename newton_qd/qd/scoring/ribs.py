@@ -56,13 +56,15 @@ def make_ribs_evaluation(
         and, with ``jacobian``, gradients (N, 1 + D, size).
 
     Raises:
-        TypeError: ``key`` is not a key, or ``limits`` are not two vectors.
+        TypeError: ``score`` is not a function, ``key`` is not a key, or ``limits`` are
+            not two vectors.
         ValueError: ``key`` is several keys, ``worst`` is not finite, or a highest
             descriptor is not above the lowest one. The returned function raises
             ``GradientsError`` if gradients are missing or have the wrong shape, and
             ``ValueError`` if the solutions are no matrix or the limits do not have the
             shape of a descriptor.
     """
+    checks.function("score", score, "a function of genotypes and a key")
     require_key("key", key)
     checks.number("worst", worst)
     low = jnp.asarray(_limits(limits)[0], jnp.float32)
@@ -162,7 +164,7 @@ def from_ribs(archive: CVTArchive | GridArchive) -> MapElitesRepertoire:
     Raises:
         MissingExtra: QDax or pyribs is not installed.
         TypeError: The archive is another one, or its solutions are not vectors.
-        ValueError: An objective is NaN.
+        ValueError: An objective is NaN, or too large for float32.
     """
     require_extra("qdax", "qd")
     require_extra("ribs", "ribs")
@@ -176,6 +178,7 @@ def from_ribs(archive: CVTArchive | GridArchive) -> MapElitesRepertoire:
     genotypes = np.zeros((cells, cast("int", archive.solution_dim)), np.float32)
     fitnesses = np.full((cells, 1), -np.inf, np.float32)
     descriptors = np.zeros(centroids.shape, np.float32)
+    _refuse_large("objectives of archive", np.asarray(data["objective"]))
     genotypes[index] = data["solution"]
     fitnesses[index, 0] = data["objective"]
     descriptors[index] = data["measures"]
@@ -247,6 +250,18 @@ def _refuse_nan(name: str, values: np.ndarray) -> None:
     if count:
         given = Fact(f"NaN in {count} of {values.size} cells")
         raise ValueError(message(name, given, "numbers; -inf in empty cells"))
+
+
+def _refuse_large(name: str, values: np.ndarray) -> None:
+    """Refuses numbers that would be infinite as float32, and their cells empty.
+
+    Raises:
+        ValueError: A finite value is one.
+    """
+    largest = float(np.finfo(np.float32).max)
+    large = values[np.isfinite(values) & (np.abs(values) > largest)]
+    if large.size:
+        raise ValueError(message(name, float(large[0]), f"at most {largest:.3g}"))
 
 
 def _centroids(archive: Any) -> np.ndarray:
