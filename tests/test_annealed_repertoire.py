@@ -181,6 +181,17 @@ def test_whole_fitnesses_do_not_round_thresholds() -> None:
     assert found.thresholds.tolist() == [0.25]
 
 
+def test_the_first_of_equally_fit_individuals_enters() -> None:
+    """All of them would be written to one row, on a GPU in no defined order."""
+    genotypes = np.array([[1.0, 1.0], [2.0, 2.0], [3.0, 3.0]])
+    descriptors = np.array([[0.11, 0.1], [0.1, 0.1], [0.12, 0.1]])
+    found = repertoire([(genotypes, descriptors, np.array([0.5, 2.0, 2.0]))])
+    for archive in (found, found.result):
+        (cell,) = np.flatnonzero(archive.fitnesses[:, 0] > -np.inf)
+        assert np.asarray(archive.genotypes)[cell].tolist() == [2, 2]
+        assert archive.fitnesses[cell, 0] == 2
+
+
 @pytest.mark.parametrize(
     ("rate", "floor", "message"),
     [

@@ -20,6 +20,7 @@ from point_runs import SMALL, PointEnv, compile_once, point_task, reference, run
 from qdax.core.containers.mapelites_repertoire import MapElitesRepertoire
 
 from newton_qd.qd.config import ConfigError
+from newton_qd.qd.emitters.cells import break_ties
 from newton_qd.qd.run import generation
 from newton_qd.qd.run.archive import load_archive
 from newton_qd.qd.run.cells import cell_centroids
@@ -323,7 +324,7 @@ def test_equal_individuals_of_a_cell_do_not_compete() -> None:
     descriptors = jnp.array([[0.1, 0.1], [0.9, 0.9], [0.1, 0.2], [0.2, 0.1]])
     fitnesses = jnp.array([1.0, 1.0, 1.0, 2.0])
     centroids = jnp.array([[0.2, 0.2], [0.8, 0.8]])
-    kept = generation._break_ties(fitnesses, descriptors, centroids)
+    kept = break_ties(fitnesses, descriptors, centroids)
     np.testing.assert_array_equal(kept, [1.0, 1.0, -np.inf, 2.0])
 
 

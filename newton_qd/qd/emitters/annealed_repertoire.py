@@ -11,6 +11,7 @@ from qdax.core.containers.mapelites_repertoire import (
 )
 
 from newton_qd import checks
+from newton_qd.qd.emitters.cells import break_ties
 from newton_qd.types import ExtraScores, Genotype
 
 
@@ -69,12 +70,15 @@ class AnnealedRepertoire(MapElitesRepertoire, kw_only=True):
         keep = (1 - self.learning_rate) ** count
         mean = total / jnp.maximum(count, 1)
 
+        def first_of(values: jax.Array) -> jax.Array:
+            return break_ties(values, descriptors, self.centroids)
+
         # QDax's addition, with thresholds instead of the elites' fitnesses.
         lowered = MapElitesRepertoire.add(
             self.replace(fitnesses=self.thresholds[:, None]),
             batch_of_genotypes,
             descriptors,
-            jnp.where(enters, fitnesses, -jnp.inf),
+            first_of(jnp.where(enters, fitnesses, -jnp.inf)),
             extra,
         )
         changed = (count > 0)[:, None]
@@ -87,7 +91,7 @@ class AnnealedRepertoire(MapElitesRepertoire, kw_only=True):
             result=self.result.add(
                 batch_of_genotypes,
                 descriptors,
-                jnp.where(finite, fitnesses, -jnp.inf),
+                first_of(jnp.where(finite, fitnesses, -jnp.inf)),
                 extra,
             ),
         )

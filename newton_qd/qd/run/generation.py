@@ -11,6 +11,7 @@ import numpy as np
 
 from newton_qd import checks
 from newton_qd.checks import Fact, message
+from newton_qd.qd.emitters.cells import break_ties
 from newton_qd.qd.run import quality
 from newton_qd.qd.scoring.gradient_scores import finite_scores
 from newton_qd.types import ExtraScores, Genotype, PyTree, Repertoire
@@ -110,7 +111,7 @@ class Generation:
         sound = finite_scores(fitnesses, found)
         fitnesses = jnp.where(sound, fitnesses, -jnp.inf)
         found = jnp.where(jnp.isfinite(found), found, 0)
-        kept = _break_ties(fitnesses, found, repertoire.centroids)
+        kept = break_ties(fitnesses, found, repertoire.centroids)
         repertoire = repertoire.add(genotypes, found, kept, {})
         if not self.takes_faulty:
             fitnesses = jnp.where(sound, fitnesses, -self.offset)
@@ -160,30 +161,3 @@ def _strongly_typed(tree: PyTree) -> PyTree:
         return jax.lax.convert_element_type(leaf, leaf.dtype)
 
     return jax.tree.map(strong, tree)
-
-
-def _break_ties(
-    fitnesses: jax.Array, descriptors: jax.Array, centroids: jax.Array
-) -> jax.Array:
-    """Keeps the first of several equally fit individuals of one cell.
-
-    QDax would write all of them to the same row of the archive. XLA does not define the
-    order on a GPU.
-
-    Args:
-        fitnesses: (N,) returns.
-        descriptors: (N, D) descriptors.
-        centroids: (cells, D) centres of the cells.
-
-    Returns:
-        (N,) returns, ``-inf`` for the later ones.
-    """
-    from qdax.core.containers.mapelites_repertoire import get_cells_indices
-
-    cells = get_cells_indices(descriptors, centroids)
-    order = jnp.lexsort((fitnesses, cells))
-    same = (cells[order][1:] == cells[order][:-1]) & (
-        fitnesses[order][1:] == fitnesses[order][:-1]
-    )
-    later = jnp.concatenate([jnp.zeros((1,), bool), same])
-    return jnp.where(jnp.zeros_like(later).at[order].set(later), -jnp.inf, fitnesses)
