@@ -205,6 +205,11 @@ def test_brax_trains_on_it(
             "eval_metrics: got True, which needs an episode length.*allowed: False",
         ),
         (
+            lambda env: env("pointmaze", brax_views=True),
+            ValueError,
+            "brax_views: got True, the bodies of brax v1, which.*; allowed: False",
+        ),
+        (
             lambda env: env("ant_omni").step(
                 jax.eval_shape(env("pointmaze").reset, jax.random.key(0)), jnp.zeros(8)
             ),

@@ -129,6 +129,9 @@ class BraxEnv(envs.Env):
             if options.get("eval_metrics"):
                 why = "which needs an episode length, and brax's wrappers count steps"
                 raise ValueError(message("eval_metrics", True, "False", why=why))
+            if options.get("brax_views"):
+                why = "the bodies of brax v1, which a state of brax has no place for"
+                raise ValueError(message("brax_views", True, "False", why=why))
             options = {"episode_length": None, **options}
         self.env = one_world(env, options, endless=True)
         self.sys = self._own = BraxSystem(self.env.default_params, self.env)
