@@ -122,6 +122,21 @@ def test_each_world_its_own_physics(envs: Any, hopper: Any) -> None:
     assert not np.allclose(state.obs[0], state.obs[1], atol=1e-3)
 
 
+def test_parameters_are_replaced_by_name(adapters: Any, hopper: Any) -> None:
+    system = hopper.sys.tree_replace({"params.friction": jnp.float32(0.5)})
+    assert float(system.params.friction) == 0.5
+    assert system.params.mass_scale is hopper.sys.params.mass_scale
+    axes = jax.tree.map(lambda _: None, hopper.sys)
+    axes = axes.tree_replace({"params.mass_scale": 0})
+    assert axes.params.mass_scale == 0 and axes.params.friction is None
+    with pytest.raises(ValueError, match=r"changes: got 'geom_friction'; allowed: pa"):
+        hopper.sys.tree_replace({"geom_friction": 1.0})
+    maze = adapters.BraxEnv("pointmaze").sys
+    assert maze.tree_replace({}).params is None
+    with pytest.raises(ValueError, match=r"got 'params.friction'; allowed: none"):
+        maze.tree_replace({"params.friction": 1.0})
+
+
 def replicated(tree: Any, devices: list[jax.Device]) -> Any:
     """As ``jax.device_put_replicated``, which JAX 0.10 has lost and brax 0.14 calls."""
     mesh = jax.sharding.Mesh(np.array(devices), ("device",))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import types
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -86,6 +87,24 @@ class BraxSystem:
     def replace(self, **changes: Any) -> BraxSystem:
         """Returns a copy with other parameters."""
         return dataclasses.replace(self, **changes)
+
+    def tree_replace(self, changes: Mapping[str, Any]) -> BraxSystem:
+        """Returns a copy with other values of some parameters, as brax's systems do.
+
+        Args:
+            changes: Values by name, such as ``{"params.friction": friction}``.
+
+        Raises:
+            ValueError: A name is not that of a parameter.
+        """
+        own = () if self.params is None else dataclasses.fields(self.params)
+        known = {f"params.{field.name}": field.name for field in own}
+        for name in changes:
+            if name not in known:
+                raise ValueError(message("changes", name, checks.listed(known)))
+        new = {known[name]: value for name, value in changes.items()}
+        params = None if self.params is None else self.params.replace(**new)
+        return self.replace(params=params)
 
 
 class BraxEnv(envs.Env):
