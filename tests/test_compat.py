@@ -8,6 +8,7 @@ import subprocess
 import sys
 import warnings
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import jax
@@ -275,6 +276,35 @@ def test_no_fault_pays_in_a_scoring_function() -> None:
     actions = np.array([[0.1, 0.1], [np.nan, 0.0]], np.float32)
     found = scores(jax.random.split(jax.random.key(0), 2), actions)
     assert np.isfinite(found[0][0]) and found[0][1] == -np.inf
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "text"),
+    [
+        (
+            "pointmaze",
+            {"batch_size": 3},
+            r"env: got a batch of shape \(3,\) for each individual; allowed: one world",
+        ),
+        (
+            "inverted_pendulum",
+            {},
+            "env: got an environment with no state descriptor; allowed: QD tasks",
+        ),
+    ],
+)
+def test_environments_that_cannot_be_scored(
+    name: str, options: dict[str, Any], text: str
+) -> None:
+    module: Any = importlib.import_module("newton_qd.compat.env_creators")
+    env = newton_qd.create(name, episode_length=2, **options)
+    policy = SimpleNamespace(apply=lambda _, obs: obs[..., : env.action_size])
+    described: Any = lambda data, _: data.obs[:, 0]  # noqa: E731
+    score = module.create_brax_scoring_fn(
+        env, policy, described, jax.random.key(0), episode_length=2
+    )
+    with pytest.raises(ValueError, match=text):
+        score(jnp.zeros((2, 1)), jax.random.key(1))
 
 
 def test_policies_have_random_numbers_of_their_own() -> None:

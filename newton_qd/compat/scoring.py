@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from newton_qd import registry
+from newton_qd.checks import Fact, message
 from newton_qd.envs.base import Env
 from newton_qd.envs.state import State, at_fault
 from newton_qd.extractors import folded_sum
@@ -40,13 +41,17 @@ def make_policy_network_play_step_fn_brax(
 
     Returns:
         Function of a state, parameters and a key. It returns the next state, the
-        unchanged parameters and key, and a ``QDTransition``.
+        unchanged parameters and key, and a ``QDTransition``. It raises a ``ValueError``
+        for a state without a state descriptor.
     """
     from qdax.core.neuroevolution.buffers.buffer import QDTransition
 
     def play_step(
         state: State, params: Genotype, key: RNGKey
     ) -> tuple[State, Genotype, RNGKey, PyTree]:
+        if "state_descriptor" not in state.info:
+            given = Fact("an environment with no state descriptor")
+            raise ValueError(message("env", given, "QD tasks, such as ant_uni"))
         actions = policy_network.apply(params, state.obs)
         following = env.step(state, actions)
         taken = QDTransition(**transition(state, actions, following))
@@ -90,6 +95,9 @@ def evaluate(
         Fitnesses (N,), descriptors (N, D), and ``{"transitions": ...}``. The order of
         the sums does not depend on N. The fitness is ``-inf`` if the world had a fault
         before the episode ended; the carry begins with the state.
+
+    Raises:
+        ValueError: An episode has more than one world.
     """
 
     def episode(*carry: PyTree) -> PyTree:
@@ -102,6 +110,10 @@ def evaluate(
         return jax.lax.scan(body, carry, None, length=episode_length)[1]
 
     data, faults = jax.vmap(episode, in_axes=in_axes)(*carry)
+    if data.dones.ndim != 2:  # individuals and steps
+        given = Fact(f"a batch of shape {data.dones.shape[2:]} for each individual")
+        allowed = "one world: newton_qd.create without batch_size"
+        raise ValueError(message("env", given, allowed))
     mask = get_mask_from_transitions(data)
     fitnesses = folded_sum(data.rewards * (1.0 - mask), 1)
     fitnesses = jnp.where((faults & (mask == 0)).any(axis=1), -jnp.inf, fitnesses)
