@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -201,6 +202,13 @@ def test_environments_without_parameters() -> None:
     with pytest.raises(
         ValueError, match=r"env: got pointmaze, .* no physical parameters"
     ):
+        randomize_params(KEY, env)
+
+
+def test_environments_of_other_libraries_are_refused() -> None:
+    env: Any = SimpleNamespace()
+    env.unwrapped = env  # as those of brax and Gymnasium
+    with pytest.raises(TypeError, match=r"env: got namespace\(.*; allowed: an env"):
         randomize_params(KEY, env)
 
 

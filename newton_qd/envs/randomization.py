@@ -102,6 +102,7 @@ def _default(env: Env, worlds: int | None) -> PhysicsParams:
             above 0.
     """
     checks.environment(env, needs="unwrapped")
+    checks.environment(env, needs="default_params")
     default = env.unwrapped.default_params
     if not isinstance(default, PhysicsParams):
         given = Fact(f"{env.name}, which has no physical parameters")
