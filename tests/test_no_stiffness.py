@@ -14,6 +14,7 @@ from newton_qd.physics.model import build_system
 from newton_qd.robots import Contact
 
 
+@pytest.mark.slow
 def test_gradient_without_stiffness(x64: None, tmp_path: Path) -> None:
     """It is one-sided, also where a motor lifts a foot off within the substep."""
     foot = link("foot", sphere(0.1))

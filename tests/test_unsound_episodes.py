@@ -54,8 +54,7 @@ def critic_of(name: str, env: Any, starts: int = 1) -> tuple[Any, np.ndarray]:
     return state.emitter, state.metrics[:, 3]
 
 
-@pytest.mark.parametrize("starts", [1, 2])
-@pytest.mark.parametrize("name", ["pga-me", "dcrl-me"])
+@pytest.mark.parametrize(("name", "starts"), [("pga-me", 1), ("dcrl-me", 2)])
 def test_a_nan_does_not_stay_in_a_critic(name: str, starts: int) -> None:
     state, rejected = critic_of(name, Broken(), starts)
     assert rejected[0] > 0
