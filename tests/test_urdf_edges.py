@@ -59,12 +59,14 @@ def test_a_turned_box_touches_with_its_corners(tmp_path: Path) -> None:
     assert len(np.unique(np.sign(local), axis=0)) == 8
 
 
-def test_a_chain_of_many_links_is_read(tmp_path: Path) -> None:
+def test_a_chain_that_newton_cannot_read_is_refused(tmp_path: Path) -> None:
     """Longer than the calls inside each other that Python allows."""
     names = [f"link{i}" for i in range(1200)]
     joints = [joint(f"j_{b}", "continuous", a, b) for a, b in pairwise(names)]
-    path = write(tmp_path, robot_text(*map(link, names), *joints))
-    assert list(read_description(Path(path)).bodies) == names
+    text = robot_text(*map(link, names), *joints)
+    assert list(read_description(Path(write(tmp_path, text))).bodies) == names
+    error = refusal(tmp_path, text, names[-1])
+    assert error.endswith("chain of joints: got about 1,000 or more; allowed: hundreds")
 
 
 SLIDES = {  # joints from the world to the torso, and what places it on the ground

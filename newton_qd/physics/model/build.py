@@ -73,8 +73,8 @@ def newton_builder(
             NAME, or in a folder that contains a folder NAME.
 
     Raises:
-        RobotDescriptionError: The file is not XML, a colour is malformed, or the mesh
-            of a collider cannot be read.
+        RobotDescriptionError: The file is not XML, a colour is malformed, the mesh of a
+            collider cannot be read, or a chain of joints is too long for Newton.
         OSError: The file cannot be read.
     """
     import newton
@@ -85,7 +85,11 @@ def newton_builder(
     # Links without <inertial> have no mass. By default Newton computes a mass from the
     # colliders.
     builder.default_shape_cfg.density = 0.0
-    builder.add_urdf(given.text(), floating=floating)
+    try:
+        builder.add_urdf(given.text(), floating=floating)
+    except RecursionError as error:  # Newton calls a function inside itself
+        name, given = f"{path}: longest chain of joints", Fact("about 1,000 or more")
+        raise RobotDescriptionError(message(name, given, "hundreds")) from error
     fixed = [kind == newton.JointType.FIXED for kind in builder.joint_type]
     merge_fixed_bodies(builder, fixed)
     return builder
