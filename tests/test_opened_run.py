@@ -92,6 +92,10 @@ def test_a_run_takes_another_environment(found: Run) -> None:
     assert not np.array_equal(own.fitnesses, new.fitnesses)
     with pytest.raises(ValueError, match=r"^env: got an environment with 11 obs"):
         found.with_env(newton_qd.create("hopper", auto_reset=False))
+    with pytest.raises(ValueError, match=r"^env: got an environment with auto-reset"):
+        found.with_env(newton_qd.create("pointmaze"))
+    with pytest.raises(ValueError, match=r"^env: got .* a batch; allowed: one world"):
+        found.with_env(newton_qd.create("pointmaze", batch_size=2, auto_reset=False))
     with pytest.raises(TypeError, match=r"^env: got 3"):
         found.with_env(3)  # type: ignore[arg-type]
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from newton_qd import checks
 from newton_qd.checks import Fact, message
+from newton_qd.envs.base import Env
 from newton_qd.envs.inputs import require_key
 from newton_qd.errors import require_extra
 from newton_qd.gradients.episode_input import check_length
@@ -32,6 +33,9 @@ from newton_qd.qd.scoring.rollout import Policy
 from newton_qd.qd.scoring.task import Task, made_task, make_task, randomized
 from newton_qd.real_numbers import real_numbers
 from newton_qd.types import Environment, Repertoire, RNGKey
+from newton_qd.wrappers.auto_reset import AutoResetWrapper
+from newton_qd.wrappers.base import outermost
+from newton_qd.wrappers.vector import VectorWrapper
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -209,9 +213,11 @@ class Run:
 
         Raises:
             TypeError: ``env`` is no environment.
-            ValueError: It has other sizes, or ends episodes before.
+            ValueError: It has a batch, auto-reset or other sizes, or ends episodes
+                before.
         """
         checks.environment(env)
+        _require_single(env)
         check_length(env, self.config.episode_length)
         new, own = (_sizes(one) for one in (env, self.task.env))
         if new != own:
@@ -282,6 +288,20 @@ class Run:
         if not (checks.is_integer(cell) and 0 <= cell < count):
             raise IndexError(message("cell", cell, f"integers from 0 to {count - 1}"))
         return int(cell)
+
+
+def _require_single(env: Environment) -> None:
+    """Checks that an environment is one world that does not reset itself.
+
+    Raises:
+        ValueError: It has a batch or auto-reset.
+    """
+    refused = {AutoResetWrapper: "auto-reset", VectorWrapper: "a batch"}
+    for kind, what in refused.items():
+        if isinstance(env, Env) and outermost(env, kind) is not None:
+            given = Fact(f"an environment with {what}")
+            allowed = "one world: create(..., auto_reset=False), no batch_size"
+            raise ValueError(message("env", given, allowed))
 
 
 def _sizes(env: Environment) -> str:
