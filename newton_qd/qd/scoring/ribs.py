@@ -261,7 +261,8 @@ def _refuse_large(name: str, values: np.ndarray) -> None:
     largest = float(np.finfo(np.float32).max)
     large = values[np.isfinite(values) & (np.abs(values) > largest)]
     if large.size:
-        raise ValueError(message(name, float(large[0]), f"at most {largest:.3g}"))
+        allowed = f"from {-largest:.3g} to {largest:.3g}"
+        raise ValueError(message(name, float(large[0]), allowed))
 
 
 def _centroids(archive: Any) -> np.ndarray:
