@@ -7,12 +7,7 @@ from typing import Any
 from newton_qd import registry
 from newton_qd.checks import Fact, message
 from newton_qd.envs.base import Env
-from newton_qd.wrappers import (
-    AutoResetWrapper,
-    EpisodeWrapper,
-    VectorWrapper,
-)
-from newton_qd.wrappers.base import outermost
+from newton_qd.wrappers.one_world import require_one_world
 
 
 def one_world(env: str | Env, options: dict[str, Any], *, endless: bool = False) -> Env:
@@ -41,14 +36,5 @@ def one_world(env: str | Env, options: dict[str, Any], *, endless: bool = False)
     elif options:
         given = Fact(f"an environment with options {', '.join(sorted(options))}")
         raise ValueError(message("env", given, "a name with options"))
-    refused = {AutoResetWrapper: "auto-reset", VectorWrapper: "a batch"}
-    allowed = "one world: create(..., auto_reset=False), no batch_size"
-    if endless:
-        refused[EpisodeWrapper] = "an episode length"
-        allowed += ", episode_length=None"
-    for kind, what in refused.items():
-        if outermost(env, kind) is not None:
-            raise ValueError(
-                message("env", Fact(f"an environment with {what}"), allowed)
-            )
+    require_one_world(env, endless=endless)
     return env

@@ -33,9 +33,7 @@ from newton_qd.qd.scoring.rollout import Policy
 from newton_qd.qd.scoring.task import Task, made_task, make_task, randomized
 from newton_qd.real_numbers import real_numbers
 from newton_qd.types import Environment, Repertoire, RNGKey
-from newton_qd.wrappers.auto_reset import AutoResetWrapper
-from newton_qd.wrappers.base import outermost
-from newton_qd.wrappers.vector import VectorWrapper
+from newton_qd.wrappers.one_world import require_one_world
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -217,7 +215,8 @@ class Run:
                 before.
         """
         checks.environment(env)
-        _require_single(env)
+        if isinstance(env, Env):
+            require_one_world(env)
         check_length(env, self.config.episode_length)
         new, own = (_sizes(one) for one in (env, self.task.env))
         if new != own:
@@ -288,20 +287,6 @@ class Run:
         if not (checks.is_integer(cell) and 0 <= cell < count):
             raise IndexError(message("cell", cell, f"integers from 0 to {count - 1}"))
         return int(cell)
-
-
-def _require_single(env: Environment) -> None:
-    """Checks that an environment is one world that does not reset itself.
-
-    Raises:
-        ValueError: It has a batch or auto-reset.
-    """
-    refused = {AutoResetWrapper: "auto-reset", VectorWrapper: "a batch"}
-    for kind, what in refused.items():
-        if isinstance(env, Env) and outermost(env, kind) is not None:
-            given = Fact(f"an environment with {what}")
-            allowed = "one world: create(..., auto_reset=False), no batch_size"
-            raise ValueError(message("env", given, allowed))
 
 
 def _sizes(env: Environment) -> str:
