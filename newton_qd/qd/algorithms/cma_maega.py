@@ -46,6 +46,7 @@ CMA_MAEGA = AlgorithmSpec(
     options=CMAMAEGAOptions,
     tuned=TUNED,
     evaluations=batch_and(gradients),
+    evaluates_first=True,
     gradients=gradients,
     takes_faulty=True,
     initial_scale=initial_scale,

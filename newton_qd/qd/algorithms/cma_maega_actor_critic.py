@@ -108,6 +108,7 @@ CMA_MAEGA_ACTOR_CRITIC = AlgorithmSpec(
         **dict.fromkeys(("hopper_uni", "walker2d_uni"), _SMALL_STEPS),
     },
     evaluations=_evaluations,
+    evaluates_first=True,
     gradients=_gradients,
     evaluates=True,
     takes_faulty=True,

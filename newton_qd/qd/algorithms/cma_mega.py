@@ -106,6 +106,7 @@ CMA_MEGA = AlgorithmSpec(
     options=CMAMEGAOptions,
     tuned=TUNED,
     evaluations=batch_and(gradients),
+    evaluates_first=True,
     gradients=gradients,
     takes_faulty=True,
     initial_scale=initial_scale,

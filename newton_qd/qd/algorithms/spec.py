@@ -74,6 +74,8 @@ class AlgorithmSpec(Generic[OptionsT]):
         evaluates: Whether its emitter itself evaluates individuals.
         evaluations: Number of episodes of one generation, with those that are
             differentiated.
+        evaluates_first: Whether its emitter evaluates as many individuals of its own
+            before its first generation as in each one.
         gradients: Number of differentiated episodes of one generation; ``None``: the
             algorithm does not use gradients of the physics.
         scoring: Makes the scoring function of the loop; ``None``: the one without
@@ -96,6 +98,7 @@ class AlgorithmSpec(Generic[OptionsT]):
     transitions: bool = False
     evaluates: bool = False
     evaluations: Callable[[EvolveConfig, OptionsT], int] = _batch_size
+    evaluates_first: bool = False
     gradients: Callable[[EvolveConfig, OptionsT], int] | None = None
     scoring: (
         Callable[[EvolveConfig, OptionsT, Task, Policy], ScoringFunction] | None

@@ -146,6 +146,9 @@ class Search:
         if iteration == 0:
             genotypes, repertoire, evaluations, rejected = self._settled(state)
             evaluations *= self._config.starts
+            if self._algorithm.evaluates_first:
+                size = self._config.batch_size * self._config.starts
+                evaluations += self._episodes - size
             scores = self._score(genotypes, self._start(0))
             repertoire, emitter, metrics = self._begin(
                 self._drawn, repertoire, genotypes, scores
