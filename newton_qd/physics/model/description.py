@@ -256,6 +256,54 @@ def warn_about(description: Description) -> None:
         warn(text, RobotDescriptionWarning)
 
 
+def _grown(
+    reader: XmlReader,
+    root: Link,
+    fixed_base: bool,
+    links: dict[str, Link],
+    children: dict[str, list[Joint]],
+) -> tuple[dict[str, Body], dict[str, np.ndarray]]:
+    """Returns the bodies, and the places of links that are fixed to the world.
+
+    Args:
+        reader: The file.
+        root: Root link.
+        fixed_base: Whether the root link is fixed to the world.
+        links: Links by name.
+        children: Joints by the name of their parent link.
+
+    Raises:
+        RobotDescriptionError: A link or a floating joint is not supported.
+    """
+    bodies: dict[str, Body] = {}
+    still: dict[str, np.ndarray] = {}
+    # a stack: a long chain would be too many calls inside each other
+    pending: list[tuple[Link, Joint | None, str | None, bool]]
+    pending = [(root, None, None, fixed_base)]
+    while pending:
+        link, joint, parent, fixed = pending.pop()
+        merged, frames, shapes, moving = _merge_fixed(link, links, children)
+        if fixed and link.name == WORLD and (link.shapes or link.mass > 0):
+            given = Fact("a collider or a mass")
+            allowed = "neither on a robot's world link"
+            element = by_name(reader, "link")[WORLD]
+            raise reader.refused(element, "link", given, allowed)
+        if fixed:
+            still.update((name, at) for name, at in frames.items() if name != WORLD)
+        else:
+            _check_real(merged, [links[name] for name in frames])
+            bodies[link.name] = Body(merged, joint, parent, frames, shapes)
+        holder = None if fixed else link.name
+        for next_joint in reversed(moving):
+            child = links[next_joint.child]
+            if next_joint.kind == "floating":
+                _check_floating(reader.path, next_joint, fixed)
+                pending.append((child, None, None, False))
+            else:
+                pending.append((child, next_joint, holder, False))
+    return bodies, still
+
+
 def read_description(path: Path, fixed_base: bool | None = None) -> Description:
     """Reads a URDF file.
 
@@ -282,35 +330,7 @@ def read_description(path: Path, fixed_base: bool | None = None) -> Description:
     children = read_joints(reader, links)
     root = links[find_root(reader, links, children)]
     floating = root.name != WORLD if fixed_base is None else not fixed_base
-    bodies: dict[str, Body] = {}
-    still: dict[str, np.ndarray] = {}
-
-    # a stack, as Python has an end to calls inside each other
-    pending: list[tuple[Link, Joint | None, str | None, bool]]
-    pending = [(root, None, None, not floating)]
-    while pending:
-        link, joint, parent, fixed = pending.pop()
-        merged, frames, shapes, moving = _merge_fixed(link, links, children)
-        if fixed and link.name == WORLD and (link.shapes or link.mass > 0):
-            given = Fact("a collider or a mass")
-            allowed = "neither on a robot's world link"
-            raise reader.refused(elements[WORLD], "link", given, allowed)
-        if not fixed:
-            _check_real(merged, [links[name] for name in frames])
-        if fixed:
-            still.update((name, at) for name, at in frames.items() if name != WORLD)
-        else:
-            bodies[link.name] = Body(merged, joint, parent, frames, shapes)
-        holder = None if fixed else link.name
-        for next_joint in moving:
-            if next_joint.kind == "floating":
-                _check_floating(path, next_joint, fixed)
-        for next_joint in reversed(moving):
-            child = links[next_joint.child]
-            if next_joint.kind == "floating":
-                pending.append((child, None, None, False))
-            else:
-                pending.append((child, next_joint, holder, False))
+    bodies, still = _grown(reader, root, not floating, links, children)
     if not bodies:
         raise reader.error(reader.root, "nothing in it moves")
     _check_masses(path, bodies)
