@@ -57,7 +57,11 @@ def load(folder: Path, repeats: Path, stop: str) -> tuple[Runs, set[tuple[str, s
         known = sorted({line["stop"] for line in kept})
         raise ValueError(f"stop: {stop!r} has no runs in {folder}; there are {known}")
     with repeats.open(newline="", encoding="utf-8") as file:
-        others = [line for line in csv.DictReader(file) if line["stop"] == stop]
+        others = [
+            line
+            for line in csv.DictReader(file)
+            if line["stop"] == stop and int(line["seed"]) != TUNING_SEED
+        ]
     found: Runs = {}
     for line in reported + others:
         seeds = found.setdefault((line["task"], line["variant"]), {})

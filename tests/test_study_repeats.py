@@ -37,7 +37,8 @@ def loaded(tmp_path: Path) -> Loaded:
     ours = [(OURS, seed, 12.0) for seed in range(3)]
     other = [(OTHER, seed, 10.0) for seed in range(3)]
     write(tmp_path / "runs.csv", *ours, *other, (OTHER, TUNING_SEED, 99.0))
-    write(tmp_path / "again.csv", (OURS, 0, 14.0), *((o, s, 12.0) for o, s, _ in other))
+    again = [(OTHER, seed, 12.0) for seed in (*range(3), TUNING_SEED)]
+    write(tmp_path / "again.csv", (OURS, 0, 14.0), *again)
     return study_repeats.load(tmp_path, tmp_path / "again.csv", "60 s")
 
 
