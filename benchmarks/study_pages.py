@@ -16,10 +16,11 @@ import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from statistics import fmean
 
 import study_repeats
 import study_scores
-from study_results import Results, load, references
+from study_results import MEDIAN, Results, load, references
 from study_runs import TUNING_SEED, lines
 
 BENCHMARKS = Path(__file__).resolve().parent
@@ -54,6 +55,11 @@ SCATTER = {
     },
 }
 """Variants with and without scatter, of each task; a number is a variant of ours."""
+FIXED = {
+    **dict.fromkeys(("ant_omni", "ant_uni", "antmaze", "anttrap"), 7),
+    **{"halfcheetah_uni": 6, "hopper_uni": 12, "walker2d_uni": 11},
+}
+"""Variants of DCRL-ME that ran with several seeds before and after its fix."""
 
 
 @functools.cache
@@ -117,6 +123,33 @@ def long_runs() -> str:
     return study_scores.markdown([*head, study_scores.named(LONG)], rows)
 
 
+def fixed(stops: str) -> str:
+    """Markdown table: DCRL-ME after its fix, as a ratio to before, with all equal runs.
+
+    In brackets are the numbers of seeds after and before it.
+    """
+    every = {
+        stop: study_repeats.load(FIELD, REPEATS, stop)[0] for stop in stops.split(", ")
+    }
+    rows = []
+    for task, number in FIXED.items():
+        row = [task, str(number)]
+        for runs in every.values():
+            after, before = (
+                [fmean(equal) for equal in runs.get((task, variant), {}).values()]
+                for variant in (f"dcrl-me@{number}", f"dcrl-me@{number}{MEDIAN}")
+            )
+            if after and before:
+                ratio = fmean(after) / fmean(before)
+                row.append(f"{ratio:.2f} ({len(after)}, {len(before)})")
+            else:
+                row.append("-")
+        rows.append(row)
+    return study_scores.markdown(
+        ["task", "variant", *map(study_scores.named, every)], rows
+    )
+
+
 KINDS: dict[str, Callable[[str], str]] = {
     "ratios": lambda _: study_scores.overview(_field()),
     "ratios to MAP-Elites": lambda _: study_scores.overview(_field(), "me"),
@@ -131,6 +164,7 @@ KINDS: dict[str, Callable[[str], str]] = {
     "published": lambda _: study_scores.published(_field()),
     "scatter": scatter,
     "long runs": lambda _: long_runs(),
+    "after a fix": fixed,
     "equal runs": _equal_runs,
     "other runs": _repeats,
 }

@@ -83,3 +83,31 @@ def test_long_runs_have_their_own_score_before(
         "| ant_uni | me@7 | 0 | 2,000 | 3,000 |",
         "| ant_uni | me@7 | 1 | - | 4,000 |",
     ]
+
+
+def test_the_fix_is_compared_with_the_mean_of_equal_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def write(path: Path, *rows: tuple[str, int, float]) -> None:
+        with path.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, HEAD, restval="1", lineterminator="\n")
+            writer.writeheader()
+            for variant, seed, score in rows:
+                writer.writerow(
+                    {
+                        **{"task": "ant_uni", "algorithm": "dcrl-me", "seed": seed},
+                        **{"variant": variant, "stop": "60 s"},
+                        **{"corrected_qd_score": score},
+                    }
+                )
+
+    old = "dcrl-me@7-median"
+    write(tmp_path / "runs.csv", ("dcrl-me@7", 0, 6.0), (old, 0, 2.0), (old, 1, 4.0))
+    repeats = tmp_path / "again.csv"
+    write(repeats, ("dcrl-me@7", 0, 12.0), ("dcrl-me@7", TUNING_SEED, 99.0))
+    monkeypatch.setattr(study_pages, "FIELD", tmp_path)
+    monkeypatch.setattr(study_pages, "REPEATS", repeats)
+    monkeypatch.setattr(study_pages, "FIXED", {"ant_uni": 7, "antmaze": 7})
+    head, _, *rows = study_pages.fixed("60 s").splitlines()
+    assert head == "| task | variant | 60 s |"
+    assert rows == ["| ant_uni | 7 | 3.00 (1, 2) |", "| antmaze | 7 | - |"]
