@@ -53,7 +53,7 @@ import study_core
 import study_execution
 import study_runs
 from study_pool import Pool
-from study_protocols import FIELD, PROTOCOLS
+from study_protocols import PROTOCOLS
 
 
 def arguments() -> argparse.Namespace:
@@ -146,15 +146,10 @@ def checked(
     if protocol and unknown:
         allowed = ", ".join(study_runs.variants())
         parser.error(f"--variants: got {', '.join(unknown)}; allowed: {allowed}")
-    if protocol and args.run:
-        task, variant, seed, _ = args.run
-        for value, known, sound in (
-            (task, FIELD.tasks, task in FIELD.tasks),
-            (variant, study_runs.variants(), variant in study_runs.variants()),
-            (seed, ("an integer from 0",), seed.isdecimal()),
-        ):
-            if not sound:
-                parser.error(f"--run: got {value}; allowed: {', '.join(known)}")
+    if args.variants and not protocol:
+        parser.error("--variants: got it without --protocol field or small")
+    if args.run:
+        _check_run(parser, args)
     if args.seeds is None:
         args.seeds = protocol.seeds if protocol else 5
     _check_times(parser, args)
@@ -171,7 +166,38 @@ def checked(
         value = getattr(args, name)
         if value < 1:
             parser.error(f"--{name}: got {value}; allowed: an integer from 1")
+    _check_folders(parser, args)
     return args
+
+
+def _check_run(parser: argparse.ArgumentParser, args: argparse.Namespace) -> None:
+    """Ends the command at a wrong word of ``--run``."""
+    protocol = PROTOCOLS.get(args.protocol)
+    tasks = protocol.tasks if protocol else study_core.TASKS
+    variants = study_runs.variants() if protocol else study_core.read("variants")
+    task, variant, seed, _ = args.run
+    for value, known, sound in (
+        (task, tasks, task in tasks),
+        (variant, variants, variant in variants),
+        (seed, ("an integer from 0",), seed.isdecimal()),
+    ):
+        if not sound:
+            parser.error(f"--run: got {value}; allowed: {', '.join(known)}")
+
+
+def _check_folders(parser: argparse.ArgumentParser, args: argparse.Namespace) -> None:
+    """Ends the command if a folder has not the runs that it should have."""
+    protocol = PROTOCOLS.get(args.protocol)
+    out = Path(args.run[3]) if args.run else args.out
+    if protocol and (others := study_runs.other_protocols(protocol, out)):
+        # files of cells and states have no name of a protocol
+        names = ", ".join(sorted(others))
+        parser.error(f"--out: got {out}; allowed: a folder without runs of {names}")
+    if args.tuned and not args.run:
+        try:
+            left(args)
+        except FileNotFoundError as error:
+            parser.error(f"--tuned: {error}")
 
 
 def _check_times(parser: argparse.ArgumentParser, args: argparse.Namespace) -> None:
@@ -242,8 +268,14 @@ def left(args: argparse.Namespace) -> list[tuple[str, ...]]:
 
 
 def one(args: argparse.Namespace, begin: float) -> None:
-    """Carries out one run."""
+    """Carries out one run, and ends the command if its device is not there."""
     task, variant, seed, out = args.run
+    if args.device == "cuda":
+        import jax
+
+        # JAX falls back to the processor; the row would name the wrong device
+        if jax.default_backend() != "gpu":
+            sys.exit("study.py: --device: got cuda; allowed: cpu, JAX has no GPU here")
     if args.protocol == "core":
         run = study_core.Run(task, variant, int(seed))
         study_core.execute(run, args.seconds, args.device, Path(out))
@@ -274,16 +306,19 @@ def main() -> None:
     args.out.mkdir(parents=True, exist_ok=True)
     latest = min(args.start_until, args.stop_after)
     pool = Pool(args, [None] * args.workers, args.gpus)
-    runs = coming(args)
+    runs, begun = coming(args), False
     while True:
         slot = pool.wait()
         spent = time.monotonic() - begin
         until, what = next(runs, (0.0, ()))
         if not what:
+            if not begun:
+                print("no run is left", flush=True)
             break
         if spent > latest:
             print(f"{1 + sum(1 for _ in runs)} runs are left", flush=True)
             break
+        begun = True
         print(f"{spent:5.0f} s: {what} until {until:g} s", flush=True)
         if args.protocol == "core":
             more = ["--seconds", str(args.seconds)]
@@ -295,6 +330,8 @@ def main() -> None:
             more += ["--no-states"] * args.no_states
         pool.start(slot, *more, "--run", *what)
     pool.drain()
+    if pool.failed:
+        sys.exit(1)
 
 
 if __name__ == "__main__":

@@ -21,11 +21,13 @@ class Pool:
         args: Arguments of the command.
         slots: The process of each slot, or ``None``.
         gpus: Number of GPUs.
+        failed: How many processes have failed.
     """
 
     args: argparse.Namespace
     slots: list[subprocess.Popen | None]
     gpus: int
+    failed: int = 0
 
     def free(self) -> int | None:
         """A slot without a process that still runs."""
@@ -39,6 +41,7 @@ class Pool:
         """Waits for the process of a slot, and says so if it has failed."""
         process, self.slots[slot] = self.slots[slot], None
         if process is not None and process.wait():
+            self.failed += 1
             print(f"failed: {process.args}", file=sys.stderr, flush=True)
 
     def start(self, slot: int, *what: str) -> None:

@@ -195,6 +195,11 @@ def finished(protocol: Protocol, out: Path) -> set[tuple[str, str, int, str]]:
     }
 
 
+def other_protocols(protocol: Protocol, out: Path) -> set[str]:
+    """Returns the names of other protocols that have lines in a folder."""
+    return {line["protocol"] for line in lines(out)} - {protocol.name}
+
+
 def missing(protocol: Protocol, out: Path, choice: Choice) -> list[Run]:
     """Returns the runs of a choice without a line for one of their stops.
 

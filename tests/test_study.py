@@ -15,6 +15,7 @@ FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
 sys.path.insert(0, str(FOLDER))
 
 import study  # noqa: E402
+import study_pool  # noqa: E402
 import study_results  # noqa: E402
 import study_runs  # noqa: E402
 from study_helpers import TASK, line  # noqa: E402
@@ -172,6 +173,11 @@ def test_tuning_chooses_the_corrected_score(tmp_path: Path) -> None:
         (["--protocol", "small", "--run", "ant", "me@1", "0", "x"], "--run: got ant"),
         (["--protocol", "small", "--run", TASK, "ga@1", "0", "x"], "--run: got ga@1"),
         (["--protocol", "small", "--run", TASK, "me@1", "a", "x"], "--run: got a; "),
+        (["--run", "ant", "me@1", "0", "x"], "--run: got ant; allowed: ant_uni, "),
+        (["--run", TASK, "me", "0", "x"], "--run: got me; allowed: me@1, "),
+        (["--variants", "me@1"], "--variants: got it without --protocol field or sm"),
+        (["--tuned", "none"], "--tuned: none holds no run of me on ant_uni"),
+        (["--protocol", "small", "--tuned", "none"], "--tuned: none holds no run of "),
     ],
 )
 def test_wrong_words_are_refused(
@@ -184,3 +190,52 @@ def test_wrong_words_are_refused(
     with pytest.raises(SystemExit):
         study.arguments()
     assert text in capsys.readouterr().err
+
+
+def test_a_folder_has_runs_of_one_protocol(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Cells of the same stop would replace each other."""
+    study_runs.add_line(tmp_path / "runs.csv", line("me", 0, "20 s"))
+    words = ["--run", TASK, "me@0", "0", str(tmp_path)], ["--out", str(tmp_path)]
+    for given in words:
+        command = ["study.py", *given, "--protocol"]
+        monkeypatch.setattr(sys, "argv", [*command, "small"])
+        study.arguments()
+        monkeypatch.setattr(sys, "argv", [*command, "field"])
+        with pytest.raises(SystemExit):
+            study.arguments()
+        assert "allowed: a folder without runs of small" in capsys.readouterr().err
+
+
+def test_a_row_does_not_name_a_gpu_that_is_not_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("jax.default_backend", lambda: "cpu")
+    command = ["study.py", "--protocol", "small", "--device", "cuda", "--run", TASK]
+    monkeypatch.setattr(sys, "argv", [*command, "me@0", "0", str(tmp_path)])
+    with pytest.raises(SystemExit, match="--device: got cuda; allowed: cpu"):
+        study.main()
+
+
+def test_a_command_fails_if_a_run_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(study_pool, "STUDY", tmp_path / "missing.py")
+    command = ["study.py", "--protocol", "small", "--out", str(tmp_path / "out")]
+    choice = ["--tasks", TASK, "--algorithms", "me", "--seeds", "1"]
+    monkeypatch.setattr(sys, "argv", [*command, *choice])
+    with pytest.raises(SystemExit) as ended:
+        study.main()
+    assert ended.value.code == 1
+    assert "failed: " in capsys.readouterr().err
+
+
+def test_a_command_without_a_run_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["study.py", "--protocol", "field", "--out", str(tmp_path)]
+    choice = ["--tasks", "humanoid_uni", "--algorithms", "cma-me"]
+    monkeypatch.setattr(sys, "argv", [*command, *choice])
+    study.main()
+    assert capsys.readouterr().out == "no run is left\n"
