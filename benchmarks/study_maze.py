@@ -6,6 +6,8 @@ beyond a corner and the distance of the farthest elite from the start:
 
     python benchmarks/study_maze.py benchmarks/results/field me-actor-critic@15 \
         --stop "60 s" --seeds 0 1 2 3 4 5 6 7 --beyond 10 20 --figure maze.png
+
+Without ``--seeds``, it has all runs that came to the stop.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from study_regions import cells_of
+from study_regions import cells_of, seeds_of
 from study_scores import markdown
 
 import newton_qd
@@ -62,20 +64,27 @@ def main() -> None:
     parser.add_argument("runs", type=Path)
     parser.add_argument("variant")
     parser.add_argument("--stop", default="60 s")
-    parser.add_argument("--seeds", type=int, nargs="+", default=list(range(8)))
+    parser.add_argument("--seeds", type=int, nargs="+")
     parser.add_argument("--beyond", type=float, nargs=2, default=[10.0, 20.0])
     parser.add_argument("--figure", type=Path)
     args = parser.parse_args()
+    try:
+        known = seeds_of(args.runs, TASK, args.variant, args.stop)
+    except ValueError as error:
+        parser.error(f"variant: {error}")
+    seeds = args.seeds or known
+    if unknown := sorted(set(seeds) - set(known)):
+        parser.error(f"--seeds: got {unknown}; allowed: {known}, those at {args.stop}")
     import matplotlib.pyplot as plt
 
     robot: Any = newton_qd.create(TASK).unwrapped
     system = robot.system
-    columns = -(-len(args.seeds) // (1 + (len(args.seeds) > 4)))
+    columns = -(-len(seeds) // (1 + (len(seeds) > 4)))
     figure, axes = plt.subplots(
-        -(-len(args.seeds) // columns), columns, figsize=(9, 5), squeeze=False
+        -(-len(seeds) // columns), columns, figsize=(9, 5), squeeze=False
     )
     rows = []
-    for panel, seed in zip(axes.flat, args.seeds, strict=False):
+    for panel, seed in zip(axes.flat, seeds, strict=False):
         path = args.runs / "cells" / f"{TASK}.{args.variant}.{seed}.npz"
         before, after = np.load(path)[args.stop]
         places, _ = cells_of(TASK, seed)

@@ -6,7 +6,7 @@ that have elites there; in brackets is the share of the cells that have an elite
 mean over all seeds:
 
     python benchmarks/study_regions.py benchmarks/results/field walker2d_uni \
-        me-actor-critic@14 dcrl-me@6 me@5 --ranges 0.2 0.4 0.6 0.8 1
+        me-actor-critic@14 dcrl-me@6-median me@5 --ranges 0.2 0.4 0.6 0.8 1
 """
 
 from __future__ import annotations
@@ -40,6 +40,24 @@ def places(task_name: str, seed: int) -> np.ndarray:
     """Returns the mean of the components of each cell's centre (cells,), in 0 to 1."""
     centres, (low, high) = cells_of(task_name, seed)
     return ((centres - low) / (high - low)).mean(axis=1)
+
+
+def seeds_of(folder: Path, task_name: str, variant: str, stop: str) -> list[int]:
+    """Returns the seeds of a variant that came to a stop, without that of the tuning.
+
+    Raises:
+        ValueError: There is none.
+    """
+    wanted = task_name, variant, stop
+    found = [
+        int(line["seed"])
+        for line in lines(folder)
+        if (line["task"], line["variant"], line["stop"]) == wanted
+        and int(line["seed"]) != TUNING_SEED
+    ]
+    if not found:
+        raise ValueError(f"got {variant}; allowed: one with a run at {stop}")
+    return sorted(found)
 
 
 def regions(
@@ -96,18 +114,12 @@ def main() -> None:
         )
     columns = []
     for variant in args.variants:
-        seeds = [
-            int(line["seed"])
-            for line in lines(args.runs)
-            if (line["task"], line["variant"], line["stop"])
-            == (args.task, variant, args.stop)
-            and int(line["seed"]) != TUNING_SEED
-        ]
-        if not seeds:
-            allowed = f"one with a run at {args.stop}"
-            parser.error(f"variants: got {variant}; allowed: {allowed}")
+        try:
+            seeds = seeds_of(args.runs, args.task, variant, args.stop)
+        except ValueError as error:
+            parser.error(f"variants: {error}")
         each = []
-        for seed in sorted(seeds):
+        for seed in seeds:
             path = args.runs / "cells" / f"{args.task}.{variant}.{seed}.npz"
             fitnesses = np.load(path)[args.stop][1]
             each.append(regions(places(args.task, seed), fitnesses, args.ranges))

@@ -13,6 +13,7 @@ FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
 sys.path.insert(0, str(FOLDER))
 
 import study_figure  # noqa: E402
+import study_maze  # noqa: E402
 import study_regions  # noqa: E402
 import study_results  # noqa: E402
 import study_runs  # noqa: E402
@@ -257,3 +258,27 @@ def test_the_table_of_regions_names_what_has_no_run(
     with pytest.raises(SystemExit):
         study_regions.main()
     assert "variants: got me@9" in capsys.readouterr().err
+
+
+def test_the_maze_has_the_runs_that_came_to_the_stop(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(study_maze, "TASK", TASK)
+    monkeypatch.setattr(study_maze, "draw", lambda *_: None)
+    places = np.stack([np.linspace(0, 30, CELLS)] * 2, axis=1)
+    monkeypatch.setattr(study_maze, "cells_of", lambda *_: (places, ()))
+    for seed, stop in ((0, "60 s"), (3, "60 s"), (0, "1000 s")):
+        add(tmp_path, "me", seed, stop, np.arange(CELLS))
+    command = ["study_maze.py", str(tmp_path), "me@0"]
+    monkeypatch.setattr(sys, "argv", [*command, "--stop", "1000 s"])
+    study_maze.main()
+    _, _, *rows = capsys.readouterr().out.splitlines()
+    assert rows == ["| 0 | 3 of 3 | 3 | 42 |"]  # 21, 26 and 30 m are beyond 20 m
+    for wrong, text in (
+        ([*command, "--seeds", "1"], "--seeds: got [1]; allowed: [0, 3]"),
+        (["study_maze.py", str(tmp_path), "me@9"], "variant: got me@9; allowed: one "),
+    ):
+        monkeypatch.setattr(sys, "argv", wrong)
+        with pytest.raises(SystemExit):
+            study_maze.main()
+        assert text in capsys.readouterr().err
