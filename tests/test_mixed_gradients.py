@@ -16,6 +16,7 @@ from newton_qd.envs.state import State
 from newton_qd.extractors import get_final_xy_position
 from newton_qd.gradients import Episode, MixedGradients, make_mixed_gradient
 from newton_qd.gradients.mixed import mixture
+from newton_qd.qd.algorithms.gradient_options import MixedOptions
 
 
 class Landscape:
@@ -96,6 +97,21 @@ def test_gradients_have_the_form_of_genotypes() -> None:
         assert strict.mixed(jnp.zeros((2, 1, 3)), key, samples=2).gradients.all()
     with pytest.raises(TypeError, match="genotypes: got an array of int32; allowed"):
         episode.mixed({"w": jnp.zeros((2, 3), int)}, key)
+
+
+def test_noise_of_a_search_follows_from_the_genotype() -> None:
+    """Neither a place in the batch nor a key that stays the same repeats it."""
+    env: Any = Landscape(lambda action: jnp.sin(2 * np.pi * action).sum())
+    episode, key = Episode(env, None, episode_length=1), jax.random.key(0)
+    of_search = MixedOptions(samples=4, noise=0.5).gradient(episode)
+    places = jnp.arange(3, dtype=jnp.float32)[:, None, None] * jnp.ones((1, 1, 3))
+    found = np.asarray(of_search(places, key).gradients[:, 0])
+    turned = np.asarray(of_search(places[::-1], key).gradients[:, 0])
+    np.testing.assert_array_equal(found, turned[::-1])
+    # one period further, only the noise is another one
+    assert np.abs(found - np.roll(found, 1, axis=0)).max(axis=(1, 2)).min() > 0.1
+    by_place = episode.mixed(places, key, samples=4, sigma=0.5).gradients[:, 0]
+    assert np.abs(by_place - found).max() > 0.1
 
 
 class Scaled(Landscape):

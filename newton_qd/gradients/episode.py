@@ -259,6 +259,7 @@ class Episode:
         samples: int = 16,
         sigma: float = 0.02,
         tolerance: float = math.inf,
+        noise_by_genotype: bool = False,
     ) -> MixedGradients:
         """Runs N episodes, with gradients of first and zeroth order under noise.
 
@@ -281,14 +282,18 @@ class Episode:
             tolerance: Allowed error of the estimate if first and zeroth order disagree,
                 in units of the gradient. Infinite: only inverse variances count. Then a
                 wrong first order with little noise gets a large weight.
+            noise_by_genotype: Whether the noise of an individual follows from the key
+                and its genotype, not from its place. A search whose key stays the same
+                then has other noise for each new genotype.
 
         Raises:
-            TypeError: A setting is not a number, or ``key`` is not a key.
+            TypeError: A setting has the wrong type, or ``key`` is not a key.
             ValueError: A setting is out of its range, or a genotype is wrong, as in a
                 call of the episode.
         """
         episode_input.check_genotypes(genotypes)
         check_mixture(samples, sigma, tolerance)
+        checks.flag("noise_by_genotype", noise_by_genotype)
         require_key("key", key)
         return mixed_gradients(
             jax.vmap(self, (0, None, None))(genotypes, key, params),
@@ -298,6 +303,7 @@ class Episode:
             samples=samples,
             sigma=sigma,
             tolerance=tolerance,
+            noise_by_genotype=noise_by_genotype,
         )
 
     def scoring(self, gradient: EpisodeGradient | None = None) -> ScoringFunction:

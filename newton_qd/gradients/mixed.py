@@ -75,6 +75,7 @@ def mixed_gradients(
     samples: int,
     sigma: float,
     tolerance: float,
+    noise_by_genotype: bool,
 ) -> MixedGradients:
     """Returns alpha-order gradients of N individuals, as :meth:`Episode.mixed`.
 
@@ -86,12 +87,15 @@ def mixed_gradients(
         samples: Pairs of samples of a genotype.
         sigma: Standard deviation of the noise, in the units of the genotype.
         tolerance: Allowed error if the two orders disagree.
+        noise_by_genotype: Whether the noise of an individual follows from its genotype,
+            not from its place.
 
     Raises:
         TypeError: A genotype is not of floating point.
     """
     require_floating(genotypes)
-    noise = normal_noise(noise_key, genotypes, samples, sigma)
+    draw = _noise_by_genotype if noise_by_genotype else normal_noise
+    noise = draw(noise_key, genotypes, samples, sigma)
     noise = rows_split_as(jax.tree.leaves(genotypes)[0], noise)
     found = _pairs(gradient, genotypes, noise)
     combine = functools.partial(_combined, sigma=sigma, tolerance=tolerance)
@@ -126,6 +130,34 @@ def normal_noise(
         for k, x in zip(keys, leaves, strict=True)
     ]
     return jax.tree.unflatten(structure, noise)
+
+
+def _noise_by_genotype(
+    key: RNGKey, genotypes: Genotype, samples: int, sigma: float
+) -> PyTree:
+    """Returns normal noise that follows from a genotype, leaves (N, samples, ...)."""
+
+    def noise_of(genotype: Genotype) -> PyTree:
+        own = jax.random.fold_in(key, _digest(genotype, key))
+        alone = jax.tree.map(lambda x: x[None], genotype)
+        return jax.tree.map(lambda w: w[0], normal_noise(own, alone, samples, sigma))
+
+    return jax.vmap(noise_of)(genotypes)
+
+
+def _digest(genotype: Genotype, key: RNGKey) -> jax.Array:
+    """Returns a number () of 32 bits that differs for other genotypes.
+
+    It is the sum of all words, times random odd numbers. Sums of integers do not depend
+    on their order.
+    """
+    words = []
+    for leaf in map(jnp.asarray, jax.tree.leaves(genotype)):
+        kind = jnp.dtype(f"uint{8 * min(leaf.dtype.itemsize, 4)}")
+        words.append(jax.lax.bitcast_convert_type(leaf, kind).astype(jnp.uint32))
+    row = jnp.concatenate([x.reshape(-1) for x in words])
+    odd = jax.random.bits(key, row.shape, jnp.uint32) | 1
+    return jnp.sum(row * odd, dtype=jnp.uint32)
 
 
 def _like(factors: jax.Array, array: jax.Array) -> jax.Array:

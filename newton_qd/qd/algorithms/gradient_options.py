@@ -99,7 +99,14 @@ class MixedOptions(FlowOptions):
         from newton_qd.gradients.mixed import check_mixture
 
         check_mixture(self.samples, self.noise)
-        return functools.partial(episode.mixed, samples=self.samples, sigma=self.noise)
+        # the key is the same in all generations, and on all devices of a mesh: noise by
+        # place would repeat the errors of earlier gradients
+        return functools.partial(
+            episode.mixed,
+            samples=self.samples,
+            sigma=self.noise,
+            noise_by_genotype=True,
+        )
 
     @property
     def episodes(self) -> int:
