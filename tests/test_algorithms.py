@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from point_runs import SMALL, evolve_module, interrupt_after, run
+from point_runs import SMALL, evolve_module, interrupt_after, point_task, run
 from test_steady import compiled
 
 import newton_qd.compat
@@ -76,6 +79,22 @@ def count_after_generations(
 
 def test_every_algorithm_is_tested() -> None:
     assert set(OPTIONS) == {spec.name for spec in ALGORITHMS}
+
+
+@pytest.mark.parametrize("name", [spec.name for spec in ALGORITHMS if spec.double])
+def test_a_generation_changes_no_type_under_x64(name: str, x64: None) -> None:
+    given: Any = OPTIONS[name]
+    config = SMALL.replace(algorithm=name, options=given)
+    search, key = Search(config, point_task(config)), jax.random.key(0)
+    generation, empty = search._generation, search.empty().repertoire
+    genotypes = jnp.zeros((config.batch_size, empty.genotypes.shape[1]), jnp.float32)
+    scores = jax.eval_shape(search._scoring(), genotypes, key)
+    before = jax.eval_shape(generation.begin, empty, genotypes, scores)[:2]
+    proposed = jax.eval_shape(generation.propose, *before, key)
+    initial = jnp.zeros((), jnp.float32)
+    after = jax.eval_shape(generation.tell, *before, *proposed, scores, initial)[:2]
+    types = functools.partial(jax.tree.map, lambda x: (x.shape, x.dtype))
+    assert types(after) == types(before)
 
 
 @pytest.mark.slow

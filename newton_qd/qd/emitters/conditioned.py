@@ -216,7 +216,9 @@ class ConditionedActorEmitter(Emitter):
             descriptors[: self._copies],
             fitnesses.reshape(-1)[: self._copies],
         )
-        unit = jnp.maximum(state.unit, _spread(repertoire.fitnesses[:, 0]))
+        # with JAX x64, QDax's archive has fitnesses in double precision
+        spread = _spread(repertoire.fitnesses[:, 0]).astype(state.unit.dtype)
+        unit = jnp.maximum(state.unit, spread)
         # worlds take new targets when their episodes begin
         worlds = self._worlds(repertoire, logits, unit, aim_key)
         learner = dataclasses.replace(state.learner, first=worlds)
