@@ -21,26 +21,24 @@ class InterpolationOptions(Options):
             variations.
         epochs: Steps of Adam for each offspring.
         deviation: Standard deviation of the policy as a normal distribution [-].
-        clip_ratio: Smallest change of the likelihood of an action at which a policy
-            moves no further away from the action [-].
     """
 
     share: float = 0.5
     epochs: int = 32
     deviation: float = 2.0
-    clip_ratio: float = 0.2
 
-    def settings(self) -> Any:
+    def settings(self, **more: float) -> Any:
         """Returns the settings of the operator.
+
+        Args:
+            **more: Other settings of ``Interpolation``.
 
         Raises:
             ValueError: A value is out of its range.
         """
         from newton_qd.qd.emitters.behaviors import Interpolation
 
-        return Interpolation(
-            epochs=self.epochs, deviation=self.deviation, clip=self.clip_ratio
-        )
+        return Interpolation(epochs=self.epochs, deviation=self.deviation, **more)
 
     def offspring(self, config: EvolveConfig) -> int:
         """Returns the number of offspring of the operator in a generation.
@@ -58,10 +56,13 @@ class AsciiMEOptions(InterpolationOptions):
     Attributes:
         learning_rate: Learning rate of Adam [-].
         discount: Discount of a control step [-].
+        clip_ratio: Smallest change of the likelihood of an action at which a policy
+            moves no further away from the action [-].
     """
 
     learning_rate: float = 3e-3
     discount: float = 0.99
+    clip_ratio: float = 0.2
 
 
 def _make(context: EmitterContext, options: AsciiMEOptions) -> Any:
@@ -71,7 +72,7 @@ def _make(context: EmitterContext, options: AsciiMEOptions) -> Any:
     config = context.config
     emitter = AsciiEmitter(
         context.policy.of_weights,
-        options.settings(),
+        options.settings(clip=options.clip_ratio),
         batch_size=options.offspring(config),
         episode_length=config.episode_length,
         rate=options.learning_rate,

@@ -235,7 +235,8 @@ class ExactAsciiEmitter(Emitter):
             gradient: Gradient of the return with respect to actions (N, T, nu) of an
                 episode with the same start, such as :meth:`newton_qd.Episode.gradient`
                 without policy and descriptor.
-            settings: Settings of the operator.
+            settings: Settings of the operator. ``clip`` and ``similarity`` have no
+                effect, because no policy moves away from an action.
             parents: Parents in one generation.
             branches: Offspring of each parent.
             reach: Largest change s of an action that the operator aims at [-].
