@@ -214,6 +214,24 @@ def test_a_run_from_several_starts(tmp_path: Path, scatter: float) -> None:
     assert np.any(again.fitnesses < mean - 1)
 
 
+ACTORS = {"points": 2, "probes": 3, "walks": 1, "worlds": 1, "window": 8}
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "more"),
+    [
+        ("me-gradient", {}, 2),
+        ("ascii-me-exact", {"branches": 4}, 4),
+        ("cma-mega", {"points": 2}, 2),
+        ("cma-maega-actor-critic", ACTORS, 3 * 2 + 8),
+    ],
+)
+def test_episodes_of_an_emitter(name: str, options: Any, more: int) -> None:
+    """They follow one start each, but for the evaluations of solution points."""
+    config = SMALL.replace(algorithm=name, options=options, starts=3)
+    assert Search(config, point_task(config))._episodes == 16 * 3 + more
+
+
 def test_the_untrained_policy_has_no_price_of_scatter() -> None:
     config = SMALL.replace(starts=3, iterations=0)
     plain, priced = (run(config.replace(scatter=x)) for x in (0.0, 0.5))

@@ -7,7 +7,7 @@ from typing import Any
 
 from newton_qd.qd.algorithms.gradient_options import SHORT, WINDOW
 from newton_qd.qd.algorithms.options import Options
-from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext
+from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext, batch_and
 from newton_qd.qd.algorithms.variation import parents_in, with_isoline
 from newton_qd.qd.config import EvolveConfig
 
@@ -159,9 +159,9 @@ def _gradients(config: EvolveConfig, options: ExactAsciiMEOptions) -> int:
     return options.parents(config)
 
 
-def _evaluations(config: EvolveConfig, options: ExactAsciiMEOptions) -> int:
-    """Returns the number of episodes; a parent runs once for its actions, too."""
-    return config.batch_size + 2 * options.parents(config)
+def _from_one_start(config: EvolveConfig, options: ExactAsciiMEOptions) -> int:
+    """Returns the number of episodes of parents: for actions, and differentiated."""
+    return 2 * options.parents(config)
 
 
 ASCII_ME_EXACT = AlgorithmSpec(
@@ -171,6 +171,7 @@ ASCII_ME_EXACT = AlgorithmSpec(
     make=_make_exact,
     options=ExactAsciiMEOptions,
     tuned={"halfcheetah_uni": SHORT},
-    evaluations=_evaluations,
+    evaluations=batch_and(_from_one_start),
     gradients=_gradients,
+    from_one_start=_from_one_start,
 )

@@ -78,6 +78,9 @@ class AlgorithmSpec(Generic[OptionsT]):
             before its first generation as in each one.
         gradients: Number of differentiated episodes of one generation; ``None``: the
             algorithm does not use gradients of the physics.
+        from_one_start: Number of episodes of one generation from a single start state,
+            however many an individual has; ``None``: those that the emitter
+            differentiates.
         scoring: Makes the scoring function of the loop; ``None``: the one without
             gradients.
         takes_faulty: Whether the emitter gets the fitness ``-inf`` of a faulty
@@ -100,6 +103,7 @@ class AlgorithmSpec(Generic[OptionsT]):
     evaluations: Callable[[EvolveConfig, OptionsT], int] = _batch_size
     evaluates_first: bool = False
     gradients: Callable[[EvolveConfig, OptionsT], int] | None = None
+    from_one_start: Callable[[EvolveConfig, OptionsT], int] | None = None
     scoring: (
         Callable[[EvolveConfig, OptionsT, Task, Policy], ScoringFunction] | None
     ) = None

@@ -230,9 +230,10 @@ class Search:
         spec = self._algorithm
         episodes = spec.evaluations(self._config, self.options)
         alone = 0
-        if spec.gradients is not None and spec.scoring is None:
+        count = spec.from_one_start or spec.gradients
+        if count is not None and spec.scoring is None:
             # gradients of an emitter follow one episode
-            alone = spec.gradients(self._config, self.options)
+            alone = count(self._config, self.options)
         return (episodes - alone) * self._config.starts + alone
 
     def checkpoint(self, state: SearchState) -> Checkpoint:
