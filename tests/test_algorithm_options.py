@@ -135,6 +135,20 @@ def test_shares_of_a_batch_that_do_not_fit_are_refused() -> None:
             {"novelty_nearest_neighbors": 0},
             "neighbors: got 0; allowed: integers",
         ),
+        (
+            "me-es",
+            {"num_optimizer_steps": 2**31},
+            "steps: got 2147483648; allowed: .* to 2147483647",
+        ),
+        ("me-es", {"sample_sigma": 0}, "sample_sigma: got 0.0; allowed: .*above 0"),
+        (
+            "me-es",
+            {"use_explore": False, "use_exploit": False},
+            r"use_explore, use_exploit: got \(False, False\); allowed: at least one",
+        ),
+        ("dcrl-me", {"lengthscale": 0}, "lengthscale: got 0.0; allowed: .*above 0"),
+        ("dcrl-me", {"discount": 1.5}, "discount: got 1.5; allowed: .* up to 1"),
+        ("pga-me", {"soft_tau_update": 2}, "update: got 2.0; allowed: .* up to 1"),
     ],
 )
 def test_options_out_of_range_are_refused(

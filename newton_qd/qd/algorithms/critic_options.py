@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING
 
+from newton_qd import checks
 from newton_qd.checks import message
 from newton_qd.qd.algorithms.options import Options
 from newton_qd.qd.config import ConfigError, EvolveConfig
@@ -47,6 +48,15 @@ class CriticOptions(Options):
     batch_size: int = 256
     soft_tau_update: float = 0.005
     policy_delay: int = 2
+
+    def check(self) -> None:
+        """Checks the values with which a critic would grow without limit.
+
+        Raises:
+            ValueError: A value is out of its range.
+        """
+        checks.number("discount", self.discount, most=1)
+        checks.number("soft_tau_update", self.soft_tau_update, most=1)
 
 
 def require_buffer(config: EvolveConfig, size: int) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING, Any, cast
 
+from newton_qd import checks
 from newton_qd.checks import listed, message
 from newton_qd.qd.algorithms.critic_options import (
     CriticOptions,
@@ -41,6 +42,15 @@ class DCRLMEOptions(CriticOptions):
     num_critic_training_steps: int = 3000
     num_pg_training_steps: int = 150
     batch_size: int = 100
+
+    def check(self) -> None:
+        """Checks the values with which critic or actor would be NaN.
+
+        Raises:
+            ValueError: A value is out of its range.
+        """
+        super().check()
+        checks.number("lengthscale", self.lengthscale, above=0)
 
     def shares(self, config: EvolveConfig) -> dict[str, int]:
         """Returns the sizes of the three parts of a generation, by option name.

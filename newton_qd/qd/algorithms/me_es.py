@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING, Any
 
+from newton_qd import checks
 from newton_qd.checks import message
 from newton_qd.qd.algorithms.critic_options import require_batch_size
 from newton_qd.qd.algorithms.options import Options
@@ -53,6 +54,17 @@ class MEESOptions(Options):
     explore_num_cell_sample: int = 5
     use_explore: bool = True
     use_exploit: bool = True
+
+    def check(self) -> None:
+        """Checks that samples differ, and that generations follow something.
+
+        Raises:
+            ValueError: They do not.
+        """
+        checks.number("sample_sigma", self.sample_sigma, above=0)
+        if not (self.use_explore or self.use_exploit):
+            names, given = "use_explore, use_exploit", (False, False)
+            raise ValueError(message(names, given, "at least one of them true"))
 
 
 class _FromOne:

@@ -23,6 +23,8 @@ from newton_qd.qd.config import (
     check_integers,
 )
 
+_MOST = 2**31 - 1  # JAX counts in 32 bits
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Options:
@@ -73,8 +75,8 @@ def read_options(
 
     Raises:
         ConfigError: An option does not exist, or its value has the wrong type, is not
-            finite, is negative, is less than ``least``, or fails a check of the
-            dataclass.
+            finite, is negative, is less than ``least``, has more than 32 bits, or fails
+            a check of the dataclass.
     """
     hints = typing.get_type_hints(kind)
     allowed = {field.name for field in dataclasses.fields(kind)}
@@ -135,7 +137,7 @@ def _fitting(name: str, value: Any, wanted: Any, least: int) -> Any:
         checks.number(name, value, least=0, error=ConfigError)
         return float(value)
     if wanted is int:
-        check_integer(name, value, least)
+        check_integer(name, value, least, _MOST)
     elif wanted is bool:
         checks.instance(name, value, bool, "true or false", error=ConfigError)
     elif typing.get_origin(wanted) is tuple:
