@@ -9,6 +9,7 @@ from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from qdax.core.emitters.emitter import Emitter
 
 from newton_qd import checks
@@ -134,7 +135,8 @@ class ActorCriticEmitter(Emitter):
         self._copies = copies
         self._spread = spread
         self._updates = updates
-        self._steered = round(steered * actors)
+        # steered actors are last
+        self._follow = np.arange(actors) >= actors - round(steered * actors)
         self._fitness = fitness
         self._lifetime = lifetime
         self._measures = measures
@@ -168,7 +170,7 @@ class ActorCriticEmitter(Emitter):
         learners = self._begun(critic_key, weights, self._aims(aim_key))
         return ActorCriticState(
             learners=learners,
-            scale=self._method.scale(scale_key, self._worlds()),
+            scale=self._method.scale(scale_key, self._method.worlds(self._first)),
             snapshots=jnp.tile(weights, (self._branches, 1, 1)),
             failed=jnp.zeros((self._actors,), jnp.int32),
             generation=jnp.zeros((), jnp.int32),
@@ -277,25 +279,18 @@ class ActorCriticEmitter(Emitter):
         learners = select(generation == later.after, fresh, learners)
         return self._learned(later.update, later.updates, learners, scale, key)
 
-    def _worlds(self) -> PyTree:
-        """Returns the initial states of the worlds of an actor."""
-        number = self._method.settings.worlds
-        return jax.tree.map(
-            lambda leaf: jnp.broadcast_to(leaf, (number, *jnp.shape(leaf))), self._first
-        )
-
     def _begun(self, key: jax.Array, weights: jax.Array, aims: jax.Array) -> Learner:
         """Returns K new actors with weights (K, size)."""
         keys = jax.random.split(key, self._actors)
         begin = jax.vmap(self._method.begin, in_axes=(0, 0, 0, None))
-        return begin(keys, weights, aims, self._worlds())
+        return begin(keys, weights, aims, self._method.worlds(self._first))
 
     def _aims(self, key: jax.Array) -> jax.Array:
         """Returns the aims (K, 1 + D) of the actors; steered actors are last."""
         shape = (self._actors, self._measures)
         ways = jax.random.normal(key, shape, jnp.float32)
         ways = ways / jnp.linalg.norm(ways, axis=1, keepdims=True)
-        steered = jnp.arange(self._actors) >= self._actors - self._steered
+        steered = self._follow
         return jnp.concatenate(
             [
                 jnp.where(steered, jnp.float32(self._fitness), 1)[:, None],
@@ -325,7 +320,7 @@ class ActorCriticEmitter(Emitter):
         lengths = jnp.linalg.norm(ways, axis=1, keepdims=True)
         ways = ways / jnp.where(lengths > 0, lengths, 1)
         chosen = jax.random.uniform(choice_key, (self._actors,)) < self._to_empty
-        chosen = chosen & (jnp.arange(self._actors) >= self._actors - self._steered)
+        chosen = chosen & self._follow
         return aims.at[:, 1:].set(jnp.where(chosen[:, None], ways, aims[:, 1:]))
 
     def _renewed(
@@ -342,6 +337,5 @@ class ActorCriticEmitter(Emitter):
             aims = self._toward_empty(aims, repertoire, cells, empty_key)
         new = self._begun(critic_key, weights, aims)
         due = due_for_restart(state.generation, self._lifetime, self._actors)
-        steered = jnp.arange(self._actors) >= self._actors - self._steered
         begun = state.generation > 0
-        return select(due & steered & begun, new, state.learners)
+        return select(due & self._follow & begun, new, state.learners)

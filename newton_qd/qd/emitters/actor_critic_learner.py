@@ -109,6 +109,13 @@ class ActorCritic:
         )
         return actor, critic
 
+    def worlds(self, first: StateLike) -> PyTree:
+        """Returns the worlds of an actor, leaves (W, ...), all in the same state."""
+        number = self.settings.worlds
+        return jax.tree.map(
+            lambda leaf: jnp.broadcast_to(leaf, (number, *jnp.shape(leaf))), first
+        )
+
     def scale(self, key: jax.Array, first: PyTree) -> tuple[jax.Array, jax.Array]:
         """Returns mean and deviation (no,) of observations with random actions.
 

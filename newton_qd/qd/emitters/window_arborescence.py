@@ -89,10 +89,7 @@ class WindowArborescenceEmitter(CMAMAEGAEmitter):
     def _begun(
         self, points: jax.Array, descriptor_length: int, key: jax.Array, old: Any
     ) -> Climbers:
-        number = self._method.settings.worlds
-        worlds = jax.tree.map(
-            lambda leaf: jnp.broadcast_to(leaf, (number, *jnp.shape(leaf))), self._first
-        )
+        worlds = self._method.worlds(self._first)
         scale_key, probe_key, walk_key = jax.random.split(key, 3)
         if old is None:
             found = self._method.scale(scale_key, worlds)
