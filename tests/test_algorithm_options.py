@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,9 @@ from point_runs import SMALL, interrupt_after, point_task, run
 import newton_qd.compat
 from newton_qd import cli
 from newton_qd.qd.algorithms.cma_me import CMAMEOptions
+from newton_qd.qd.algorithms.me_conditioned import ConditionedOptions
 from newton_qd.qd.algorithms.options import read_options
+from newton_qd.qd.algorithms.variation import parents_in
 from newton_qd.qd.config import ConfigError, read_config
 
 
@@ -156,6 +159,15 @@ def test_options_out_of_range_are_refused(
 ) -> None:
     with pytest.raises(ConfigError, match=message):
         run(SMALL.replace(algorithm=name, options=options))
+
+
+@pytest.mark.parametrize(("share", "size"), [(0.29, 100), (1 / 49, 49), (0.3, 128)])
+def test_a_share_of_a_generation_is_rounded_down(share: float, size: int) -> None:
+    """Not below a whole number that rounding errors miss."""
+    config, exact = SMALL.replace(batch_size=size), Fraction(share).limit_denominator()
+    assert parents_in(config, share, 1) == int(exact * size)
+    copies = ConditionedOptions(copies=share, between=0.5).numbers(config)[0]
+    assert copies == int(exact * size)
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from newton_qd.qd.algorithms.gradient_options import (
 )
 from newton_qd.qd.algorithms.learning import LearningOptions
 from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext, batch_and
-from newton_qd.qd.algorithms.variation import with_isoline
+from newton_qd.qd.algorithms.variation import part_of, with_isoline
 from newton_qd.qd.config import ConfigError, EvolveConfig
 
 
@@ -59,7 +59,7 @@ class ConditionedOptions(LearningOptions):
             value = getattr(self, name)
             name = f"options: {name}"
             checks.number(name, value, least=0, most=1, error=ConfigError)
-        found = tuple(int(x * config.batch_size) for x in (self.copies, self.between))
+        found = tuple(part_of(config, x) for x in (self.copies, self.between))
         if not 1 <= sum(found) <= config.batch_size:
             given = self.copies, self.between
             allowed = f"from 1 to batch_size = {config.batch_size} individuals together"

@@ -78,6 +78,12 @@ def with_own_isoline(emitter: MultiEmitter, config: EvolveConfig) -> MultiEmitte
     return emitter
 
 
+def part_of(config: EvolveConfig, share: float) -> int:
+    """Returns the number of individuals that are a share of a generation, at most."""
+    # rounded, because 0.29 * 100 is below 29
+    return int(round(share * config.batch_size, 6))
+
+
 def parents_in(config: EvolveConfig, share: float, branches: int) -> int:
     """Returns the number of parents whose offspring are a share of a generation.
 
@@ -91,7 +97,7 @@ def parents_in(config: EvolveConfig, share: float, branches: int) -> int:
     """
     checks.number("options: share", share, above=0, most=1, error=ConfigError)
     checks.integer("options: branches", branches, most=None, error=ConfigError)
-    parents = int(share * config.batch_size) // branches
+    parents = part_of(config, share) // branches
     if parents < 1:
         least = f"{branches} / batch_size = {branches} / {config.batch_size}"
         allowed = f"at least {least}, the offspring of a parent"
