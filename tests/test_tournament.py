@@ -13,6 +13,7 @@ from point_runs import SMALL, point_task
 from qdax.core.containers.mapelites_repertoire import MapElitesRepertoire
 
 import newton_qd.compat
+from newton_qd.qd.config import ConfigError
 from newton_qd.qd.emitters.tournament import TournamentEmitter
 from newton_qd.qd.run.search import Search
 
@@ -88,3 +89,11 @@ def test_iso_line_variations_of_an_algorithm_have_a_tournament(
     finally:
         newton_qd.compat.uninstall()  # pga-me and dcrl-me have installed it
     assert made == [{"batch_size": share * 64, "tournament": 3}]
+
+
+@pytest.mark.parametrize("name", ["cma-me", "me-es", "omg-mega", "cma-maega"])
+def test_algorithms_without_variations_have_no_tournaments(name: str) -> None:
+    config = SMALL.replace(algorithm=name, tournament=2)
+    allowed = f"tournament: got 2; allowed: 1 for '{name}', which has no iso"
+    with pytest.raises(ConfigError, match=allowed):
+        Search(config, point_task(config))

@@ -44,6 +44,7 @@ CMA_MAEGA = AlgorithmSpec(
     summary="CMA-MAEGA: like `cma-mega`, with an annealed archive",
     make=_make,
     options=CMAMAEGAOptions,
+    varies=False,
     tuned=TUNED,
     evaluations=batch_and(gradients),
     evaluates_first=True,

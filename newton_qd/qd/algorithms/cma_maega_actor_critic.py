@@ -103,6 +103,7 @@ CMA_MAEGA_ACTOR_CRITIC = AlgorithmSpec(
     "actors that learn over short windows, and such actors move the points",
     make=_make,
     options=ArborescenceActorOptions,
+    varies=False,
     tuned={
         "halfcheetah_uni": SHORT,
         **dict.fromkeys(("hopper_uni", "walker2d_uni"), _SMALL_STEPS),

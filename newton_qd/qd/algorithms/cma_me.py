@@ -53,6 +53,7 @@ CMA_ME = AlgorithmSpec(
     "the policy's size",
     make=_make,
     options=CMAMEOptions,
+    varies=False,
     least=1,
     smallest=2,
     double=False,

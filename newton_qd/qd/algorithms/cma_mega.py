@@ -104,6 +104,7 @@ CMA_MEGA = AlgorithmSpec(
     "points",
     make=_make,
     options=CMAMEGAOptions,
+    varies=False,
     tuned=TUNED,
     evaluations=batch_and(gradients),
     evaluates_first=True,

@@ -169,6 +169,7 @@ ME_ES = AlgorithmSpec(
     "number of samples for each gradient",
     make=_make,
     options=MEESOptions,
+    varies=False,
     least=1,
     evaluates=True,
     evaluations=_evaluations,

@@ -45,6 +45,7 @@ OMG_MEGA = AlgorithmSpec(
     "elites; every evaluation is differentiated",
     make=_make,
     options=OMGMEGAOptions,
+    varies=False,
     tuned={"halfcheetah_uni": CHAOTIC, **on_robots_that_fall(sigma_g=0.02)},
     evaluations=_gradients,
     gradients=_gradients,

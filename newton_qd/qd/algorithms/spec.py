@@ -6,8 +6,9 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, Generic, TypeAlias
 
+from newton_qd.checks import message
 from newton_qd.qd.algorithms.options import OptionsT, read_options
-from newton_qd.qd.config import EvolveConfig
+from newton_qd.qd.config import ConfigError, EvolveConfig
 
 if TYPE_CHECKING:  # importing a list of algorithms imports no JAX
     import jax
@@ -86,6 +87,8 @@ class AlgorithmSpec(Generic[OptionsT]):
         takes_faulty: Whether the emitter gets the fitness ``-inf`` of a faulty
             individual. If not, it gets the worst finite fitness.
         initial_scale: Factor of the weights of the initial population.
+        varies: Whether its generations have iso+line variations, so that a tournament
+            has an effect.
         smallest: Smallest number of individuals of a generation.
         double: Whether the emitter runs in JAX's 64-bit mode.
         goes_on: Whether a run goes on beyond its end. If not, its state depends on the
@@ -109,6 +112,7 @@ class AlgorithmSpec(Generic[OptionsT]):
     ) = None
     takes_faulty: bool = False
     initial_scale: Callable[[OptionsT], float] = _unscaled
+    varies: bool = True
     smallest: int = 1
     double: bool = True
     goes_on: bool = True
@@ -117,7 +121,11 @@ class AlgorithmSpec(Generic[OptionsT]):
         """Returns the options of a run, with the defaults of its environment.
 
         Raises:
-            ConfigError: An option does not exist, or its value is not allowed.
+            ConfigError: An option does not exist, its value is not allowed, or the run
+                has tournaments, and the algorithm none.
         """
+        if config.tournament > 1 and not self.varies:
+            allowed = f"1 for {self.name!r}, which has no iso+line variations"
+            raise ConfigError(message("tournament", config.tournament, allowed))
         tuned = self.tuned.get(config.env_name, {})
         return read_options(self.options, config, least=self.least, **tuned)
