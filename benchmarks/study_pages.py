@@ -154,6 +154,7 @@ KINDS: dict[str, Callable[[str], str]] = {
     "ratios": lambda _: study_scores.overview(_field()),
     "ratios to MAP-Elites": lambda _: study_scores.overview(_field(), "me"),
     "each": lambda stop: study_scores.each(_field(), stop),
+    "seeds": lambda stops: study_scores.seeds(_field(), stops.split(", ")),
     "ours and DCRL-ME": lambda stops: study_scores.against(
         _field(), "dcrl-me", stops.split(", ")
     ),

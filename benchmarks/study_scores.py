@@ -160,6 +160,26 @@ def each(results: Results, stop: str) -> str:
     return markdown(["task", *OTHERS.values()], rows)
 
 
+def seeds(results: Results, stops: Sequence[str]) -> str:
+    """Markdown table: seeds at each stop of the variants that are compared there."""
+
+    def number(task: str, stop: str, rival: str | None) -> str:
+        side = sides_of(results, task, stop, rival)[rival is not None]
+        return str(max(enough(side))[4]) if side else "0"
+
+    rows = [
+        [
+            task,
+            *(
+                ", ".join(number(task, s, name) for s in stops)
+                for name in (None, *OTHERS)
+            ),
+        ]
+        for task in sorted({key[0] for key in results})
+    ]
+    return markdown(["task", "ours", *OTHERS.values()], rows)
+
+
 def named(stop: str) -> str:
     """Returns the name of a stop in the documentation."""
     amount, unit = stop.split()

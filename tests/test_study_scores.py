@@ -150,6 +150,17 @@ def test_ours_are_compared_with_each_baseline() -> None:
     ]
 
 
+def test_seeds_are_those_of_the_compared_variants() -> None:
+    results = scored("60 s", {"me-actor-critic": 8.0, "me": 4.0}, seeds=5)
+    results |= scored("60 s", {"dcrl-me": 1.0, "me-actor-critic@2": 9.0}, seeds=7)
+    results |= scored("250 s", {"me-actor-critic": 8.0, "me@1": 5.0}, seeds=2)
+    results |= scored("60 s", {"dcrl-me@1": 2.0}, seeds=3)
+    assert study_scores.seeds(results, ["60 s", "250 s"]).splitlines()[::2] == [
+        "| task | ours | MAP-Elites | DCRL-ME | PGA-ME | ASCII-ME | CMA-ME |",
+        f"| {TASK} | 5, 2 | 5, 2 | 3, 0 | 0, 0 | 0, 0 | 0, 0 |",
+    ]
+
+
 def test_published_ratios_are_of_single_evaluations() -> None:
     stop = "1000000 evaluations"
     results = {}
