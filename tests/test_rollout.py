@@ -174,6 +174,15 @@ def test_wrong_actions_are_refused() -> None:
             env.rollout(state, actions)
 
 
+def test_float64_needs_the_mode_of_jax() -> None:
+    """As in ``reset`` and ``step``. Before, the error was about ``controls``."""
+    with jax.enable_x64(True):
+        env = newton_qd.create("hopper", auto_reset=False, dtype="float64")
+        state = jax.jit(env.reset)(jax.random.key(0))
+    with pytest.raises(ValueError, match=r"^dtype: got 'float64' while JAX x64 is off"):
+        env.rollout(state, jnp.zeros((2, 3)))
+
+
 @pytest.mark.parametrize(
     ("native", "own"),
     [

@@ -51,7 +51,8 @@ def rollout(env: Any, state: State, actions: Action, params: Params) -> State:
 
     Raises:
         TypeError: The state or an action has the wrong type.
-        ValueError: The state, the actions or ``params`` do not fit the environment.
+        ValueError: The state, the actions or ``params`` do not fit the environment, or
+            it is float64 and JAX x64 is off.
     """
     if not hasattr(state, "done"):  # a class of a user may have states of its own
         inputs.require_state(state)
@@ -66,6 +67,7 @@ def rollout(env: Any, state: State, actions: Action, params: Params) -> State:
     if order == RolloutOrder.ONE_BY_ONE:
         return _in_order(env, state, actions, params, known=False)
     base = env.unwrapped
+    checks.x64(base.dtype)
     inputs.require_robot_state(state, base.system, ())
     actions = jax.vmap(
         lambda action: inputs.checked_action(action, base.action_size, base.dtype)
