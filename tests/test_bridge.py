@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import subprocess
 import sys
@@ -238,6 +239,45 @@ def test_no_second_derivative() -> None:
 
     with pytest.raises(TypeError, match=r"first derivatives only: .*lax.stop_gradient"):
         jax.grad(first)(jnp.asarray(ACTIONS[0, 0]))
+
+
+def test_functions_without_a_derivative() -> None:
+    """JAX's own error names neither the function nor the cure."""
+    here, action = start(), jnp.asarray(ACTIONS[0, 0])
+
+    def impulses(q: jax.Array) -> jax.Array:
+        state = dataclasses.replace(here, q=q)
+        return physics.contact_impulses(SYSTEM, state, action)[1]
+
+    for name, read in {
+        "mass_matrix": lambda q: physics.mass_matrix(SYSTEM, q),
+        "bias_forces": lambda q: physics.bias_forces(SYSTEM, q, here.v),
+        "contact_gaps": lambda q: physics.contact_gaps(SYSTEM, q),
+        "contact_impulses": impulses,
+    }.items():
+        words = rf"^there is no derivative of physics\..*{name}.*: .*stop_gradient"
+
+        def loss(q: jax.Array, read: Any = read) -> jax.Array:
+            return read(q).sum()
+
+        for derived in (jax.grad(loss), jax.jit(jax.grad(loss)), jax.jacfwd(loss)):
+            with pytest.raises(TypeError, match=words):
+                derived(here.q)
+
+
+def test_gaps_may_be_constant_in_a_loss() -> None:
+    """The cure that the error names."""
+
+    def loss(q: jax.Array) -> jax.Array:
+        gaps = physics.contact_gaps(SYSTEM, jax.lax.stop_gradient(q))
+        return gaps.sum() * q.sum()
+
+    q = start().q
+    np.testing.assert_allclose(
+        jax.jit(jax.vmap(jax.grad(loss)))(q[None])[0],
+        physics.contact_gaps(SYSTEM, q).sum() * jnp.ones_like(q),
+        rtol=1e-6,
+    )
 
 
 def test_an_inner_gradient_may_be_constant() -> None:

@@ -19,6 +19,7 @@ from newton_qd.physics import layout, row_calls
 from newton_qd.physics.explicit_mesh import split_as, split_row
 from newton_qd.physics.launch import Launcher, thread_count
 from newton_qd.physics.layout import Layout
+from newton_qd.physics.reverse_mode import without_derivative
 from newton_qd.physics.row_calls import (
     RowCall,
     differentiable,
@@ -276,6 +277,7 @@ def dynamics(system: System, q: jax.Array, v: jax.Array) -> tuple[jax.Array, jax
     read, written = layout.coordinates(system), layout.dynamics(system)
     call = _kernel_call(system, "dynamics_forward", read.size)
     row = _row(system, read.shapes, q=q, v=v)
+    row = without_derivative("physics.mass_matrix or bias_forces", row)
     found = _split(call(row, output_dims=written.size)[0], written)
     return found["mass_matrix"], found["bias"]
 
@@ -290,6 +292,7 @@ def contact_gaps(system: System, q: jax.Array) -> jax.Array:
     read, written = layout.coordinates(system), layout.gaps(system)
     call = _kernel_call(system, "contact_gaps", read.size)
     row = _row(system, read.shapes, q=q, v=jnp.zeros((system.nv,), q.dtype))
+    row = without_derivative("physics.contact_gaps", row)
     return call(row, output_dims=written.size)[0]
 
 
@@ -307,6 +310,7 @@ def contact_impulses(
     read, written = layout.inputs(system), layout.impulses(system)
     call = _kernel_call(system, "contact_impulses", read.size)
     row = _row(system, read.shapes, q=q, v=v, control=control)
+    row = without_derivative("physics.contact_impulses", row)
     return _split(call(row, output_dims=written.size)[0], written)["impulse"]
 
 

@@ -91,6 +91,8 @@ def seen_bodies(system: System, state: PhysicsState) -> Kinematics:
 def mass_matrix(system: System, q: jax.Array) -> jax.Array:
     """Computes the joint-space inertia, including the armature.
 
+    The result is not differentiable.
+
     Args:
         system: The system.
         q: (nq,) coordinates [m or rad].
@@ -110,7 +112,7 @@ def mass_matrix(system: System, q: jax.Array) -> jax.Array:
 def bias_forces(system: System, q: jax.Array, v: jax.Array) -> jax.Array:
     """Computes the bias forces: velocity-product forces and gravity.
 
-    Damping, springs and contacts are not included.
+    Damping, springs and contacts are not included. The result is not differentiable.
 
     Args:
         system: The system.

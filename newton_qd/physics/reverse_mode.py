@@ -9,10 +9,12 @@ back, which refuses. So a gradient that is only a constant of another one is all
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
 import jax
+from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
@@ -27,6 +29,33 @@ _SECOND = (
     "again; stop the inner gradient with jax.lax.stop_gradient, or use differences of "
     "gradients (docs/physics.md)"
 )
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def without_derivative(name: str, x: jax.Array) -> jax.Array:
+    """Returns ``x`` unchanged. Any derivative of it is a ``TypeError``.
+
+    Args:
+        name: Name of the function that reads ``x`` and has no derivative.
+        x: Its inputs.
+    """
+    return x
+
+
+@functools.partial(without_derivative.defjvp, symbolic_zeros=True)
+def _constant(name: str, primals: tuple, tangents: tuple) -> tuple[Any, Any]:
+    """Passes what is constant.
+
+    Raises:
+        TypeError: ``x`` is differentiated.
+    """
+    if not isinstance(tangents[0], SymbolicZero):
+        raise TypeError(
+            f"there is no derivative of {name}: stop the gradient of its arguments "
+            "with jax.lax.stop_gradient, or use differences of its values "
+            "(docs/physics.md)"
+        )
+    return primals[0], tangents[0]
 
 
 def reverse_mode_only(x: jax.Array) -> jax.Array:
