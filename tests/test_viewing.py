@@ -99,6 +99,21 @@ def test_a_policy_and_auto_reset() -> None:
     assert np.array_equal(whole.q[3, 2], whole.q[3, 4])
 
 
+def test_a_state_of_ones_own_is_the_start() -> None:
+    env = newton_qd.create("pointmaze", auto_reset=False, episode_length=4)
+    state = env.step(env.reset(jax.random.key(1)), jnp.ones(2))
+    seen = record(env, jnp.full((2, 3, 2), 0.5), state)
+    later = env.rollout(state, jnp.full((3, 2), 0.5))
+    for q in seen.q:
+        np.testing.assert_array_equal(q, jnp.stack([state.obs, *later.obs]))
+    batch = jax.tree.map(lambda x: x[None], state)
+    with pytest.raises(ValueError, match=r"^key: got a state of a batch of shape \(1,"):
+        record(env, jnp.zeros((3, 2)), batch)
+    other = newton_qd.create("hopper", auto_reset=False).reset(jax.random.key(0))
+    with pytest.raises(ValueError, match=r"^state: got obs of shape \(11,\)"):
+        record(env, jnp.zeros((3, 2)), other)
+
+
 def test_wrong_arguments_are_named(ant: Any, walk: Trajectory) -> None:
     key = jax.random.key(0)
     for wrong in (jnp.zeros((3, 7)), jnp.zeros(8), jnp.zeros((2, 0, 8))):

@@ -17,6 +17,7 @@ from newton_qd.checks import Fact, message
 from newton_qd.envs.base import Env, PhysicsEnv
 from newton_qd.envs.inputs import require_key
 from newton_qd.envs.shown import component_names
+from newton_qd.envs.state import State
 from newton_qd.types import Action, Observation, Params, PyTree, RNGKey
 from newton_qd.viewing.drawing import Drawing, drawing_of
 from newton_qd.viewing.trajectory import Contacts, Trajectory
@@ -27,7 +28,7 @@ _STEPS = 1000  # of an environment without an episode length
 def record(
     env: Env,
     policy: Callable[[Observation], Action] | jax.Array | np.ndarray,
-    key: RNGKey,
+    key: RNGKey | State,
     *,
     steps: int | None = None,
     worlds: int | None = None,
@@ -46,7 +47,8 @@ def record(
         policy: Function of an observation (no,) that returns an action (nu,). Or
             actions (steps, nu), or (worlds, steps, nu) for each world its own.
         key: Key of the resets. Every world gets its own part of it if there are
-            several; one world starts as after ``env.reset(key)``.
+            several; one world starts as after ``env.reset(key)``. Or the state of one
+            world, from which all worlds start.
         steps: Control steps; ``None``: as many as there are actions, else the length
             of the environment's episode, or 1,000 if it has none.
         worlds: Number of worlds; ``None``: as many as there are plans of actions, or 1.
@@ -57,14 +59,19 @@ def record(
 
     Raises:
         TypeError: The environment cannot be drawn, or an argument has the wrong type.
-        ValueError: The environment has a batch, the actions have the wrong shape,
-            ``steps`` or ``worlds`` is not an integer above 0, there are fewer actions
-            than ``steps``, or the trajectory does not fit in memory.
+        ValueError: The environment or the state has a batch, or the state is one of
+            another environment. The actions have the wrong shape, ``steps`` or
+            ``worlds`` is not an integer above 0, there are fewer actions than
+            ``steps``, or the trajectory does not fit in memory.
         RobotDescriptionError: A URDF file is malformed.
         OSError: A URDF file cannot be read.
     """
     drawing = drawing_of(env)
-    require_key("key", key)
+    if not isinstance(key, State):
+        require_key("key", key)
+    elif jnp.ndim(key.done):
+        given = Fact(f"a state of a batch of shape {jnp.shape(key.done)}")
+        raise ValueError(message("key", given, "a key, or the state of one world"))
     checks.integer("steps", steps, optional=True)
     checks.integer("worlds", worlds, optional=True)
     plan = None
@@ -80,14 +87,21 @@ def record(
         steps = _episode_steps(env)
     worlds = 1 if worlds is None else worlds
     check_memory(env, steps, worlds)
-    keys = key[None] if worlds == 1 else jax.random.split(key, worlds)
+    starts = _starts(key, worlds)
     acts = (lambda _, observation: policy(observation)) if callable(policy) else None
     run = functools.partial(_run, env, acts, params, contacts, steps)
     if plan is not None:
         plan = plan[:, :steps]
-    seen = jax.jit(jax.vmap(run))(keys, None, plan)
+    seen = jax.jit(jax.vmap(run))(starts, None, plan)
     seen = jax.tree.map(np.asarray, seen)
     return _trajectory(env, drawing, seen, labels)
+
+
+def _starts(key: RNGKey | State, worlds: int) -> PyTree:
+    """Returns a key or a state for each world, leaves (worlds, ...)."""
+    if isinstance(key, State):
+        return jax.tree.map(lambda x: jnp.stack([x] * worlds), key)
+    return key[None] if worlds == 1 else jax.random.split(key, worlds)
 
 
 def check_memory(env: Env, steps: int, worlds: int) -> None:
@@ -193,7 +207,7 @@ def _run(
     params: Params,
     contacts: bool,
     steps: int,
-    key: RNGKey,
+    key: RNGKey | State,
     parameters: PyTree,
     plan: jax.Array | None,
 ) -> tuple[dict[str, jax.Array], dict[str, jax.Array]]:
@@ -203,7 +217,7 @@ def _run(
         ValueError: The environment has a batch; or contacts are recorded, and the world
             has physical parameters.
     """
-    first = env.reset(key)
+    first = key if isinstance(key, State) else env.reset(key)
     if contacts and (params is not None or "params" in first.info):
         why = "and contacts are computed without physical parameters"
         raise ValueError(message("contacts", contacts, "False", why=why))
