@@ -152,6 +152,22 @@ def test_shares_of_a_batch_that_do_not_fit_are_refused() -> None:
         ("dcrl-me", {"lengthscale": 0}, "lengthscale: got 0.0; allowed: .*above 0"),
         ("dcrl-me", {"discount": 1.5}, "discount: got 1.5; allowed: .* up to 1"),
         ("pga-me", {"soft_tau_update": 2}, "update: got 2.0; allowed: .* up to 1"),
+        *(
+            (name, {"noise": 0.02}, "noise: got 0.02, .*no effect with samples = 0; ")
+            for name in ("omg-mega", "cma-mega", "cma-maega")
+        ),
+        ("omg-mega", {"noise": 0.1, "samples": 0}, "no value, or another samples"),
+        ("me-actor-critic", {"climb_window": 0}, "window: got 0, .* climbers = 0; "),
+        (
+            "me-actor-critic",
+            {"episode_updates": 2, "climbers": 1},
+            "episode_updates: got 2, .* episodes_after = 0; ",
+        ),
+        (
+            "me-conditioned",
+            {"tolerance": 0.2, "conditioned": False},
+            "tolerance: got 0.2, .* conditioned = False; ",
+        ),
     ],
 )
 def test_options_out_of_range_are_refused(

@@ -15,6 +15,7 @@ FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
 sys.path.insert(0, str(FOLDER))
 
 import study  # noqa: E402
+import study_core  # noqa: E402
 import study_pool  # noqa: E402
 import study_results  # noqa: E402
 import study_runs  # noqa: E402
@@ -35,6 +36,13 @@ def test_every_variant_is_a_setting(protocol: Any) -> None:
             config = EvolveConfig(env_name=TASK, algorithm=algorithm, **given)
             algorithm_named(algorithm).read_options(config)
     assert protocol.settings_of(TASK)["hidden"] == [64, 64]
+
+
+@pytest.mark.parametrize("task", study_core.TASKS)
+def test_every_variant_of_one_core_is_a_setting(task: str) -> None:
+    for variant in study_core.read("variants"):
+        config = study_core.config_of(study_core.Run(task, variant, 0))
+        algorithm_named(config.algorithm).read_options(config)
 
 
 @pytest.mark.parametrize("task", FIELD.tasks)

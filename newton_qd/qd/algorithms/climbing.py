@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from newton_qd import checks
 from newton_qd.checks import message
 from newton_qd.qd.algorithms.gradient_options import MAZES, SHORT
-from newton_qd.qd.algorithms.options import Options
+from newton_qd.qd.algorithms.options import Options, only_with
 from newton_qd.qd.algorithms.spec import EmitterContext
 from newton_qd.qd.config import ConfigError
 
@@ -49,13 +49,13 @@ class ClimbingOptions(Options):
     """
 
     climbers: int = 0
-    climb_steps: int = 32
-    climb_shortest: float = 0.005
-    climb_longest: float = 0.05
-    climb_momentum: float = 0.7
-    climb_worlds: int = 1
-    climb_window: int = 0
-    climb_termination_width: float = 0.03
+    climb_steps: int = only_with("climbers", 32)
+    climb_shortest: float = only_with("climbers", 0.005)
+    climb_longest: float = only_with("climbers", 0.05)
+    climb_momentum: float = only_with("climbers", 0.7)
+    climb_worlds: int = only_with("climbers", 1)
+    climb_window: int = only_with("climbers", 0)
+    climb_termination_width: float = only_with("climbers", 0.03)
 
     def check(self) -> None:
         """Checks the climbers.

@@ -10,6 +10,7 @@ from newton_qd.qd.algorithms.gradient_options import (
     DifferentiableOptions,
     differentiable,
 )
+from newton_qd.qd.algorithms.options import only_with
 
 if TYPE_CHECKING:  # importing a list of algorithms imports no JAX
     from newton_qd.qd.emitters.actor_critic_learner import ActorCritic
@@ -36,9 +37,9 @@ class EpisodeLearningOptions(DifferentiableOptions):
     """
 
     episodes_after: int = 0
-    episode_updates: int = 1
-    episode_weight_noise: float = 0.02
-    episode_termination_width: float = 0.03
+    episode_updates: int = only_with("episodes_after", 1)
+    episode_weight_noise: float = only_with("episodes_after", 0.02)
+    episode_termination_width: float = only_with("episodes_after", 0.03)
 
     def check(self) -> None:
         """Checks how actors learn from episodes.

@@ -7,7 +7,7 @@ import functools
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from newton_qd.qd.algorithms.options import Options
+from newton_qd.qd.algorithms.options import Options, only_with
 
 if TYPE_CHECKING:  # importing the options imports no JAX
     from newton_qd.gradients import Episode, GradientOptions
@@ -85,7 +85,7 @@ class MixedOptions(FlowOptions):
     """
 
     samples: int = 0
-    noise: float = 0.02
+    noise: float = only_with("samples", 0.02)
 
     def gradient(self, episode: Episode) -> EpisodeGradient:
         """Returns the gradient of an episode: exact, or mixed with the zeroth order.

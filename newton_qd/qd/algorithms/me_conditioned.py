@@ -15,6 +15,7 @@ from newton_qd.qd.algorithms.gradient_options import (
     on_robots_that_fall,
 )
 from newton_qd.qd.algorithms.learning import LearningOptions
+from newton_qd.qd.algorithms.options import only_with
 from newton_qd.qd.algorithms.spec import AlgorithmSpec, EmitterContext, batch_and
 from newton_qd.qd.algorithms.variation import part_of, with_isoline
 from newton_qd.qd.config import ConfigError, EvolveConfig
@@ -44,9 +45,9 @@ class ConditionedOptions(LearningOptions):
     copies: float = 0.0625
     between: float = 0.1875
     updates: int = 1
-    empty: float = 0.5
-    tolerance: float = 0.1
-    dual_rate: float = 0.3
+    empty: float = only_with("conditioned", 0.5)
+    tolerance: float = only_with("conditioned", 0.1)
+    dual_rate: float = only_with("conditioned", 0.3)
     conditioned: bool = True
 
     def numbers(self, config: EvolveConfig) -> tuple[int, int]:

@@ -45,6 +45,18 @@ class Options:
 
 
 OptionsT = TypeVar("OptionsT", bound=Options)
+_DefaultT = TypeVar("_DefaultT")
+_SWITCH = "switch"
+
+
+def only_with(switch: str, default: _DefaultT) -> _DefaultT:
+    """Returns the field of an option that has an effect only with another option.
+
+    Args:
+        switch: Name of the other option; with 0 or ``False``, this one has no effect.
+        default: Default of the option.
+    """
+    return dataclasses.field(default=default, metadata={_SWITCH: switch})
 
 
 @contextlib.contextmanager
@@ -75,8 +87,8 @@ def read_options(
 
     Raises:
         ConfigError: An option does not exist, or its value has the wrong type, is not
-            finite, is negative, is less than ``least``, has more than 32 bits, or fails
-            a check of the dataclass.
+            finite, is negative, is less than ``least``, has more than 32 bits, fails a
+            check of the dataclass, or has no effect with the others.
     """
     hints = typing.get_type_hints(kind)
     allowed = {field.name for field in dataclasses.fields(kind)}
@@ -89,7 +101,25 @@ def read_options(
     with refused_options():
         options = kind(**defaults)
         options.check()
+    _check_effect(options, {name for name, _ in config.options})
     return options
+
+
+def _check_effect(options: Options, given: set[str]) -> None:
+    """Checks that options that a user gave have an effect.
+
+    Raises:
+        ConfigError: The option that one of them needs is off.
+    """
+    for field in dataclasses.fields(options):
+        switch = field.metadata.get(_SWITCH)
+        if switch is None or field.name not in given or getattr(options, switch):
+            continue
+        off = getattr(options, switch)
+        allowed = f"no value, or another {switch}"
+        why = f"which has no effect with {switch} = {off}"
+        value = getattr(options, field.name)
+        raise ConfigError(message(f"options: {field.name}", value, allowed, why=why))
 
 
 def check_fields(kind: type[Options]) -> None:
