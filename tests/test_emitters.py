@@ -14,6 +14,7 @@ from emitter_problems import (
     SIZE,
     algorithm,
     centroids,
+    compiled,
     emit,
     isoline,
     isoline_coverage,
@@ -22,6 +23,7 @@ from emitter_problems import (
     searcher,
     start,
 )
+from jax.sharding import Mesh, PartitionSpec
 from qdax.core.emitters.multi_emitter import MultiEmitter
 
 from newton_qd.qd.emitters import (
@@ -83,6 +85,31 @@ def test_contains_what_is_not_finite(name: str) -> None:
     assert float(rows["coverage"][-1]) > 0.1
     # The line emitter has no state; the loop counts its individuals.
     assert rejected(state) > 0 or name == "line"
+
+
+@pytest.mark.parametrize("name", ["cma_mega", "cma_maega"])
+def test_a_search_runs_on_each_device(name: str) -> None:
+    """A loop in ``shard_map`` needs the same types before and after a generation."""
+    search = algorithm(MAKERS[name](score), annealed=name == "cma_maega")
+
+    def run(initial: jax.Array, key: jax.Array) -> tuple:
+        carry = (*search.init(initial, centroids(), key)[:2], key)
+        (repertoire, state, _), _ = jax.lax.scan(
+            search.scan_update, carry, None, length=2
+        )
+        return repertoire.genotypes, state.coefficients
+
+    mesh, split = Mesh(jax.devices()[:1], ("x",)), PartitionSpec("x")
+    # the key is the same on all devices
+    each = jax.shard_map(
+        run, mesh=mesh, in_specs=(split, PartitionSpec()), out_specs=split
+    )
+    for own, other in zip(
+        compiled(run)(start(), jax.random.key(1)),
+        compiled(each)(start(), jax.random.key(1)),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(own, other)
 
 
 @pytest.mark.parametrize("name", MAKERS)

@@ -198,7 +198,7 @@ def split_as(likes: Sequence[jax.Array], values: Tree) -> Tree:
         likes: Arrays of the world, or its random key.
         values: Pytree of numbers of the world.
     """
-    values = _varying_as(likes, values)
+    values = varying_as(likes, values)
     likes = [like for like in likes if like.size and _on_explicit_mesh(like)]
     if not likes:
         return values
@@ -217,15 +217,15 @@ def split_as(likes: Sequence[jax.Array], values: Tree) -> Tree:
     return jax.tree.map(split, values)
 
 
-def _varying_as(likes: Sequence[jax.Array], values: Tree) -> Tree:
+def varying_as(likes: Sequence[jax.Array], values: Tree) -> Tree:
     """Returns values whose types vary over the axes over which other arrays vary.
 
     Only inside ``jax.shard_map`` a type varies. A loop over steps needs the same types
     before and after a step.
 
     Args:
-        likes: Arrays of the world, or its random key.
-        values: Pytree of numbers of the world.
+        likes: Arrays, such as those of the world, or random keys.
+        values: Pytree of numbers and random keys.
     """
     varying = frozenset().union(*map(_varying, likes))
     if not varying:

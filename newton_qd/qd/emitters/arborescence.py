@@ -28,6 +28,7 @@ from qdax.core.emitters.emitter import Emitter
 from newton_qd import checks
 from newton_qd.checks import Fact, listed, message
 from newton_qd.envs.state import select
+from newton_qd.physics.explicit_mesh import varying_as
 from newton_qd.qd.emitters.arborescence_state import ArborescenceState
 from newton_qd.qd.emitters.cma_es import CMAES, CMAESState
 from newton_qd.qd.emitters.optimizer_check import check_optimizer
@@ -341,7 +342,7 @@ class ArborescenceEmitter(Emitter, abc.ABC):
         # Only the bars are computed from the repertoire with the points.
         added = repertoire.add(points, scores.descriptors, scores.fitnesses)
         strategy = self._strategy(scores.descriptors.shape[-1])
-        return ArborescenceState(
+        state = ArborescenceState(
             key=key,
             points=points,
             gradients=scores.gradients,
@@ -356,6 +357,8 @@ class ArborescenceEmitter(Emitter, abc.ABC):
             restarts=restarts,
             rejected=rejected + jnp.sum(~scores.finite, dtype=jnp.int32),
         )
+        # a new distribution consists of constants
+        return varying_as(jax.tree.leaves(state), state)
 
     def _adapt(
         self,
