@@ -321,3 +321,8 @@ def test_emitting_and_updating_agree() -> None:
     state = state.replace(finite=~state.finite)
     _, after, _ = tell(genotypes, lost, descriptors, repertoire, state)
     assert [int(x) for x in (after.rejected, after.restarts, after.age[0])] == [1, 1, 0]
+    # the point itself was counted when its gradients were found
+    _, after, _ = tell(
+        genotypes, lost.at[0].set(jnp.nan), descriptors, repertoire, state
+    )
+    assert int(after.rejected) == 1

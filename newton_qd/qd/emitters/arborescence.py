@@ -230,24 +230,25 @@ class ArborescenceEmitter(Emitter, abc.ABC):
         """
         del genotypes, extra_scores
         state, shape = emitter_state, (self._num_emitters, self._population)
-        finite = finite_scores(fitnesses, descriptors)
+        finite = finite_scores(fitnesses, descriptors).reshape(shape)
         cells = get_cells_indices(descriptors, repertoire.centroids)
-        fitnesses = jnp.where(finite, jnp.reshape(fitnesses, (-1,)), 0)
+        fitnesses = jnp.where(finite, jnp.reshape(fitnesses, shape), 0)
         # The first individual of each point is the point itself.
         cma_es, improved, flat = jax.vmap(self._adapt)(
             state.cma_es,
             state.coefficients,
-            fitnesses.reshape(shape)[:, 1:],
+            fitnesses[:, 1:],
             state.bars[cells].reshape(shape)[:, 1:],
-            finite.reshape(shape)[:, 1:],
+            finite[:, 1:],
         )
+        # A point was counted when its gradients were found.
+        lost = ~finite.at[:, 0].set(finite[:, 0] | ~state.finite)
         keys = jax.random.split(state.key, 6)
         key, elite_key, score_key, sample_key, begin_key, move_key = keys
         points, optimizer = self._moved(state, cma_es.mean, move_key)
         strategy = self._strategy(descriptors.shape[-1])
-        age = state.age + 1
-        restart = flat | ~state.finite | jax.vmap(strategy.stopped)(cma_es)
-        restart |= self._given_up(improved, age)
+        age, stopped = state.age + 1, jax.vmap(strategy.stopped)(cma_es)
+        restart = flat | ~state.finite | stopped | self._given_up(improved, age)
 
         elites = repertoire.select(elite_key, self._num_emitters).genotypes
         fresh = self._fresh(elites, descriptors.shape[-1], begin_key, optimizer)
@@ -257,7 +258,7 @@ class ArborescenceEmitter(Emitter, abc.ABC):
             search,
             (key, score_key, sample_key),
             restarts=state.restarts + jnp.sum(restart, dtype=jnp.int32),
-            rejected=state.rejected + jnp.sum(~finite, dtype=jnp.int32),
+            rejected=state.rejected + jnp.sum(lost, dtype=jnp.int32),
         )
 
     def _given_up(self, improved: jax.Array, age: jax.Array) -> jax.Array:
