@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import functools
 import itertools
+import math
 from pathlib import Path
 
 import numpy as np
@@ -79,8 +80,11 @@ def regions(
         last = high == limits[-1]
         inside = (places >= low) & ((places < high) | (last & (places <= high)))
         own = fitnesses[inside]
-        share = float(quality.coverage(own)) if len(own) else 0.0
-        found.append((float(quality.mean_fitness(own)), share))
+        if own.size:
+            share = float(quality.coverage(own))
+            found.append((float(quality.mean_fitness(own)), share))
+        else:
+            found.append((math.nan, 0.0))
     return found
 
 

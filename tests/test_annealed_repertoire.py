@@ -209,3 +209,27 @@ def test_refuses(rate: float, floor: float, message: str) -> None:
             learning_rate=rate,
             threshold_min=floor,
         )
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"genotypes": np.zeros((0, 2))}, r"genotypes: got .*\(0, 2\).* at least 1"),
+        ({"fitnesses": np.zeros(2)}, r"fitnesses: got .* \(2,\), .* with N = 3, as"),
+        # JAX would use its one component for both
+        ({"descriptors": np.zeros((3, 1))}, r"descriptors: got .* D\) = \(3, 2\)"),
+        ({"centroids": np.zeros(4)}, r"centroids: got .* \(4,\), .* \(cells, D\)"),
+    ],
+)
+def test_refuses_other_shapes(changes: dict[str, Any], message: str) -> None:
+    given: dict[str, Any] = {
+        "genotypes": np.zeros((3, 2)),
+        "fitnesses": np.zeros((3, 1)),
+        "descriptors": np.zeros((3, 2)),
+        "centroids": np.zeros((4, 2)),
+    }
+    with pytest.raises(ValueError, match=message):
+        AnnealedRepertoire.init(**given | changes, learning_rate=0.1, threshold_min=0.0)
+    given["fitnesses"] = [1.0]
+    with pytest.raises(TypeError, match=r"fitnesses: got \[1.0\]; allowed: an array"):
+        AnnealedRepertoire.init(**given, learning_rate=0.1, threshold_min=0.0)

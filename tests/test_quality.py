@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -64,6 +66,33 @@ def test_the_distribution_starts_at_the_coverage() -> None:
     thresholds = np.array([-1e9, 2.0, 3.0, 6.0, 6.5])
     found = quality.ccdf(ONE, thresholds)
     np.testing.assert_allclose(found, [80, 60, 40, 20, 0])
+
+
+def test_wrong_shapes_are_refused() -> None:
+    listed: Any = [1.0, 2.0]
+    with pytest.raises(TypeError, match=r"fitnesses: got \[1.0, 2.0\]; .* \(cells,\)"):
+        quality.coverage(listed)
+    for score in (quality.coverage, quality.best, quality.mean_fitness):
+        with pytest.raises(ValueError, match=r"fitnesses: got .* shape \(0,\), "):
+            score(ONE[:0])
+    column = ONE[:, None]
+    for refused in (
+        lambda: quality.mean_fitness(column),
+        lambda: quality.offset_qd_score(column, 1.0),
+        lambda: quality.qd_gain(column, 1.0),
+        lambda: quality.normalized_qd_score(column, 0.0, 1.0),
+        lambda: quality.ccdf(column, np.zeros(2)),
+    ):
+        with pytest.raises(ValueError, match=r"shape \(5, 1\), .*; of an .* of QDax"):
+            refused()
+    with pytest.raises(ValueError, match=r"untrained: got an array .* one number"):
+        quality.qd_gain(ONE, np.zeros(5))
+    with pytest.raises(ValueError, match=r"thresholds: got an array of shape \(\)"):
+        quality.ccdf(ONE, np.array(0.0))
+    for archives, given in (([], "none"), ([ONE, ONE[:4]], r"shapes \[\(5,\), \(4,\)")):
+        for compare in (quality.common_cells, quality.common_mean_fitness):
+            with pytest.raises(ValueError, match=f"archives: got {given}"):
+                compare(archives)
 
 
 def test_scores_are_the_same_under_jit() -> None:

@@ -175,6 +175,27 @@ def test_what_cannot_be_joined() -> None:
     odd = robust_scoring(lambda g, k: (g[:, 0], g, {"colour": g}), starts=2)
     with pytest.raises(ValueError, match="extra scores: got 'colour'; allowed: trans"):
         odd(jnp.zeros((2, 2)), KEY)
+    no_key: Any = 0
+    with pytest.raises(TypeError, match="key: got 0; allowed: one key"):
+        odd(jnp.zeros((2, 2)), no_key)
+    found: Any
+    for found, text in (
+        ((jnp.zeros((2, 1)), jnp.zeros((2, 3)), {}), r"fitnesses: .*shape \(2, 1\); "),
+        ((jnp.zeros(2), jnp.zeros(2), {}), r"descriptors: .* \(2,\); .* \(2, D\)"),
+        ((jnp.zeros(2), jnp.zeros((2, 3))), "score: got a tuple of 2; allowed: fit"),
+        (
+            (jnp.zeros(2), jnp.zeros((2, 3)), {"gradients": jnp.zeros((2, 5, 3))}),
+            r"scores: gradients: got shape \(2, 5, 3\); allowed: shape \(2, ..., 4\)",
+        ),
+        (
+            (jnp.zeros(2), jnp.zeros((2, 3)), {"faulty": jnp.zeros((2, 3), bool)}),
+            r"scores: faulty: got shape \(2, 3\); allowed: shape \(2,\)",
+        ),
+    ):
+        with pytest.raises(ValueError, match=text):
+            robust_scoring(lambda *_, found=found: found, starts=2)(
+                jnp.zeros((2, 5)), KEY
+            )
     for changes, text in (
         ({"starts": 0}, "starts: got 0"),
         ({"statistic": "mode"}, "statistic: got 'mode'; allowed: mean, median"),

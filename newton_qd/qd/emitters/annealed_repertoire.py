@@ -11,6 +11,7 @@ from qdax.core.containers.mapelites_repertoire import (
 )
 
 from newton_qd import checks
+from newton_qd.checks import message
 from newton_qd.qd.emitters.cells import break_ties
 from newton_qd.types import ExtraScores, Genotype
 
@@ -58,8 +59,15 @@ class AnnealedRepertoire(MapElitesRepertoire, kw_only=True):
             batch_of_descriptors: (N, D) descriptors.
             batch_of_fitnesses: (N,) or (N, 1) fitnesses.
             batch_of_extra_scores: Extra scores to store, leaves (N, ...).
+
+        Raises:
+            TypeError: An argument is not an array.
+            ValueError: An argument has another shape.
         """
         extra, descriptors = batch_of_extra_scores, batch_of_descriptors
+        _check_batch(
+            batch_of_genotypes, batch_of_fitnesses, descriptors, self.centroids
+        )
         fitnesses = jnp.reshape(batch_of_fitnesses, (-1,))
         finite = jnp.isfinite(fitnesses) & jnp.all(jnp.isfinite(descriptors), axis=-1)
         cells = get_cells_indices(descriptors, self.centroids)
@@ -116,7 +124,7 @@ class AnnealedRepertoire(MapElitesRepertoire, kw_only=True):
 
         Args:
             genotypes: Initial genotypes, leaves (N, ...).
-            fitnesses: (N,) their fitnesses.
+            fitnesses: (N,) or (N, 1) their fitnesses.
             descriptors: (N, D) their descriptors.
             centroids: (cells, D) centres of the cells.
             extra_scores: Their extra scores.
@@ -128,9 +136,12 @@ class AnnealedRepertoire(MapElitesRepertoire, kw_only=True):
             keys_extra_scores: Extra scores to store.
 
         Raises:
-            ValueError: ``learning_rate`` or ``threshold_min`` is out of its range.
+            TypeError: An argument is not an array.
+            ValueError: ``learning_rate`` or ``threshold_min`` is out of its range, or
+                an array has another shape.
         """
         check_annealing(learning_rate, threshold_min)
+        _check_batch(genotypes, fitnesses, descriptors, centroids)
         empty = MapElitesRepertoire.init_default(
             jax.tree.map(lambda leaf: leaf[0], genotypes),
             centroids,
@@ -163,3 +174,36 @@ def check_annealing(learning_rate: float, threshold_min: float) -> None:
     """
     checks.number("learning_rate", learning_rate, least=0, most=1)
     checks.number("threshold_min", threshold_min)
+
+
+def _check_batch(
+    genotypes: Genotype,
+    fitnesses: jax.Array,
+    descriptors: jax.Array,
+    centroids: jax.Array,
+) -> None:
+    """Checks individuals; JAX would broadcast a descriptor of another length.
+
+    Raises:
+        TypeError: An argument is not an array.
+        ValueError: An argument has another shape.
+    """
+    leaves = jax.tree.leaves(genotypes)
+    named = {"fitnesses": fitnesses, "descriptors": descriptors, "centroids": centroids}
+    for name, value in (*(("genotypes", x) for x in leaves), *named.items()):
+        if not checks.is_array(value):
+            raise TypeError(message(name, value, "an array"))
+    if len(centroids.shape) != 2:
+        raise ValueError(message("centroids", centroids, "an array (cells, D)"))
+    count = leaves[0].shape[0] if leaves and leaves[0].shape else 0
+    for leaf in leaves:
+        if not count or leaf.shape[:1] != (count,):
+            allowed = "arrays (N, ...) of the same N, at least 1"
+            raise ValueError(message("genotypes", leaf, allowed))
+    if fitnesses.shape not in ((count,), (count, 1)):
+        allowed = f"an array (N,) or (N, 1) with N = {count}, as the genotypes"
+        raise ValueError(message("fitnesses", fitnesses, allowed))
+    shape = (count, centroids.shape[1])
+    if descriptors.shape != shape:
+        allowed = f"an array (N, D) = {shape}"
+        raise ValueError(message("descriptors", descriptors, allowed))

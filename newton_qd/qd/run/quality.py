@@ -12,7 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from newton_qd.checks import message
+from newton_qd import checks
+from newton_qd.checks import Fact, message
+
+_CELLS = "an array (cells,), with one fitness for each cell, and at least one cell"
 
 
 def coverage(fitnesses: Any) -> Any:
@@ -20,7 +23,12 @@ def coverage(fitnesses: Any) -> Any:
 
     Args:
         fitnesses: (cells,) fitness of each cell, ``-inf`` in empty cells.
+
+    Raises:
+        TypeError: ``fitnesses`` is not an array.
+        ValueError: It has another shape.
     """
+    _check_cells(fitnesses)
     xp = fitnesses.__array_namespace__()
     return 100 * xp.mean(xp.astype(xp.isfinite(fitnesses), fitnesses.dtype))
 
@@ -30,7 +38,12 @@ def best(fitnesses: Any) -> Any:
 
     Args:
         fitnesses: (cells,) fitness of each cell, ``-inf`` in empty cells.
+
+    Raises:
+        TypeError: ``fitnesses`` is not an array.
+        ValueError: It has another shape.
     """
+    _check_cells(fitnesses)
     return fitnesses.__array_namespace__().max(fitnesses)
 
 
@@ -39,7 +52,12 @@ def mean_fitness(fitnesses: Any) -> Any:
 
     Args:
         fitnesses: (cells,) fitness of each cell, ``-inf`` in empty cells.
+
+    Raises:
+        TypeError: ``fitnesses`` is not an array.
+        ValueError: It has another shape.
     """
+    _check_cells(fitnesses)
     xp = fitnesses.__array_namespace__()
     filled = xp.isfinite(fitnesses)
     number = xp.sum(xp.astype(filled, fitnesses.dtype))
@@ -54,7 +72,12 @@ def offset_qd_score(fitnesses: Any, offset: float) -> Any:
     Args:
         fitnesses: (cells,) fitness of each cell, ``-inf`` in empty cells.
         offset: Number that makes fitnesses positive.
+
+    Raises:
+        TypeError: ``fitnesses`` is not an array.
+        ValueError: It has another shape.
     """
+    _check_cells(fitnesses)
     xp = fitnesses.__array_namespace__()
     return xp.sum(xp.where(xp.isfinite(fitnesses), fitnesses + offset, 0))
 
@@ -68,7 +91,14 @@ def qd_gain(fitnesses: Any, untrained: Any) -> Any:
     Args:
         fitnesses: (cells,) fitness of each cell, ``-inf`` in empty cells.
         untrained: () fitness of an untrained policy.
+
+    Raises:
+        TypeError: ``fitnesses`` is not an array.
+        ValueError: It or ``untrained`` has another shape.
     """
+    _check_cells(fitnesses)
+    if np.shape(untrained) != ():
+        raise ValueError(message("untrained", untrained, "one number"))
     xp = fitnesses.__array_namespace__()
     gain = xp.where(xp.isfinite(fitnesses), fitnesses - untrained, 0)
     return xp.sum(xp.where(gain < 0, 0, gain))
@@ -88,13 +118,19 @@ def normalized_qd_score(
         best_known: Fitness of the best known policy.
 
     Raises:
-        ValueError: The best known policy is not better than an untrained one.
+        TypeError: A fitness of a policy is not a number.
+        ValueError: ``fitnesses`` has another shape, or the best known policy is not
+            better than an untrained one.
     """
+    values = np.asarray(fitnesses, np.float64)
+    _check_cells(values)
+    checks.number("untrained", untrained)
+    checks.number("best_known", best_known)
     if not best_known > untrained:
         allowed = f"above untrained = {untrained!r}"
         raise ValueError(message("best_known", best_known, allowed))
-    gain = float(qd_gain(np.asarray(fitnesses, np.float64), untrained))
-    return gain / (best_known - untrained) / len(fitnesses)
+    gain = float(qd_gain(values, untrained))
+    return gain / (best_known - untrained) / len(values)
 
 
 def common_cells(archives: Sequence[np.ndarray]) -> np.ndarray:
@@ -102,8 +138,11 @@ def common_cells(archives: Sequence[np.ndarray]) -> np.ndarray:
 
     Args:
         archives: Fitnesses (cells,) of archives with the same cells.
+
+    Raises:
+        ValueError: There is no archive, or they differ in their number of cells.
     """
-    return np.all(np.isfinite(np.stack(archives)), axis=0)
+    return np.all(np.isfinite(_stacked(archives)), axis=0)
 
 
 def common_mean_fitness(archives: Sequence[np.ndarray]) -> np.ndarray:
@@ -116,11 +155,14 @@ def common_mean_fitness(archives: Sequence[np.ndarray]) -> np.ndarray:
 
     Returns:
         (A,) mean fitnesses, NaN if there is no such cell.
+
+    Raises:
+        ValueError: There is no archive, or they differ in their number of cells.
     """
     common = common_cells(archives)
     if not common.any():
         return np.full(len(archives), np.nan)
-    return np.stack(archives)[:, common].mean(axis=1)
+    return _stacked(archives)[:, common].mean(axis=1)
 
 
 def ccdf(fitnesses: np.ndarray, thresholds: np.ndarray) -> np.ndarray:
@@ -132,6 +174,40 @@ def ccdf(fitnesses: np.ndarray, thresholds: np.ndarray) -> np.ndarray:
     Args:
         fitnesses: (cells,) fitness of each cell, ``-inf`` in empty cells.
         thresholds: (K,) thresholds.
+
+    Raises:
+        ValueError: An argument has another shape.
     """
-    reached = np.asarray(fitnesses)[:, None] >= np.asarray(thresholds)
-    return 100.0 * reached.mean(axis=0)
+    values, levels = np.asarray(fitnesses), np.asarray(thresholds)
+    _check_cells(values)
+    if levels.ndim != 1:
+        raise ValueError(message("thresholds", levels, "an array (K,)"))
+    return 100.0 * (values[:, None] >= levels).mean(axis=0)
+
+
+def _check_cells(fitnesses: Any) -> None:
+    """Checks that there is one fitness for each cell.
+
+    Raises:
+        TypeError: It is not an array.
+        ValueError: It has another shape.
+    """
+    if not checks.is_array(fitnesses):
+        raise TypeError(message("fitnesses", fitnesses, _CELLS))
+    if len(fitnesses.shape) != 1 or not fitnesses.shape[0]:
+        hint = "; of an archive of QDax, fitnesses[:, 0]"
+        raise ValueError(message("fitnesses", fitnesses, _CELLS + hint))
+
+
+def _stacked(archives: Sequence[np.ndarray]) -> np.ndarray:
+    """Returns the fitnesses of archives (A, cells).
+
+    Raises:
+        ValueError: There is none, or they differ in their number of cells.
+    """
+    shapes = [np.shape(archive) for archive in archives]
+    if len(set(shapes)) != 1 or len(shapes[0]) != 1:
+        given = Fact(f"shapes {shapes}" if shapes else "none")
+        allowed = "arrays (cells,) with the same number of cells, at least one"
+        raise ValueError(message("archives", given, allowed))
+    return np.stack(archives)

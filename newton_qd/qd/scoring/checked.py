@@ -39,25 +39,52 @@ def checked_scoring(
         genotypes: Genotype, key: RNGKey
     ) -> tuple[jax.Array, jax.Array, ExtraScores]:
         found = score(genotypes, key)
-        allowed = "fitnesses (N,), descriptors (N, D) and a dictionary"
-        if not isinstance(found, tuple) or len(found) != 3:
-            count = f" of {len(found)}" if isinstance(found, tuple) else ""
-            given = Fact(f"a {type(found).__name__}{count}")
-            raise ConfigError(message(name, given, allowed))
         number = len(jax.tree.leaves(genotypes)[0])
-        for what, values, shape in (
-            ("fitnesses", found[0], (number,)),
-            ("descriptors", found[1], (number, measures)),
-        ):
-            if jnp.shape(values) != shape:
-                given = Fact(f"shape {jnp.shape(values)}")
-                raise ConfigError(message(f"{name}: {what}", given, f"shape {shape}"))
-        if not isinstance(found[2], dict):
-            given = Fact(f"a {type(found[2]).__name__} in the last place")
-            raise ConfigError(message(name, given, allowed))
+        check_scores(name, found, number, measures, error=ConfigError)
         return found
 
     return scored
+
+
+def check_scores(
+    name: str,
+    found: object,
+    number: int,
+    measures: int | None = None,
+    *,
+    error: type[ValueError] = ValueError,
+) -> None:
+    """Checks the results of a scoring function.
+
+    Args:
+        name: Name of the function.
+        found: Its results: fitnesses (N,), descriptors (N, D) and a dictionary.
+        number: Number N of individuals.
+        measures: Length D of the descriptor; ``None``: any.
+        error: Type of the error.
+
+    Raises:
+        ValueError: They have other types or shapes; or another ``error``.
+    """
+    allowed = "fitnesses (N,), descriptors (N, D) and a dictionary"
+    if not isinstance(found, tuple) or len(found) != 3:
+        count = f" of {len(found)}" if isinstance(found, tuple) else ""
+        given = Fact(f"a {type(found).__name__}{count}")
+        raise error(message(name, given, allowed))
+    fitnesses, descriptors, extra = found
+    if measures is None and len(jnp.shape(descriptors)) == 2:
+        measures = jnp.shape(descriptors)[1]
+    for what, values, shape in (
+        ("fitnesses", fitnesses, (number,)),
+        ("descriptors", descriptors, (number, "D" if measures is None else measures)),
+    ):
+        if jnp.shape(values) != shape:
+            given = Fact(f"shape {jnp.shape(values)}")
+            wanted = f"shape {shape}".replace("'", "")
+            raise error(message(f"{name}: {what}", given, wanted))
+    if not isinstance(extra, dict):
+        given = Fact(f"a {type(extra).__name__} in the last place")
+        raise error(message(name, given, allowed))
 
 
 def check_genotypes(

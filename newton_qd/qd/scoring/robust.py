@@ -9,9 +9,11 @@ import jax
 import jax.numpy as jnp
 
 from newton_qd import checks
-from newton_qd.checks import listed, message
+from newton_qd.checks import Fact, listed, message
+from newton_qd.envs.inputs import require_key
 from newton_qd.gradients.scores import unit_rows
 from newton_qd.qd.config import STATISTICS, EvolveConfig
+from newton_qd.qd.scoring.checked import check_scores
 from newton_qd.qd.scoring.rollout import Policy, make_scoring_function
 from newton_qd.qd.scoring.scatter import Scatter, scatter_of
 from newton_qd.qd.scoring.task import Task
@@ -47,7 +49,7 @@ def robust_scoring(
         starts T, ...), and beside them are the descriptors of their episodes,
         ``episode_descriptors`` (N, starts, D). With ``scatter``, the dictionary has the
         fitness without its price, ``unscattered`` (N,). The function raises
-        ``ValueError`` for other entries of the dictionary.
+        ``ValueError`` for other entries of the dictionary, and for wrong shapes.
 
     Raises:
         TypeError: ``score`` is not a function, or ``scatter`` is no ``Scatter``.
@@ -61,11 +63,21 @@ def robust_scoring(
     if starts == 1:
         return score
 
+    def checked(
+        genotypes: Genotype, key: RNGKey
+    ) -> tuple[jax.Array, jax.Array, ExtraScores]:
+        scores = score(genotypes, key)
+        number = len(jax.tree.leaves(genotypes)[0])
+        check_scores("score", scores, number)
+        _check_parts(scores[2], number, 1 + scores[1].shape[1])
+        return scores
+
     def scored(
         genotypes: Genotype, key: RNGKey
     ) -> tuple[jax.Array, jax.Array, ExtraScores]:
+        require_key("key", key)
         keys = start_keys(key, starts)
-        fitnesses, found, extra = jax.vmap(score, (None, 0))(genotypes, keys)
+        fitnesses, found, extra = jax.vmap(checked, (None, 0))(genotypes, keys)
         bad = jnp.any(jnp.isneginf(fitnesses), axis=0)
         rows = jnp.concatenate([fitnesses[..., None], found], axis=-1)
         # an infinite fitness would make weights of 0 to NaN
@@ -175,14 +187,10 @@ def _joined(
         slopes: (starts, N, R) slope of the fitness with respect to each row; ``None``:
             the fitness is the first row.
 
-    Raises:
-        ValueError: It has entries whose mean is not defined.
     """
-    joined: dict[str, Any] = {}
-    for name, value in extra.items():
-        if name not in _PARTS:
-            raise ValueError(message("extra scores", name, listed(_PARTS)))
-        joined[name] = jax.tree.map(_PARTS[name], value)
+    joined: dict[str, Any] = {
+        name: jax.tree.map(_PARTS[name], value) for name, value in extra.items()
+    }
     if "gradients" in extra:
         mixed = jax.tree.map(lambda x: _mixed(weights, slopes, x), extra["gradients"])
         lost = _lost(joined, weights[0], every_row=slopes is not None)
@@ -190,6 +198,32 @@ def _joined(
         joined["gradients"] = mixed
         joined["normalized_grads"] = unit_rows(mixed)
     return joined
+
+
+def _check_parts(extra: ExtraScores, number: int, rows: int) -> None:
+    """Checks the dictionary of the scores of one start.
+
+    Args:
+        extra: The dictionary.
+        number: Number N of individuals.
+        rows: Number R of rows: fitness and components of the descriptor.
+
+    Raises:
+        ValueError: It has entries whose mean is not defined, or of another shape.
+    """
+    for name, value in extra.items():
+        if name not in _PARTS:
+            raise ValueError(message("extra scores", name, listed(_PARTS)))
+        for leaf in jax.tree.leaves(value):
+            shape = jnp.shape(leaf)
+            fits, allowed = {
+                "transitions": (len(shape) > 1, " T, ..."),
+                "faulty": (len(shape) == 1, ""),
+                "overflowed": (shape[1:] == (rows,), f" {rows}"),
+            }.get(name, (len(shape) > 1 and shape[-1] == rows, f" ..., {rows}"))
+            if shape[:1] != (number,) or not fits:
+                name, given = f"extra scores: {name}", Fact(f"shape {shape}")
+                raise ValueError(message(name, given, f"shape ({number},{allowed})"))
 
 
 def _mixed(
