@@ -24,7 +24,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from newton_qd.qd import EvolveConfig, make_task
+from newton_qd import UnknownEnvironment
+from newton_qd.qd import ConfigError, EvolveConfig, make_task
 from newton_qd.qd.algorithms.episode_learning import (
     EpisodeLearningOptions,
     episode_learning,
@@ -181,8 +182,14 @@ def main() -> None:
     name, *values = args.compare
     if not values:
         parser.error(f"--compare: got {name}; allowed: a setting and its values")
-    if args.seeds < 1:
-        parser.error(f"--seeds: got {args.seeds}; allowed: an integer from 1")
+    for option in ("seeds", "updates", "every"):
+        if getattr(args, option) < 1:
+            given = getattr(args, option)
+            parser.error(f"--{option}: got {given}; allowed: an integer from 1")
+    try:
+        make_task(EvolveConfig(env_name=args.env_name))
+    except (UnknownEnvironment, ConfigError) as error:
+        parser.error(str(error))
     try:
         pairs = [changed(f"{name}={value}") for value in values]
     except argparse.ArgumentTypeError as error:

@@ -63,6 +63,9 @@ def main() -> None:
     for name in ("generations", "every"):
         if getattr(args, name) < 1:
             parser.error(f"{name}: got {getattr(args, name)}; allowed: integers from 1")
+    if args.every > args.generations:
+        allowed = f"at most --generations = {args.generations}"
+        parser.error(f"--every: got {args.every}; allowed: {allowed}")
     search = _begun(args.task, args.variant, args.seed)
     print("| " + " | ".join(["generations", *COLUMNS.values(), "time [s]"]) + " |")
     print("|---" * (len(COLUMNS) + 2) + "|", flush=True)

@@ -31,7 +31,7 @@ from study_protocols import FIELD
 from newton_qd.qd.algorithms.climbing import ascent_emitter
 from newton_qd.qd.algorithms.me_ascent import ME_ASCENT, MEAscentOptions
 from newton_qd.qd.algorithms.spec import EmitterContext
-from newton_qd.qd.config import EvolveConfig
+from newton_qd.qd.config import ConfigError, EvolveConfig
 from newton_qd.qd.scoring.robust import run_scoring
 from newton_qd.qd.scoring.rollout import make_policy
 from newton_qd.qd.scoring.task import make_task
@@ -63,6 +63,12 @@ def gains(context: EmitterContext, repertoire: Any, options: Any, steps: int) ->
         yield float(np.sum(found[found > -np.inf] + offset))
 
 
+def _options(config: EvolveConfig, climbers: int, settings: list) -> MEAscentOptions:
+    """Returns the options of climbers that live longer than the measurement."""
+    values = {"climbers": climbers, "climb_steps": 10**6, **dict(settings)}
+    return ME_ASCENT.read_options(config.replace(algorithm="me-ascent", options=values))
+
+
 def main() -> None:
     """Prints the gain after some numbers of steps, for each setting."""
     parser = argparse.ArgumentParser(
@@ -83,9 +89,20 @@ def main() -> None:
         metavar="NAME=X",
     )
     args = parser.parse_args()
+    if args.variant not in study_runs.variants():
+        parser.error(f"variant: got {args.variant}; allowed: a key of study/field.toml")
+    for name in ("generations", "steps"):
+        if getattr(args, name) < 1:
+            parser.error(
+                f"--{name}: got {getattr(args, name)}; allowed: integers from 1"
+            )
     given = {**FIELD.settings_of(args.task), **study_runs.variants()[args.variant]}
     given = {key: value for key, value in given.items() if key != "options"}
     config = EvolveConfig(env_name=args.task, seed=1, iterations=1, **given)
+    try:
+        asked = [_options(config, args.climbers, each) for each in args.settings]
+    except ConfigError as error:
+        parser.error(str(error))
     task = make_task(config)
     config = config.resolve(task.descriptor_length)
     policy = make_policy(task.env, config.hidden)
@@ -102,11 +119,7 @@ def main() -> None:
         "| " + " | ".join(["settings", *map(str, marks), "processor time [s]"]) + " |"
     )
     print("|---" * (len(marks) + 2) + "|", flush=True)
-    for settings in args.settings:
-        values = {"climb_steps": 10**6, **dict(settings)}
-        values = {"climbers": args.climbers, **values}
-        asked = config.replace(algorithm="me-ascent", options=values)
-        options = ME_ASCENT.read_options(asked)
+    for settings, options in zip(args.settings, asked, strict=True):
         begin = time.process_time()
         scores = list(gains(context, begun, options, args.steps))
         cells = [", ".join(f"{k}={v:g}" for k, v in settings) or "defaults"]

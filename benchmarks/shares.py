@@ -18,7 +18,8 @@ import jax
 import numpy as np
 from study_runs import variants
 
-from newton_qd.qd import EvolveConfig, make_task
+from newton_qd import UnknownEnvironment
+from newton_qd.qd import ConfigError, EvolveConfig, make_task
 from newton_qd.qd.run.search import Search, SearchState
 
 LENGTH = 250
@@ -92,24 +93,36 @@ def main() -> None:
     parser.add_argument("env_name")
     parser.add_argument("variant", help="a key of study/field.toml")
     parser.add_argument("--generations", type=int, default=100)
-    parser.add_argument("--batch-size", type=int, default=1024)
-    parser.add_argument("--updates", type=int, help="in place of the variant's")
+    for name in ("--batch-size", "--updates"):
+        parser.add_argument(name, type=int, help="in place of the variant's")
     args = parser.parse_args()
-    given = variants()[args.variant]
+    if args.variant not in variants():
+        parser.error(f"variant: got {args.variant}; allowed: a key of study/field.toml")
+    if args.generations < 1:
+        parser.error(f"--generations: got {args.generations}; allowed: integers from 1")
+    given = {"batch_size": 1024, **variants()[args.variant]}
+    if args.batch_size:
+        given["batch_size"] = args.batch_size
     if args.updates:
-        given = {**given, "options": {**given["options"], "updates": args.updates}}
+        own = given.get("options", {})
+        given = {**given, "options": {**own, "updates": args.updates}}
     config = EvolveConfig(
         env_name=args.env_name,
         algorithm=args.variant.split("@")[0],
-        batch_size=args.batch_size,
         episode_length=LENGTH,
         hidden=(64, 64),
         centroids=1024,
         **given,
     )
-    task = make_task(config)
-    search = Search(config.resolve(task.descriptor_length), task)
-    emitters = search._generation.emitter.emitters
+    try:
+        task = make_task(config)
+        search = Search(config.resolve(task.descriptor_length), task)
+    except (UnknownEnvironment, ConfigError) as error:
+        parser.error(str(error))
+    emitters = getattr(search._generation.emitter, "emitters", None)
+    if emitters is None:
+        allowed = "a variant with offspring of two kinds"
+        parser.error(f"variant: got {args.variant}; allowed: {allowed}")
     parts = measured(search, args.generations, emitters[0].batch_size)
     whole = sum(part.new + part.better for part in parts)
     print("| part | offspring | entered [%] | new cells [%] | better elites [%] |")

@@ -225,6 +225,9 @@ def main() -> None:
     parser.add_argument("--time", choices=("processor_s", "wall_s"), default="wall_s")
     args = parser.parse_args()
     curves = load(args.runs)
+    if not curves:
+        allowed = "a folder with files TASK.ALGORITHM.SEED.csv"
+        parser.error(f"runs: got {args.runs}; allowed: {allowed}")
     if args.out:
         collect(curves, args.out)
     if args.figures:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -41,6 +43,37 @@ def test_a_folder_without_runs_is_refused(
     with pytest.raises(SystemExit):
         study_scores.main()
     assert "none; allowed: a folder with runs.csv" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("script", "given", "text"),
+    [
+        ("shares", "ant_uni me@1", "variant: got me@1; allowed: .* of two kinds"),
+        ("shares", "ant_uni me@x", "variant: got me@x; allowed: a key of"),
+        ("shares", "hopper me-actor-critic@1", "env_name: got 'hopper', .* descriptor"),
+        ("study_report", "none", "runs: got none; allowed: a folder with files TASK"),
+        (
+            "by_generation",
+            "hopper_uni me@1 --every 10 --generations 5",
+            "--every: got 10; allowed: at most --generations = 5",
+        ),
+        ("actor_alone", "nope", "env_name is 'nope'; known names: ant, "),
+        ("actor_alone", "ant_uni --every 0", "--every: got 0; allowed: an integer"),
+        ("climbing", "walker2d_uni me@1 --climbers 0", "options: climbers: got 0"),
+        ("climbing", "walker2d_uni me@x", "variant: got me@x; allowed: a key of"),
+    ],
+)
+def test_a_script_says_what_is_wrong(
+    script: str,
+    given: str,
+    text: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(sys, "argv", [f"{script}.py", *given.split()])
+    with pytest.raises(SystemExit):
+        importlib.import_module(script).main()
+    assert re.search(text, capsys.readouterr().err)
 
 
 def test_the_chosen_variant_has_the_name(tmp_path: Path) -> None:
