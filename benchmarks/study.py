@@ -55,6 +55,9 @@ import study_runs
 from study_pool import Pool
 from study_protocols import PROTOCOLS
 
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as in shells."""
+
 
 def arguments() -> argparse.Namespace:
     """Reads the command line."""
@@ -304,8 +307,26 @@ def main() -> None:
         one(args, begin)
         return
     args.out.mkdir(parents=True, exist_ok=True)
-    latest = min(args.start_until, args.stop_after)
     pool = Pool(args, [None] * args.workers, args.gpus)
+    try:
+        carry_out(args, pool, begin)
+    except KeyboardInterrupt:
+        pool.stop()
+        print("stopped: the same command continues", flush=True)
+        sys.exit(INTERRUPTED)
+    if pool.failed:
+        sys.exit(1)
+
+
+def carry_out(args: argparse.Namespace, pool: Pool, begin: float) -> None:
+    """Starts the runs, and waits for them.
+
+    Args:
+        args: Arguments of the command.
+        pool: The processes.
+        begin: ``time.monotonic()`` when the command began [s].
+    """
+    latest = min(args.start_until, args.stop_after)
     runs, begun = coming(args), False
     while True:
         slot = pool.wait()
@@ -330,9 +351,10 @@ def main() -> None:
             more += ["--no-states"] * args.no_states
         pool.start(slot, *more, "--run", *what)
     pool.drain()
-    if pool.failed:
-        sys.exit(1)
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except KeyboardInterrupt:
+        sys.exit(INTERRUPTED)

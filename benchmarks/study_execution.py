@@ -2,9 +2,9 @@
 
 A run adds one line to ``runs.csv`` at each of its stops, and the fitness of each cell
 to ``cells/RUN.npz``. Scores of re-evaluated elites are part of the line; for them, the
-clock is stopped. A run that is stopped leaves ``states/RUN.bin``, from which the next
-command continues; it is removed when the run has reached its last stop. Clocks are
-explained in ``study_clock.py``.
+clock is stopped. A run that is stopped leaves its state and clock in one file,
+``states/RUN.state``, from which the next command continues; it is removed when the run
+has reached its last stop. Clocks are explained in ``study_clock.py``.
 """
 
 from __future__ import annotations
@@ -85,19 +85,16 @@ class Progress:
         options = self.search.options
         self.gradients = spec.gradients(config, options) if spec.gradients else 0
         self.episode = config.episode_length
-        self._path = out / "states" / f"{run}.bin"
-        self._clock = out / "states" / f"{run}.json"
+        self._path = out / "states" / f"{run}.state"
+        # an earlier version had the state and its clock in two files
+        self._earlier = [out / "states" / f"{run}.{x}" for x in ("bin", "json")]
         self.spent = Spent()
         self.state = self.search.empty()
         for _ in range(3):  # compiles, and runs what is compiled
             self.advance()
         self.scores()
         self.spent, self.state = Spent(), self.search.empty()
-        if self._path.is_file() and self._clock.is_file():
-            from newton_qd.qd.run.checkpoint import load_checkpoint
-
-            self.state = self.search.restore(load_checkpoint(self._path))
-            self.spent = Spent(**json.loads(self._clock.read_text()))
+        self._restore()
 
     def seconds(self, wall: bool) -> float:
         """Time of the run [s]."""
@@ -124,18 +121,43 @@ class Progress:
         )
         self.state, self.spent = state, spent
 
+    def _restore(self) -> None:
+        """Restores state and clock, if there are any."""
+        from newton_qd.qd.run.checkpoint import load_checkpoint
+
+        state, clock = self._earlier
+        if self._path.is_file():
+            held = load_checkpoint(self._path)
+            *emitter, spent = held.emitter
+            held = dataclasses.replace(held, emitter=tuple(emitter))
+            self.spent = Spent(*spent.tolist())
+        elif state.is_file() and clock.is_file():
+            held = load_checkpoint(state)
+            self.spent = Spent(**json.loads(clock.read_text()))
+        else:
+            return
+        self.state = self.search.restore(held)
+
     def save(self) -> None:
         """Writes state and clock."""
         from newton_qd.qd.run.checkpoint import save_checkpoint
 
         self._path.parent.mkdir(parents=True, exist_ok=True)
-        save_checkpoint(self._path, self.search.checkpoint(self.state))
-        self._clock.write_text(json.dumps(dataclasses.asdict(self.spent)))
+        held = self.search.checkpoint(self.state)
+        # beside the arrays of the emitter: two files would not be written at once
+        spent = np.array(dataclasses.astuple(self.spent))
+        held = dataclasses.replace(held, emitter=(*held.emitter, spent))
+        save_checkpoint(self._path, held)
+        self._forget_earlier()
 
     def forget(self) -> None:
         """Removes what ``save`` has written."""
         self._path.unlink(missing_ok=True)
-        self._clock.unlink(missing_ok=True)
+        self._forget_earlier()
+
+    def _forget_earlier(self) -> None:
+        for path in self._earlier:
+            path.unlink(missing_ok=True)
 
     def scores(self) -> tuple[dict[str, float], np.ndarray]:
         """Returns the columns of a line, and the fitnesses (2, cells) of the archive.
@@ -283,7 +305,10 @@ def _write(
     path = out / "cells" / f"{here.run}.npz"
     path.parent.mkdir(parents=True, exist_ok=True)
     kept = dict(np.load(path)) if path.is_file() else {}
-    np.savez_compressed(path, **{**kept, str(stop): cells})
+    # a run may be stopped at any time; NumPy adds .npz to another name
+    unfinished = path.with_suffix(".unfinished.npz")
+    np.savez_compressed(unfinished, **{**kept, str(stop): cells})
+    unfinished.replace(path)
     add_line(out / "runs.csv", {name: _text(line[name]) for name in HEAD})
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -60,13 +61,24 @@ class Pool:
             cores = sorted(os.sched_getaffinity(0))
             share = cores[slot % len(cores) :: len(self.slots)]
             command += ["--cores", *map(str, share)]
+        # Ctrl-C in a terminal reaches all processes; ``stop`` ends them
+        handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
         self.slots[slot] = subprocess.Popen(command, env=variables)
+        signal.signal(signal.SIGINT, handler)
 
     def wait(self) -> int:
         """Waits for a free slot."""
         while (slot := self.free()) is None:
             time.sleep(0.2)
         return slot
+
+    def stop(self) -> None:
+        """Ends all processes; their files are whole, so they can be continued."""
+        running = [process for process in self.slots if process is not None]
+        for process in running:
+            process.terminate()
+        for process in running:
+            process.wait()
 
     def drain(self) -> None:
         """Waits for all processes."""

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
+import processes
 import pytest
 
 from newton_qd.qd.algorithms import ALGORITHMS, algorithm_named
@@ -237,6 +241,22 @@ def test_a_command_fails_if_a_run_fails(
         study.main()
     assert ended.value.code == 1
     assert "failed: " in capsys.readouterr().err
+
+
+def test_an_interrupt_ends_all_runs(tmp_path: Path, sigint: None) -> None:
+    command = [sys.executable, "-u", FOLDER / "study.py", "--protocol", "small"]
+    command += ["--tasks", TASK, "--algorithms", "me", "--out", str(tmp_path)]
+    # signals of a terminal reach all processes of a group
+    process = processes.start([*map(str, command)], start_new_session=True)
+    assert process.stdout is not None
+    assert TASK in process.stdout.readline()
+    time.sleep(0.5)  # until the run has begun
+    os.killpg(process.pid, signal.SIGINT)
+    out, problems = process.communicate()
+    assert process.returncode == study.INTERRUPTED
+    assert "stopped: " in out and not problems
+    with pytest.raises(ProcessLookupError):
+        os.killpg(process.pid, 0)  # nobody is left
 
 
 def test_a_command_without_a_run_says_so(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import sys
 import tempfile
 import threading
@@ -21,6 +23,8 @@ import study_execution  # noqa: E402
 import study_runs  # noqa: E402
 from study_protocols import Protocol, Stop  # noqa: E402
 from study_runs import Run, lines  # noqa: E402
+
+from newton_qd.qd.run.checkpoint import load_checkpoint, save_checkpoint  # noqa: E402
 
 CLOCK = {"wall_s", "processor_s"}
 PROTOCOL = Protocol(
@@ -244,14 +248,26 @@ def test_a_paced_run_counts_its_generations(tmp_path: Path, monkeypatch: Any) ->
 
 
 @pytest.mark.slow
-def test_a_row_repeats_bitwise(tmp_path: Path, monkeypatch: Any) -> None:
+@pytest.mark.parametrize("earlier", [False, True])
+def test_a_row_repeats_bitwise(tmp_path: Path, monkeypatch: Any, earlier: bool) -> None:
+    """Also if an earlier version has written the state, with its clock beside it."""
     monkeypatch.setattr(study_execution, "variants", lambda: SETTINGS)
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     assert execute(whole)
     assert not execute(parts, deadline=0.0)  # stops after the first generation
-    assert (parts / "states" / f"{RUN}.bin").is_file()
+    state = parts / "states" / f"{RUN}.state"
+    assert state.is_file()
+    if earlier:
+        held = load_checkpoint(state)
+        spent = dict(zip(("wall_s", "processor_s"), held.emitter[-1], strict=True))
+        state.with_suffix(".json").write_text(json.dumps(spent))
+        held = dataclasses.replace(held, emitter=held.emitter[:-1])
+        save_checkpoint(state.with_suffix(".bin"), held)
+        state.unlink()
     assert execute(parts)
-    assert not (parts / "states" / f"{RUN}.bin").exists()
+    assert not list(state.parent.iterdir())
+    begun, after = (float(row["processor_s"]) for row in lines(parts))
+    assert 0 < begun < after
     assert [row["stop"] for row in lines(whole)] == [str(x) for x in PROTOCOL.stops]
     for one, other in zip(lines(whole), lines(parts), strict=True):
         assert {k: v for k, v in one.items() if k not in CLOCK} == {
