@@ -297,6 +297,26 @@ def test_wrappers_of_gymnasium() -> None:
     assert list(info["episode"]["l"]) == [3, 3]
 
 
+def test_the_spec_has_the_length_of_an_episode() -> None:
+    """Other libraries read it there."""
+    name = "newton_qd/pointmaze-v0"
+    env = gymnasium.make(name, episode_length=3)
+    assert env.spec is not None and env.spec.max_episode_steps == 3
+    again = gymnasium.make(env.spec)
+    again.reset(seed=0)
+    action = again.action_space.sample()
+    assert [again.step(action)[3] for _ in range(3)] == [False, False, True]
+    # nothing but its environment ends an episode later
+    long = gymnasium.make(name, episode_length=5, action_repeat=2).spec
+    assert long is not None and long.max_episode_steps == 3
+    endless = gymnasium.make(name, episode_length=None).spec
+    assert endless is not None and endless.max_episode_steps is None
+    many = gymnasium.make_vec(name, num_envs=2, episode_length=3)
+    assert many.spec is not None and many.spec.max_episode_steps == 3
+    copied = pickle.loads(pickle.dumps(env.unwrapped))
+    assert copied.spec.max_episode_steps == 3
+
+
 def test_every_environment_is_registered() -> None:
     names = {f"newton_qd/{name}-v0" for name in newton_qd.registered_envs()}
     assert names <= set(gymnasium.registry)
@@ -354,6 +374,16 @@ def test_every_environment_is_registered() -> None:
             ),
             ValueError,
             r"options\['reset_mask'\]: got an array of shape \(2,\), bool",
+        ),
+        (
+            lambda: make_gymnasium(Clock()).reset(options={"typo": 1}),
+            ValueError,
+            "options: got 'typo'; allowed: none",
+        ),
+        (
+            lambda: make_gymnasium_vector(Clock(), 2).reset(options={"mask": None}),
+            ValueError,
+            "options: got 'mask'; allowed: reset_mask",
         ),
         (
             lambda: make_gymnasium(Clock()).step(np.zeros(1)),

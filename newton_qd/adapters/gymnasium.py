@@ -6,7 +6,9 @@ Importing this module registers every environment with Gymnasium, such as
 
 from __future__ import annotations
 
+import dataclasses
 import os
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -16,6 +18,7 @@ from newton_qd import checks, registry
 from newton_qd.adapters.live_camera import LiveCamera
 from newton_qd.adapters.pickled import Pickled
 from newton_qd.adapters.worlds import one_world
+from newton_qd.checks import listed, message
 from newton_qd.envs.base import Env
 from newton_qd.envs.state import State
 from newton_qd.errors import MissingExtra
@@ -24,6 +27,7 @@ from newton_qd.types import READINGS
 try:
     import gymnasium
     from gymnasium import spaces
+    from gymnasium.envs.registration import EnvSpec
 except ModuleNotFoundError as error:
     raise MissingExtra("gymnasium", "gym") from error
 
@@ -87,11 +91,45 @@ def info_of(state: State) -> dict[str, np.ndarray]:
     return {name: np.array(value)[()] for name, value in found.items()}
 
 
+def check_reset_options(options: Mapping[str, Any] | None, *known: str) -> None:
+    """Checks that the options of a reset exist.
+
+    Raises:
+        ValueError: One does not.
+    """
+    unknown = sorted(set(options or {}) - set(known), key=str)
+    if unknown:
+        raise ValueError(message("options", unknown[0], listed(known)))
+
+
+class WithLength:
+    """An environment whose spec says how long its episodes are."""
+
+    env: Any
+    _spec: EnvSpec | None = None
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """What ``gymnasium.make`` was asked for, with ``max_episode_steps``.
+
+        Gymnasium leaves it out, because no wrapper of its own ends the episodes.
+        """
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        length = getattr(self.env, "episode_length", None)
+        if spec is not None and spec.max_episode_steps is None and length is not None:
+            steps = -(-length // getattr(self.env, "action_repeat", 1))
+            spec = dataclasses.replace(spec, max_episode_steps=steps)
+        self._spec = spec
+
+
 def _key(seed: int) -> jax.Array:
     return jax.random.key(seed % 2**32)  # JAX counts in 32 bits
 
 
-class GymnasiumEnv(Pickled, gymnasium.Env):
+class GymnasiumEnv(Pickled, WithLength, gymnasium.Env):  # pyright: ignore[reportIncompatibleVariableOverride]
     """One world as an environment of Gymnasium.
 
     Observations, rewards and ends are bitwise those of ``jax.jit(env.step)``. An
@@ -156,11 +194,15 @@ class GymnasiumEnv(Pickled, gymnasium.Env):
 
         Args:
             seed: Seed of this and of later resets; ``None``: the next random number.
-            options: Not used.
+            options: ``None`` or empty: there are none.
 
         Returns:
             Observation (no,) and info.
+
+        Raises:
+            ValueError: There are options.
         """
+        check_reset_options(options)
         super().reset(seed=seed)
         if seed is None:
             seed = int(self.np_random.integers(2**32))

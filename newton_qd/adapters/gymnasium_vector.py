@@ -11,6 +11,8 @@ import numpy as np
 from newton_qd import checks
 from newton_qd.adapters.gymnasium import (
     RENDER_MODES,
+    WithLength,
+    check_reset_options,
     ends_of,
     info_of,
     metadata_of,
@@ -34,7 +36,7 @@ except ModuleNotFoundError as error:
     raise MissingExtra("gymnasium", "gym") from error
 
 
-class GymnasiumVectorEnv(Pickled, gymnasium.vector.VectorEnv):
+class GymnasiumVectorEnv(Pickled, WithLength, gymnasium.vector.VectorEnv):  # pyright: ignore[reportIncompatibleVariableOverride]
     """A batch of worlds as a vector environment of Gymnasium.
 
     A step of all worlds is one call. World ``i`` after ``reset(seed=n)`` begins as
@@ -140,10 +142,11 @@ class GymnasiumVectorEnv(Pickled, gymnasium.vector.VectorEnv):
             Observations (num_envs, no) and info.
 
         Raises:
-            ValueError: The mask or the seeds have the wrong shape, or a seed is not an
-                integer.
+            ValueError: The mask or the seeds have the wrong shape, a seed is not an
+                integer, or there is another option.
             gymnasium.error.ResetNeeded: There is a mask, and there was no reset.
         """
+        check_reset_options(options, "reset_mask")
         seeds = None if seed is None else self._seeds(seed)
         if seeds is not None:
             super().reset(seed=seeds[0])
