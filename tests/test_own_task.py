@@ -108,6 +108,18 @@ def test_limits_that_are_no_numbers(limits: Any) -> None:
         dataclasses.replace(point_task(SMALL), limits=limits)
 
 
+def test_traced_limits_are_refused() -> None:
+    """The cells of an archive and the price of scatter need their values."""
+    task = point_task(SMALL)
+
+    def narrow(high: jax.Array) -> jax.Array:
+        dataclasses.replace(task, limits=(jnp.zeros(2), high))
+        return high
+
+    with pytest.raises(ConfigError, match=r"limits: got .*jax.jit .*; allowed: values"):
+        jax.jit(narrow)(jnp.ones(2))
+
+
 def test_limits_of_one_length() -> None:
     limits = np.zeros(2, np.float32), np.ones(3, np.float32)
     with pytest.raises(ConfigError, match="labels: got 2 names"):

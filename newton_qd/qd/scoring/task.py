@@ -9,6 +9,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.core import Tracer
 
 from newton_qd import checks, tasks
 from newton_qd.checks import Fact, listed, message, shown
@@ -62,11 +63,15 @@ class Task:
         """Checks that limits and labels are of the same descriptor.
 
         Raises:
-            ConfigError: They are not, or limits are no numbers.
+            ConfigError: They are not, or limits are no numbers, or traced.
         """
         allowed = "lowest and highest descriptor, as two arrays of numbers"
         kinds = (tuple, list, np.ndarray, jax.Array)
         checks.instance("limits", self.limits, kinds, allowed, error=ConfigError)
+        if any(isinstance(limit, Tracer) for limit in self.limits):
+            given = Fact("arrays whose values jax.jit or jax.vmap does not know yet")
+            allowed = "values: make the task outside of the transformed function"
+            raise ConfigError(message("limits", given, allowed))
         if any(real_numbers(limit) is None for limit in self.limits):
             raise ConfigError(message("limits", self.limits, allowed))
         limits = tuple(
