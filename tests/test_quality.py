@@ -27,6 +27,9 @@ def test_scores_of_one_archive() -> None:
     assert quality.qd_gain(ONE, 2.0) == (3 - 2) + (6 - 2)
     # 5 of 5 cells times the distance of 8 between untrained and best known
     assert quality.normalized_qd_score(ONE, 2.0, 10.0) == pytest.approx(5 / 8 / 5)
+    # such as means of JAX
+    two, ten = np.array(2.0), jnp.float32(10)
+    assert quality.normalized_qd_score(ONE, two, ten) == pytest.approx(5 / 8 / 5)
 
 
 def test_scores_of_an_empty_archive() -> None:

@@ -105,7 +105,7 @@ def qd_gain(fitnesses: Any, untrained: Any) -> Any:
 
 
 def normalized_qd_score(
-    fitnesses: np.ndarray, untrained: float, best_known: float
+    fitnesses: np.ndarray, untrained: Any, best_known: Any
 ) -> float:
     """Returns the mean normalized fitness over all cells.
 
@@ -114,18 +114,18 @@ def normalized_qd_score(
 
     Args:
         fitnesses: (cells,) fitness of each cell, ``-inf`` in empty cells.
-        untrained: Fitness of an untrained policy.
-        best_known: Fitness of the best known policy.
+        untrained: () fitness of an untrained policy.
+        best_known: () fitness of the best known policy.
 
     Raises:
         TypeError: A fitness of a policy is not a number.
-        ValueError: ``fitnesses`` has another shape, or the best known policy is not
-            better than an untrained one.
+        ValueError: ``fitnesses`` has another shape, a fitness of a policy is not
+            finite, or the best known policy is not better than an untrained one.
     """
     values = np.asarray(fitnesses, np.float64)
     _check_cells(values)
-    checks.number("untrained", untrained)
-    checks.number("best_known", best_known)
+    untrained = _number("untrained", untrained)
+    best_known = _number("best_known", best_known)
     if not best_known > untrained:
         allowed = f"above untrained = {untrained!r}"
         raise ValueError(message("best_known", best_known, allowed))
@@ -183,6 +183,19 @@ def ccdf(fitnesses: np.ndarray, thresholds: np.ndarray) -> np.ndarray:
     if levels.ndim != 1:
         raise ValueError(message("thresholds", levels, "an array (K,)"))
     return 100.0 * (values[:, None] >= levels).mean(axis=0)
+
+
+def _number(name: str, value: Any) -> float:
+    """Returns a number, which may be an array of shape (), such as a mean of JAX.
+
+    Raises:
+        TypeError: It is not a number.
+        ValueError: It is not finite.
+    """
+    if getattr(value, "shape", None) == ():
+        value = value.item()
+    checks.number(name, value)
+    return float(value)
 
 
 def _check_cells(fitnesses: Any) -> None:
