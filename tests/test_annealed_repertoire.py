@@ -233,3 +233,14 @@ def test_refuses_other_shapes(changes: dict[str, Any], message: str) -> None:
     given["fitnesses"] = [1.0]
     with pytest.raises(TypeError, match=r"fitnesses: got \[1.0\]; allowed: an array"):
         AnnealedRepertoire.init(**given, learning_rate=0.1, threshold_min=0.0)
+
+
+def test_adding_nothing_changes_nothing() -> None:
+    before = AnnealedRepertoire.init(
+        *(jnp.zeros((3, 2)), jnp.zeros(3), jnp.zeros((3, 2)), jnp.eye(2)),
+        learning_rate=0.1,
+        threshold_min=0.0,
+    )
+    after = before.add(jnp.zeros((0, 2)), jnp.zeros((0, 2)), jnp.zeros(0))
+    np.testing.assert_array_equal(after.thresholds, before.thresholds)
+    np.testing.assert_array_equal(after.fitnesses, before.fitnesses)

@@ -141,7 +141,7 @@ class AnnealedRepertoire(MapElitesRepertoire, kw_only=True):
                 an array has another shape.
         """
         check_annealing(learning_rate, threshold_min)
-        _check_batch(genotypes, fitnesses, descriptors, centroids)
+        _check_batch(genotypes, fitnesses, descriptors, centroids, least=1)
         empty = MapElitesRepertoire.init_default(
             jax.tree.map(lambda leaf: leaf[0], genotypes),
             centroids,
@@ -181,8 +181,17 @@ def _check_batch(
     fitnesses: jax.Array,
     descriptors: jax.Array,
     centroids: jax.Array,
+    *,
+    least: int = 0,
 ) -> None:
     """Checks individuals; JAX would broadcast a descriptor of another length.
+
+    Args:
+        genotypes: Genotypes, leaves (N, ...).
+        fitnesses: (N,) or (N, 1) fitnesses.
+        descriptors: (N, D) descriptors.
+        centroids: (cells, D) centres of the cells.
+        least: Smallest number N of individuals.
 
     Raises:
         TypeError: An argument is not an array.
@@ -197,8 +206,8 @@ def _check_batch(
         raise ValueError(message("centroids", centroids, "an array (cells, D)"))
     count = leaves[0].shape[0] if leaves and leaves[0].shape else 0
     for leaf in leaves:
-        if not count or leaf.shape[:1] != (count,):
-            allowed = "arrays (N, ...) of the same N, at least 1"
+        if count < least or leaf.shape[:1] != (count,):
+            allowed = f"arrays (N, ...) of the same N, at least {least}"
             raise ValueError(message("genotypes", leaf, allowed))
     if fitnesses.shape not in ((count,), (count, 1)):
         allowed = f"an array (N,) or (N, 1) with N = {count}, as the genotypes"
