@@ -16,6 +16,7 @@ from newton_qd import cli
 from newton_qd.qd.algorithms.cma_me import CMAMEOptions
 from newton_qd.qd.algorithms.me_conditioned import ConditionedOptions
 from newton_qd.qd.algorithms.options import read_options
+from newton_qd.qd.algorithms.spec import AlgorithmSpec
 from newton_qd.qd.algorithms.variation import parents_in
 from newton_qd.qd.config import ConfigError, read_config
 
@@ -175,6 +176,24 @@ def test_options_out_of_range_are_refused(
 ) -> None:
     with pytest.raises(ConfigError, match=message):
         run(SMALL.replace(algorithm=name, options=options))
+
+
+def test_a_run_with_an_option_without_effect_is_resumed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Earlier versions began such runs, and a resume cannot change an option."""
+    options = {"noise": 0.02}
+    config = SMALL.replace(algorithm="omg-mega", options=options, iterations=1)
+    out = tmp_path / "new"
+    with pytest.raises(ConfigError, match=r"noise: got 0.02, .* samples = 0"):
+        run(config, out=out, resume=True)
+    assert not out.exists()
+    with monkeypatch.context() as patch:
+        patch.setattr(AlgorithmSpec, "check_effect", lambda *_: None)
+        run(config, out=out)
+    arguments = ["evolve", "--quiet", "--resume", "--out", str(out)]
+    more = [*arguments, "--iterations", "2"]
+    assert cli.main(more, task_factory=point_task) == cli.OK
 
 
 @pytest.mark.parametrize(("share", "size"), [(0.29, 100), (1 / 49, 49), (0.3, 128)])

@@ -38,7 +38,7 @@ def test_every_variant_is_a_setting(protocol: Any) -> None:
         for name in own:
             given = {**protocol.settings_of(TASK), **variants[name]}
             config = EvolveConfig(env_name=TASK, algorithm=algorithm, **given)
-            algorithm_named(algorithm).read_options(config)
+            algorithm_named(algorithm).check_effect(config)
     assert protocol.settings_of(TASK)["hidden"] == [64, 64]
 
 
@@ -46,7 +46,7 @@ def test_every_variant_is_a_setting(protocol: Any) -> None:
 def test_every_variant_of_one_core_is_a_setting(task: str) -> None:
     for variant in study_core.read("variants"):
         config = study_core.config_of(study_core.Run(task, variant, 0))
-        algorithm_named(config.algorithm).read_options(config)
+        algorithm_named(config.algorithm).check_effect(config)
 
 
 @pytest.mark.parametrize("task", FIELD.tasks)

@@ -30,7 +30,7 @@ def test_every_setting_is_one_of_evolve() -> None:
             config = study_config(env_name, algorithm)
             assert (config.env_name, config.algorithm) == (env_name, algorithm)
             assert (config.batch_size, config.centroids) == (1024, 1024)
-            algorithm_named(algorithm).read_options(config)
+            algorithm_named(algorithm).check_effect(config)
 
 
 def test_what_did_not_run_is_told() -> None:

@@ -47,7 +47,10 @@ def run(
     checks.number(
         "checkpoint_seconds", seconds, least=0, endless=True, error=ConfigError
     )
-    algorithm_named(config.algorithm).read_options(config)
+    algorithm = algorithm_named(config.algorithm)
+    algorithm.read_options(config)
+    if not arguments.resume:
+        algorithm.check_effect(config)
     if arguments.device == "cpu" and "jax" not in sys.modules:
         os.environ["JAX_PLATFORMS"] = "cpu"  # so that JAX reserves no GPU memory
     if arguments.device is arguments.devices is None:  # else they are checked first

@@ -87,8 +87,8 @@ def read_options(
 
     Raises:
         ConfigError: An option does not exist, or its value has the wrong type, is not
-            finite, is negative, is less than ``least``, has more than 32 bits, fails a
-            check of the dataclass, or has no effect with the others.
+            finite, is negative, is less than ``least``, has more than 32 bits, or fails
+            a check of the dataclass.
     """
     hints = typing.get_type_hints(kind)
     allowed = {field.name for field in dataclasses.fields(kind)}
@@ -101,16 +101,20 @@ def read_options(
     with refused_options():
         options = kind(**defaults)
         options.check()
-    _check_effect(options, {name for name, _ in config.options})
     return options
 
 
-def _check_effect(options: Options, given: set[str]) -> None:
+def check_effect(options: Options, config: EvolveConfig) -> None:
     """Checks that options that a user gave have an effect.
+
+    Args:
+        options: Options of the algorithm.
+        config: Settings of the run from which they were made.
 
     Raises:
         ConfigError: The option that one of them needs is off.
     """
+    given = {name for name, _ in config.options}
     for field in dataclasses.fields(options):
         switch = field.metadata.get(_SWITCH)
         if switch is None or field.name not in given or getattr(options, switch):

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, Generic, TypeAlias
 
 from newton_qd.checks import message
-from newton_qd.qd.algorithms.options import OptionsT, read_options
+from newton_qd.qd.algorithms.options import OptionsT, check_effect, read_options
 from newton_qd.qd.config import ConfigError, EvolveConfig
 
 if TYPE_CHECKING:  # importing a list of algorithms imports no JAX
@@ -129,3 +129,13 @@ class AlgorithmSpec(Generic[OptionsT]):
             raise ConfigError(message("tournament", config.tournament, allowed))
         tuned = self.tuned.get(config.env_name, {})
         return read_options(self.options, config, least=self.least, **tuned)
+
+    def check_effect(self, config: EvolveConfig) -> None:
+        """Checks that the options of a new run have an effect.
+
+        A run that an earlier version began may have others, and can be resumed.
+
+        Raises:
+            ConfigError: An option has no effect, or is refused by ``read_options``.
+        """
+        check_effect(self.read_options(config), config)

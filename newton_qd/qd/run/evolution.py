@@ -143,6 +143,8 @@ def evolve(
     chosen = _device(device, devices)
     # after the other arguments, whose errors would come one by one otherwise
     folder = _folder(out, config, resume, tensorboard)
+    if folder is None or not folder.has_config:
+        algorithm_named(config.algorithm).check_effect(config)
     interrupts.install()  # before the handlers below, so that it outlives them
     with ExitStack() as stack:
         stop = stack.enter_context(graceful_stop())
