@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -24,12 +25,24 @@ from emitter_problems import (
     start,
 )
 from jax.sharding import Mesh, PartitionSpec
+from point_runs import PointEnv
+from qdax.core.containers.mapelites_repertoire import MapElitesRepertoire
+from qdax.core.emitters.emitter import Emitter
 from qdax.core.emitters.multi_emitter import MultiEmitter
+from qdax.core.map_elites import MAPElites
+from test_actor_critic import SIZE as WEIGHTS
+from test_actor_critic import emitter as actors
+from test_actor_critic import method
+from test_ascent import climbing
+from test_conditioned import emitter as conditioned
+from test_conditioned import policy as conditioned_policy
 
 from newton_qd.qd.emitters import (
     CMAMAEGAEmitter,
     CMAMEGAEmitter,
+    EpisodeLearning,
     OMGMEGAEmitter,
+    WindowArborescenceEmitter,
 )
 from newton_qd.qd.emitters.annealed_repertoire import AnnealedRepertoire
 
@@ -110,6 +123,65 @@ def test_a_search_runs_on_each_device(name: str) -> None:
         strict=True,
     ):
         np.testing.assert_array_equal(own, other)
+
+
+def sums(genotypes: Any, key: jax.Array) -> tuple[Any, Any, dict[str, Any]]:
+    del key
+    return genotypes.sum(axis=1), genotypes[:, :2], {}
+
+
+def lossy(weights: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    del key
+    return weights, weights[:, 0] > 0
+
+
+def actors_of_episodes() -> Emitter:
+    learning = EpisodeLearning(method(), PointEnv(), 1, 1, 0.1)
+    return actors(later=learning, to_empty=0.5)
+
+
+def window_arborescence() -> Emitter:
+    first = PointEnv().reset(jax.random.key(0))
+    return WindowArborescenceEmitter(
+        sums, method(), first, probes=2, walks=2, sigma_g=0.5, batch_size=4
+    )
+
+
+LEARNERS: dict[str, tuple[Callable[[], Emitter], int]] = {
+    "ascent": (climbing, 20),
+    "lossy_ascent": (lambda: climbing(slope=lossy), 20),
+    "actors": (actors, WEIGHTS),
+    "actors_of_episodes": (actors_of_episodes, WEIGHTS),
+    "conditioned": (conditioned, conditioned_policy().size),
+    "window_arborescence": (window_arborescence, WEIGHTS),
+}
+
+
+@pytest.mark.parametrize("one_key", [False, True])
+@pytest.mark.parametrize("name", LEARNERS)
+def test_actors_learn_on_each_device(name: str, one_key: bool) -> None:
+    """Types of ``shard_map`` fit, with one key for all devices or one for each."""
+    make, size = LEARNERS[name]
+    init: Any = MapElitesRepertoire.init
+    if name == "window_arborescence":
+        init = functools.partial(
+            AnnealedRepertoire.init, learning_rate=0.1, threshold_min=0.0
+        )
+    search = MAPElites(sums, make(), lambda _: {}, repertoire_init=init)
+
+    def run(initial: jax.Array, keys: jax.Array) -> Any:
+        key = keys if one_key else keys[0]
+        carry = (*search.init(initial, centroids(), key)[:2], key)
+        (repertoire, _, _), _ = jax.lax.scan(search.scan_update, carry, None, length=2)
+        return repertoire.genotypes
+
+    mesh, split = Mesh(jax.devices()[:1], ("x",)), PartitionSpec("x")
+    specs = (split, PartitionSpec() if one_key else split)
+    each = jax.shard_map(run, mesh=mesh, in_specs=specs, out_specs=split)
+    key = jax.random.key(1)
+    initial = jax.ShapeDtypeStruct((16, size), jnp.float32)
+    found = jax.eval_shape(each, initial, key if one_key else key[None])
+    assert found.shape == (len(centroids()), size)
 
 
 @pytest.mark.parametrize("name", MAKERS)

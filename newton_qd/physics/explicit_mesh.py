@@ -243,6 +243,17 @@ def varying_as(likes: Sequence[jax.Array], values: Tree) -> Tree:
     return jax.tree.map(vary, values)
 
 
+def varying_alike(values: Tree) -> Tree:
+    """Returns values that all vary over the axes over which any of them varies.
+
+    Outside of ``jax.shard_map``, nothing changes.
+
+    Args:
+        values: Pytree of numbers and random keys.
+    """
+    return varying_as(jax.tree.leaves(values), values)
+
+
 def rows_split_as(like: jax.Array, values: Tree) -> Tree:
     """Returns values of a batch, split over devices as another array of this batch.
 

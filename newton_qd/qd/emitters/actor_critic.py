@@ -15,6 +15,7 @@ from qdax.core.emitters.emitter import Emitter
 from newton_qd import checks
 from newton_qd.checks import message
 from newton_qd.envs.state import select
+from newton_qd.physics.explicit_mesh import varying_alike
 from newton_qd.qd.emitters.actor_critic_learner import ActorCritic, Learner
 from newton_qd.qd.emitters.cells import draw_elites, empty_targets
 from newton_qd.qd.emitters.episode_learner import EpisodeLearning
@@ -162,13 +163,13 @@ class ActorCriticEmitter(Emitter):
         With whitening, they are read as weights for whitened observations, which makes
         them other policies.
         """
-        del repertoire, descriptors, extra_scores
+        del descriptors, extra_scores
         key, scale_key, aim_key, critic_key = jax.random.split(key, 4)
         # repeats the best if there are more actors than individuals
         order = jnp.resize(jnp.argsort(-fitnesses.reshape(-1)), (self._actors,))
         weights = genotypes[order]
         learners = self._begun(critic_key, weights, self._aims(aim_key))
-        return ActorCriticState(
+        state = ActorCriticState(
             learners=learners,
             scale=self._method.scale(scale_key, self._method.worlds(self._first)),
             snapshots=jnp.tile(weights, (self._branches, 1, 1)),
@@ -176,6 +177,7 @@ class ActorCriticEmitter(Emitter):
             generation=jnp.zeros((), jnp.int32),
             key=key,
         )
+        return varying_alike((state, repertoire))[0]
 
     def emit(
         self, repertoire: Repertoire, emitter_state: PyTree, key: jax.Array
@@ -259,7 +261,7 @@ class ActorCriticEmitter(Emitter):
             carry, _ = jax.lax.scan(learn, carry, keys)
             return carry, carry[0].weights
 
-        begin = (learners, jnp.zeros((self._actors,), jnp.int32))
+        begin = varying_alike((learners, jnp.zeros((self._actors,), jnp.int32)))
         keys = jax.random.split(key, self._branches)
         (learners, failed), snapshots = jax.lax.scan(branch, begin, keys)
         return learners, failed, snapshots

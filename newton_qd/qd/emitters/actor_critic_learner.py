@@ -14,6 +14,7 @@ import optax
 
 from newton_qd.envs.state import select
 from newton_qd.gradients.flow import passed_back
+from newton_qd.physics.explicit_mesh import varying_alike
 from newton_qd.qd.emitters.actor_critic_settings import ActorCriticSettings
 from newton_qd.qd.emitters.whitening import Whitening
 from newton_qd.qd.scoring.task import Task
@@ -123,6 +124,7 @@ class ActorCritic:
             key: Key of the actions.
             first: Initial states of the worlds, leaves (W, ...).
         """
+        key, first = varying_alike((key, first))
         shape = (_SETTLING, len(first.done), self.env.action_size)
         actions = jax.random.uniform(key, shape, first.obs.dtype, -1, 1)
 
@@ -186,6 +188,8 @@ class ActorCritic:
             The actor after the window, and whether the gradient was not finite (). If
             it was not finite, the actor does not change, and its worlds restart.
         """
+        # else the gradient would be the sum over all devices
+        learner, scale, key = varying_alike((learner, scale, key))
         settings = self.settings
         noise_key, order_key = jax.random.split(key)
 

@@ -28,7 +28,7 @@ from qdax.core.emitters.emitter import Emitter
 from newton_qd import checks
 from newton_qd.checks import Fact, listed, message
 from newton_qd.envs.state import select
-from newton_qd.physics.explicit_mesh import varying_as
+from newton_qd.physics.explicit_mesh import varying_alike
 from newton_qd.qd.emitters.arborescence_state import ArborescenceState
 from newton_qd.qd.emitters.cma_es import CMAES, CMAESState
 from newton_qd.qd.emitters.optimizer_check import check_optimizer
@@ -359,7 +359,7 @@ class ArborescenceEmitter(Emitter, abc.ABC):
             rejected=rejected + jnp.sum(~scores.finite, dtype=jnp.int32),
         )
         # a new distribution consists of constants
-        return varying_as(jax.tree.leaves(state), state)
+        return varying_alike(state)
 
     def _adapt(
         self,

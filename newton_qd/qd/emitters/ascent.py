@@ -13,6 +13,7 @@ from qdax.core.emitters.emitter import Emitter
 from newton_qd import checks
 from newton_qd.envs.state import select
 from newton_qd.gradients.episode import Episode
+from newton_qd.physics.explicit_mesh import varying_alike
 from newton_qd.qd.emitters.cells import draw_elites
 from newton_qd.qd.emitters.restarts import LONGEST_LIFE, due_for_restart
 from newton_qd.types import ExtraScores, Genotype, PyTree, Repertoire, RNGKey
@@ -178,7 +179,8 @@ class AscentEmitter(Emitter):
         key, begin_key = jax.random.split(key)
         none = jnp.zeros((self._climbers,), bool)
         start = self._begun(repertoire, begin_key)
-        return AscentState(*start, none, jnp.zeros((), jnp.int32), key)
+        state = AscentState(*start, none, jnp.zeros((), jnp.int32), key)
+        return varying_alike((state, repertoire))[0]
 
     def emit(
         self, repertoire: Repertoire, emitter_state: PyTree, key: jax.Array
@@ -208,7 +210,9 @@ class AscentEmitter(Emitter):
         share = self._momentum
         motion = share * motion + (1 - share) * _units(slopes)
         weights = weights + steps[:, None] * _units(motion)
-        return AscentState(weights, motion, steps, lost, state.generation + 1, key)
+        number = state.generation + 1
+        # a gradient that is never lost may say so with a constant
+        return varying_alike(AscentState(weights, motion, steps, lost, number, key))
 
     def _begun(
         self, repertoire: Repertoire, key: jax.Array

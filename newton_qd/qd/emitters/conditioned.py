@@ -11,6 +11,7 @@ from qdax.core.emitters.emitter import Emitter
 
 from newton_qd import checks
 from newton_qd.checks import message
+from newton_qd.physics.explicit_mesh import varying_alike
 from newton_qd.qd.emitters.actor_critic_learner import ActorCritic, Learner
 from newton_qd.qd.emitters.aims import AimedEnv, AimedState, ConditionedPolicy
 from newton_qd.qd.emitters.cells import draw_cells, draw_elites
@@ -162,7 +163,7 @@ class ConditionedActorEmitter(Emitter):
         logits = jnp.zeros((len(repertoire.centroids),), actor.dtype)
         worlds = self._worlds(repertoire, logits, unit, aim_key)
         aim = jnp.ones((1,), actor.dtype)
-        return ConditionedState(
+        state = ConditionedState(
             learner=self._method.begin(critic_key, actor, aim, worlds),
             scale=self._scale(scale_key, worlds),
             unit=unit,
@@ -171,6 +172,7 @@ class ConditionedActorEmitter(Emitter):
             failed=jnp.zeros((1,), jnp.int32),
             key=key,
         )
+        return varying_alike((state, repertoire))[0]
 
     def emit(
         self, repertoire: Repertoire, emitter_state: PyTree, key: jax.Array
@@ -229,7 +231,7 @@ class ConditionedActorEmitter(Emitter):
             return (learner, failed + lost), None
 
         keys = jax.random.split(learn_key, self._updates)
-        begin = (learner, jnp.zeros_like(state.failed))
+        begin = varying_alike((learner, jnp.zeros_like(state.failed)))
         (learner, failed), _ = jax.lax.scan(learn, begin, keys)
         cells = self._targets(repertoire, cell_key, self._copies)
         return ConditionedState(learner, state.scale, unit, logits, cells, failed, key)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from newton_qd import checks
 from newton_qd.envs.state import at_fault, select
 from newton_qd.gradients.outcome import Tally
+from newton_qd.physics.explicit_mesh import varying_alike
 from newton_qd.qd.emitters.actor_critic_learner import ActorCritic, Learner
 from newton_qd.qd.emitters.ascent import limited_mean
 from newton_qd.types import Environment, PyTree
@@ -82,6 +83,8 @@ class EpisodeLearning:
             The actor after the step, and whether the gradients of all worlds were lost
             (). If they were, the actor does not change.
         """
+        # else the gradient would be the sum over all devices
+        learner, scale, key = varying_alike((learner, scale, key))
 
         def plain(weights: jax.Array) -> jax.Array:
             return self.method.whitening.plain(weights, scale)
@@ -144,6 +147,7 @@ class EpisodeLearning:
         one = jnp.ones((), noise.dtype)
         nothing = Tally(jnp.zeros(aim.size + 1, noise.dtype), one)
         begin = first, nothing, jnp.zeros((), bool)
+        begin, weights, noise = varying_alike((begin, weights, noise))
         (_, tally, bad), _ = jax.lax.scan(advance, begin, noise)
         sums, steps = tally.fitness[:-1], tally.fitness[-1]
         if self.averaged:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 
 from newton_qd import checks
 from newton_qd.checks import message
+from newton_qd.physics.explicit_mesh import varying_alike
 from newton_qd.qd.emitters.actor_critic_learner import ActorCritic, Learner
 from newton_qd.qd.emitters.arborescence_state import ArborescenceState
 from newton_qd.qd.emitters.cma_maega import CMAMAEGAEmitter
@@ -116,6 +117,7 @@ class WindowArborescenceEmitter(CMAMAEGAEmitter):
         self, actors: Learner, scale: Scale, key: jax.Array, updates: int
     ) -> Learner:
         """Returns actors, leaves (E, ...), after some updates."""
+        actors, scale, key = varying_alike((actors, scale, key))
         count = len(scale[0])
 
         def learn(actors: Learner, key: jax.Array) -> tuple[Learner, None]:
