@@ -20,6 +20,7 @@ from newton_qd.qd.emitters.actor_critic_learner import ActorCritic, Learner
 from newton_qd.qd.emitters.cells import draw_elites, empty_targets
 from newton_qd.qd.emitters.episode_learner import EpisodeLearning
 from newton_qd.qd.emitters.restarts import LONGEST_LIFE, due_for_restart
+from newton_qd.qd.scoring.gradient_scores import genotype_matrix
 from newton_qd.types import (
     ExtraScores,
     Genotype,
@@ -125,6 +126,7 @@ class ActorCriticEmitter(Emitter):
         for name, value in counts.items():
             checks.integer(name, value, most=None)
         checks.integer("lifetime", lifetime, most=LONGEST_LIFE)
+        checks.integer("measures", measures)
         if not 0 < spread[0] <= spread[1]:
             raise ValueError(message("spread", spread, "0 < smallest <= largest"))
         for name, share in {"steered": steered, "to_empty": to_empty}.items():
@@ -162,8 +164,17 @@ class ActorCriticEmitter(Emitter):
 
         With whitening, they are read as weights for whitened observations, which makes
         them other policies.
+
+        Raises:
+            GradientsError: Genotypes are not one array.
+            ValueError: ``measures`` is not the length of a descriptor.
         """
-        del descriptors, extra_scores
+        del extra_scores
+        genotypes = genotype_matrix(genotypes)
+        length = descriptors.shape[-1]
+        if self._measures != length:
+            allowed = f"{length}, the length of a descriptor"
+            raise ValueError(message("measures", self._measures, allowed))
         key, scale_key, aim_key, critic_key = jax.random.split(key, 4)
         # repeats the best if there are more actors than individuals
         order = jnp.resize(jnp.argsort(-fitnesses.reshape(-1)), (self._actors,))

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from newton_qd.checks import Fact, message
 from newton_qd.qd.emitters.whitening import Whitening
 from newton_qd.qd.scoring.rollout import Policy
 from newton_qd.qd.scoring.task import Task
@@ -161,16 +162,34 @@ class ConditionedPolicy:
     Attributes:
         policy: Policy of the archive.
         targets: Length of a target.
+
+    Raises:
+        ValueError: The first layer of the policy is not known.
     """
 
     policy: Policy
     targets: int
 
+    def __post_init__(self) -> None:
+        """Finds the first layer.
+
+        Raises:
+            ValueError: It is not known.
+        """
+        _ = self._bias
+
     @functools.cached_property
     def _bias(self) -> np.ndarray:
-        """Places of the first layer's bias in a vector of weights."""
+        """Places of the first layer's bias in a vector of weights.
+
+        Raises:
+            ValueError: The first layer is not known.
+        """
         bias = Whitening.of(self.policy).bias
-        assert bias is not None  # of a perceptron
+        if bias is None:
+            given = Fact(type(self.policy.network).__name__)
+            allowed = "a policy of make_policy, whose first layer is known"
+            raise ValueError(message("policy", given, allowed))
         return bias
 
     @property

@@ -16,6 +16,7 @@ from newton_qd.gradients.episode import Episode
 from newton_qd.physics.explicit_mesh import varying_alike
 from newton_qd.qd.emitters.cells import draw_elites
 from newton_qd.qd.emitters.restarts import LONGEST_LIFE, due_for_restart
+from newton_qd.qd.scoring.gradient_scores import genotype_matrix
 from newton_qd.types import ExtraScores, Genotype, PyTree, Repertoire, RNGKey
 
 Slope: TypeAlias = Callable[[jax.Array, RNGKey], tuple[jax.Array, jax.Array]]
@@ -174,7 +175,12 @@ class AscentEmitter(Emitter):
         descriptors: jax.Array,
         extra_scores: ExtraScores,
     ) -> PyTree:
-        """Begins at random elites."""
+        """Begins at random elites.
+
+        Raises:
+            GradientsError: Genotypes are not one array.
+        """
+        genotype_matrix(genotypes)
         del genotypes, fitnesses, descriptors, extra_scores
         key, begin_key = jax.random.split(key)
         none = jnp.zeros((self._climbers,), bool)

@@ -22,6 +22,7 @@ from newton_qd.qd.emitters.behaviors import (
     preference,
 )
 from newton_qd.qd.emitters.cells import accepted_cells, draw_cells, draw_elites
+from newton_qd.qd.scoring.gradient_scores import genotype_matrix
 from newton_qd.types import ExtraScores, Genotype, PyTree, Repertoire
 
 
@@ -105,8 +106,14 @@ class AsciiEmitter(Emitter):
         descriptors: jax.Array,
         extra_scores: ExtraScores,
     ) -> PyTree:
-        """Stores the behaviors of the initial population."""
+        """Stores the behaviors of the initial population.
+
+        Raises:
+            GradientsError: Genotypes are not one array.
+            ValueError: The scoring function returns no transitions.
+        """
         del key, fitnesses
+        genotypes = genotype_matrix(genotypes)
         seen = self._seen(extra_scores)
         cells = repertoire.centroids.shape[0]
 
@@ -277,11 +284,14 @@ class ExactAsciiEmitter(Emitter):
             (parents * branches, size) offspring, and whether a derivative
             ``overflowed`` or was lost to a fault, (parents,). Such a parent does not
             move, and neither does one whose derivative is 0.
+
+        Raises:
+            GradientsError: Genotypes are not one array.
         """
         del emitter_state
         cell_key, rate_key, step_key, score_key = jax.random.split(key, 4)
         cells = draw_elites(repertoire, cell_key, self._parents)
-        weights = repertoire.genotypes[cells]
+        weights = genotype_matrix(repertoire.genotypes)[cells]
         steps = self._rollout(weights, score_key)
         own = behavior_of(steps, steps["rewards"].shape[1], 1.0)
         found = self._gradient(own.actions, score_key)

@@ -15,6 +15,7 @@ from newton_qd.physics.explicit_mesh import varying_alike
 from newton_qd.qd.emitters.actor_critic_learner import ActorCritic, Learner
 from newton_qd.qd.emitters.aims import AimedEnv, AimedState, ConditionedPolicy
 from newton_qd.qd.emitters.cells import draw_cells, draw_elites
+from newton_qd.qd.scoring.gradient_scores import genotype_matrix
 from newton_qd.types import (
     ExtraScores,
     Genotype,
@@ -148,8 +149,13 @@ class ConditionedActorEmitter(Emitter):
         descriptors: jax.Array,
         extra_scores: ExtraScores,
     ) -> PyTree:
-        """Starts from the best of the initial population, for all targets."""
+        """Starts from the best of the initial population, for all targets.
+
+        Raises:
+            GradientsError: Genotypes are not one array.
+        """
         del descriptors, extra_scores
+        genotypes = genotype_matrix(genotypes)
         key, scale_key, aim_key, cell_key, critic_key = jax.random.split(key, 5)
         fitnesses = fitnesses.reshape(-1)
         actor = self._policy.unconditioned(genotypes[jnp.argmax(fitnesses)])

@@ -11,6 +11,7 @@ from qdax.core.emitters.emitter import Emitter
 from newton_qd import checks
 from newton_qd.gradients.exact import DirectionalGradient
 from newton_qd.qd.emitters.cells import draw_cells, empty_targets, nearest_cells
+from newton_qd.qd.scoring.gradient_scores import genotype_matrix
 from newton_qd.types import ExtraScores, PyTree, Repertoire
 
 
@@ -84,6 +85,9 @@ class GradientLineEmitter(Emitter):
         Returns:
             (parents * branches, size) offspring, and whether a gradient ``overflowed``,
             (parents,). If a gradient is zero or not finite, the direction is random.
+
+        Raises:
+            GradientsError: Genotypes are not one array.
         """
         del emitter_state
         climb_key, target_key, step_key, way_key, score_key = jax.random.split(key, 5)
@@ -98,7 +102,7 @@ class GradientLineEmitter(Emitter):
         uphill = jnp.eye(1, 1 + error.shape[1], dtype=error.dtype)
         towards = jnp.pad(error, ((0, 0), (1, 0)))
         directions = jnp.concatenate([jnp.tile(uphill, (climbing, 1)), towards])
-        genotypes = repertoire.genotypes[cells]
+        genotypes = genotype_matrix(repertoire.genotypes)[cells]
         found = self._gradient(genotypes, directions[:, None], score_key)
         units = _units(found.gradients[:, 0], way_key)
         steps = self._draw(step_key, genotypes.dtype)
