@@ -51,6 +51,9 @@ class AsciiEmitter(Emitter):
     towards its actions in the steps from which it got a higher return than the parent,
     and away from them in the others. The scoring function must return ``transitions``.
     ASCII-ME is this emitter together with iso+line variations.
+
+    The state has the behaviors of a whole generation, those of other emitters included.
+    So in ``jax.lax.scan``, the initial population must be as large as a generation.
     """
 
     def __init__(
