@@ -283,6 +283,7 @@ EXCEPTIONS = {
     "physics/reverse_mode.py": {
         "_FORWARD": "JAX's words, and what to use instead",
         "_SECOND": "about a transformation, not a value",
+        "there is no derivative of": "about a transformation, not a value",
     },
     "physics/model/xml_reader.py": {
         "{self.path}, line {error.lineno}": "about the text of a file, not a value",
