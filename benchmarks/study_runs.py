@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import fcntl
+import functools
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -63,8 +64,15 @@ def variants() -> dict[str, dict[str, Any]]:
 
 
 def _file() -> dict[str, dict[str, Any]]:
-    """Returns the content of ``field.toml``."""
-    with VARIANTS.open("rb") as file:
+    """Returns the content of ``field.toml``; do not change it."""
+    return _content(VARIANTS, VARIANTS.stat().st_mtime_ns)
+
+
+@functools.lru_cache(maxsize=1)
+def _content(path: Path, changed: int) -> dict[str, Any]:
+    """Returns the content of a TOML file that was last changed at a time [ns]."""
+    del changed
+    with path.open("rb") as file:
         return tomllib.load(file)
 
 

@@ -178,6 +178,7 @@ def test_options_out_of_range_are_refused(
         run(SMALL.replace(algorithm=name, options=options))
 
 
+@pytest.mark.slow
 def test_a_run_with_an_option_without_effect_is_resumed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -260,9 +260,9 @@ def test_functions_without_a_derivative() -> None:
         def loss(q: jax.Array, read: Any = read) -> jax.Array:
             return read(q).sum()
 
-        for derived in (jax.grad(loss), jax.jit(jax.grad(loss)), jax.jacfwd(loss)):
+        for derived in (jax.grad(loss), jax.jacfwd(loss)):
             with pytest.raises(TypeError, match=words):
-                derived(here.q)
+                jax.eval_shape(derived, here.q)
 
 
 def test_gaps_may_be_constant_in_a_loss() -> None:

@@ -100,7 +100,9 @@ def test_contains_what_is_not_finite(name: str) -> None:
     assert rejected(state) > 0 or name == "line"
 
 
-@pytest.mark.parametrize("name", ["cma_mega", "cma_maega"])
+@pytest.mark.parametrize(
+    "name", ["cma_mega", pytest.param("cma_maega", marks=pytest.mark.slow)]
+)
 def test_a_search_runs_on_each_device(name: str) -> None:
     """A loop in ``shard_map`` needs the same types before and after a generation."""
     search = algorithm(MAKERS[name](score), annealed=name == "cma_maega")
@@ -157,7 +159,7 @@ LEARNERS: dict[str, tuple[Callable[[], Emitter], int]] = {
 }
 
 
-@pytest.mark.parametrize("one_key", [False, True])
+@pytest.mark.parametrize("one_key", [True, pytest.param(False, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", LEARNERS)
 def test_actors_learn_on_each_device(name: str, one_key: bool) -> None:
     """Types of ``shard_map`` fit, with one key for all devices or one for each."""

@@ -98,6 +98,7 @@ def test_a_third_body_changes_no_impact(
     np.testing.assert_array_equal(after.v[12:], 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("near", [2.0, 0.19])
 def test_gradients_are_those_of_differences(
     x64: None, tmp_path: Path, near: float

@@ -48,7 +48,12 @@ def test_a_folder_without_runs_is_refused(
 @pytest.mark.parametrize(
     ("script", "given", "text"),
     [
-        ("shares", "ant_uni me@1", "variant: got me@1; allowed: .* of two kinds"),
+        pytest.param(
+            "shares",
+            "ant_uni me@1",
+            "variant: got me@1; allowed: .* of two kinds",
+            marks=pytest.mark.slow,
+        ),
         ("shares", "ant_uni me@x", "variant: got me@x; allowed: a key of"),
         ("shares", "hopper me-actor-critic@1", "env_name: got 'hopper', .* descriptor"),
         ("study_report", "none", "runs: got none; allowed: a folder with files TASK"),
