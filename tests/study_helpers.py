@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import sys
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,22 @@ def line(algorithm: str, seed: int, stop: str, **values: Any) -> dict[str, str]:
         **{"initial_fitness": 2.0, **values},
     }
     return {name: str(given[name]) for name in study_runs.HEAD}
+
+
+def write(path: Path, *rows: dict[str, Any]) -> None:
+    """Writes a file of runs; what a row leaves out is 1."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, study_runs.HEAD, restval="1", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def scored(variant: str, seed: int, score: float, **values: Any) -> dict[str, Any]:
+    """Returns the row of a run, after 60 s if there is no other stop."""
+    return {
+        **{"task": TASK, "algorithm": variant.partition("@")[0], "variant": variant},
+        **{"seed": seed, "stop": "60 s", "corrected_qd_score": score, **values},
+    }
 
 
 def add(out: Path, algorithm: str, seed: int, stop: str, fitnesses: Any) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import csv
+import functools
 import re
 import sys
 from pathlib import Path
@@ -12,8 +12,9 @@ import pytest
 FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
 sys.path.insert(0, str(FOLDER))
 
+import study_helpers  # noqa: E402
 import study_pages  # noqa: E402
-from study_runs import HEAD, TUNING_SEED  # noqa: E402
+from study_runs import TUNING_SEED  # noqa: E402
 
 
 @pytest.mark.slow
@@ -56,16 +57,15 @@ def test_long_runs_have_their_own_score_before(
     """The reported run after 250 s may be another one than that after 1,000 s."""
 
     def write(path: Path, *rows: tuple[str, int, str, float]) -> None:
-        with path.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, HEAD, restval="1", lineterminator="\n")
-            writer.writeheader()
-            for commit, seed, stop, score in rows:
-                writer.writerow(
-                    {
-                        **{"task": "ant_uni", "variant": "me@7", "commit": commit},
-                        **{"seed": seed, "stop": stop, "corrected_qd_score": score},
-                    }
+        study_helpers.write(
+            path,
+            *(
+                study_helpers.scored(
+                    "me@7", seed, score, task="ant_uni", stop=stop, commit=commit
                 )
+                for commit, seed, stop, score in rows
+            ),
+        )
 
     write(
         tmp_path / "runs.csv",
@@ -88,23 +88,14 @@ def test_long_runs_have_their_own_score_before(
 def test_the_fix_is_compared_with_the_mean_of_equal_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def write(path: Path, *rows: tuple[str, int, float]) -> None:
-        with path.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, HEAD, restval="1", lineterminator="\n")
-            writer.writeheader()
-            for variant, seed, score in rows:
-                writer.writerow(
-                    {
-                        **{"task": "ant_uni", "algorithm": "dcrl-me", "seed": seed},
-                        **{"variant": variant, "stop": "60 s"},
-                        **{"corrected_qd_score": score},
-                    }
-                )
-
-    old = "dcrl-me@7-median"
-    write(tmp_path / "runs.csv", ("dcrl-me@7", 0, 6.0), (old, 0, 2.0), (old, 1, 4.0))
+    new, old = (
+        functools.partial(study_helpers.scored, variant, task="ant_uni")
+        for variant in ("dcrl-me@7", "dcrl-me@7-median")
+    )
+    first = new(0, 6.0), old(0, 2.0), old(1, 4.0)
+    study_helpers.write(tmp_path / "runs.csv", *first)
     repeats = tmp_path / "again.csv"
-    write(repeats, ("dcrl-me@7", 0, 12.0), ("dcrl-me@7", TUNING_SEED, 99.0))
+    study_helpers.write(repeats, new(0, 12.0), new(TUNING_SEED, 99.0))
     monkeypatch.setattr(study_pages, "FIELD", tmp_path)
     monkeypatch.setattr(study_pages, "REPEATS", repeats)
     monkeypatch.setattr(study_pages, "FIXED", {"ant_uni": 7, "antmaze": 7})

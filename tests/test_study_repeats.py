@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import sys
 from pathlib import Path
 
@@ -11,25 +10,16 @@ import pytest
 FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
 sys.path.insert(0, str(FOLDER))
 
+import study_helpers  # noqa: E402
 import study_repeats  # noqa: E402
-from study_runs import HEAD, TUNING_SEED  # noqa: E402
+from study_runs import TUNING_SEED  # noqa: E402
 
 OURS, OTHER = "me-actor-critic@21", "dcrl-me@12"
 Loaded = tuple[study_repeats.Runs, set[tuple[str, str]]]
 
 
 def write(path: Path, *runs: tuple[str, int, float]) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, HEAD, restval="1", lineterminator="\n")
-        writer.writeheader()
-        for variant, seed, score in runs:
-            writer.writerow(
-                {
-                    **{"task": "hopper_uni", "variant": variant, "seed": seed},
-                    **{"algorithm": variant.partition("@")[0]},
-                    **{"stop": "60 s", "corrected_qd_score": score},
-                }
-            )
+    study_helpers.write(path, *(study_helpers.scored(*run) for run in runs))
 
 
 @pytest.fixture
