@@ -123,7 +123,7 @@ def test_truncation_is_not_termination() -> None:
     env.reset()
     for _ in range(2):
         env.step(np.zeros(1))
-    assert env.step(np.ones(1))[2:4] == (True, False), "both: it ended by itself"
+    assert env.step(np.ones(1))[2:4] == (True, True), "as with Gymnasium's TimeLimit"
 
 
 def test_seeds() -> None:
@@ -315,6 +315,34 @@ def test_the_spec_has_the_length_of_an_episode() -> None:
     assert many.spec is not None and many.spec.max_episode_steps == 3
     copied = pickle.loads(pickle.dumps(env.unwrapped))
     assert copied.spec.max_episode_steps == 3
+
+
+def test_a_vector_environment_made_from_a_spec_has_its_length() -> None:
+    """Gymnasium counts actions, and ``episode_length`` control steps."""
+    name, repeat = "newton_qd/pointmaze-v0", {"episode_length": 5, "action_repeat": 2}
+    first = gymnasium.make_vec(name, num_envs=2, **repeat)
+    again = gymnasium.make_vec(first.spec, num_envs=2)
+    assert again.spec is not None and again.spec.max_episode_steps == 3
+    again.reset(seed=0)
+    actions = again.action_space.sample()
+    assert [again.step(actions)[3].all() for _ in range(3)] == [False, False, True]
+    with pytest.raises(ValueError, match=r"max_episode_steps: got 2\.5; allowed: "):
+        gymnasium.make_vec(name, max_episode_steps=2.5)
+
+
+@pytest.mark.parametrize("last", [0.0, 1.0])
+def test_an_environment_made_from_a_spec_ends_as_its_own(last: float) -> None:
+    spec = gymnasium.envs.registration.EnvSpec(
+        "Clock-v0", make_gymnasium, kwargs={"env": limited(3)}
+    )
+    first = gymnasium.make(spec)
+    again = gymnasium.make(first.spec)
+    for env in (first, again):
+        env.reset(seed=0)
+    assert "TimeLimit" in str(again) and "TimeLimit" not in str(first)
+    for action, ends in ((0.0, False), (0.0, False), (last, True)):
+        given = np.full(1, action, np.float32)
+        assert first.step(given)[2:4] == again.step(given)[2:4] == (last * ends, ends)
 
 
 def test_every_environment_is_registered() -> None:

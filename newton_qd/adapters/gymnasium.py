@@ -75,13 +75,21 @@ def metadata_of(env: Env, render_mode: str | None, **more: Any) -> dict[str, Any
     return {"render_modes": list(RENDER_MODES), "render_fps": rate, **more}
 
 
-def ends_of(state: State) -> tuple[np.ndarray, np.ndarray]:
-    """Returns whether worlds are terminated, and whether they are truncated."""
+def ends_of(env: Env, state: State) -> tuple[np.ndarray, np.ndarray]:
+    """Returns whether worlds are terminated, and whether they are truncated.
+
+    Both are true where an episode ended by itself in its last step, as with
+    Gymnasium's ``TimeLimit``, which ``gymnasium.make(env.spec)`` adds.
+    """
     done = np.asarray(state.done) > 0
     if "truncation" not in state.info:
         return done, np.zeros_like(done)
     truncated = np.asarray(state.info["truncation"]) > 0
-    return done & ~truncated, truncated
+    terminated = done & ~truncated
+    length = getattr(env, "episode_length", None)
+    if length is not None:
+        truncated = truncated | (np.asarray(state.info["steps"]) >= length)
+    return terminated, truncated
 
 
 def info_of(state: State) -> dict[str, np.ndarray]:
@@ -133,7 +141,8 @@ class GymnasiumEnv(Pickled, WithLength, gymnasium.Env):  # pyright: ignore[repor
     """One world as an environment of Gymnasium.
 
     Observations, rewards and ends are bitwise those of ``jax.jit(env.step)``. An
-    episode that reaches ``episode_length`` is truncated; every other end terminates it.
+    episode that reaches ``episode_length`` is truncated; every other end terminates it,
+    also one in the last step.
     ``info`` has the metrics, and from ``State.info`` the steps, the fault, the state
     descriptor and the position. ``reset(seed=n)`` is ``env.reset(jax.random.key(n))``.
 
@@ -229,7 +238,7 @@ class GymnasiumEnv(Pickled, WithLength, gymnasium.Env):  # pyright: ignore[repor
             raise gymnasium.error.ResetNeeded("step: call reset first")
         state = self._step(self.state, np.asarray(action, self.env.dtype))
         self.state = state
-        terminated, truncated = ends_of(state)
+        terminated, truncated = ends_of(self.env, state)
         ended = bool(terminated), bool(truncated)
         return np.array(state.obs), float(state.reward), *ended, info_of(state)
 

@@ -82,8 +82,8 @@ class GymnasiumVectorEnv(Pickled, WithLength, gymnasium.vector.VectorEnv):  # py
             render_mode: ``"rgb_array"`` or ``None``.
             width: Width of the picture of a world [px].
             height: Height of the picture of a world [px].
-            max_episode_steps: Gymnasium's name of ``episode_length``; ``None``: as
-                ``options`` say.
+            max_episode_steps: Steps after which an episode is truncated, with
+                ``action_repeat`` control steps each; ``None``: as ``options`` say.
             **options: Arguments of ``newton_qd.create``, such as ``episode_length``.
 
         Raises:
@@ -95,7 +95,10 @@ class GymnasiumVectorEnv(Pickled, WithLength, gymnasium.vector.VectorEnv):  # py
         """
         require_no_fork()
         if max_episode_steps is not None:
-            options["episode_length"] = max_episode_steps
+            checks.integer("max_episode_steps", max_episode_steps)
+            repeat = options.get("action_repeat", 1)
+            checks.integer("action_repeat", repeat)
+            options["episode_length"] = max_episode_steps * repeat
         checks.integer("num_envs", num_envs)
         world = one_world(env, options)
         if autoreset_mode not in (*AutoresetMode, *(m.value for m in AutoresetMode)):
@@ -183,7 +186,7 @@ class GymnasiumVectorEnv(Pickled, WithLength, gymnasium.vector.VectorEnv):  # py
         if self._mode is AutoresetMode.NEXT_STEP and begins.any():
             state = self._begun(state, begins)
         self.state = state
-        terminated, truncated = ends_of(state)
+        terminated, truncated = ends_of(self.env, state)
         ended = terminated | truncated
         reward, info = np.array(state.reward), info_of(state)
         if self._mode is AutoresetMode.NEXT_STEP:
