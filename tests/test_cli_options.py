@@ -98,6 +98,69 @@ def test_options_of_the_environment_on_the_command_line(
     assert found["qdax_wrappers_kwargs"] == ({"minval": (-1, -1)},)
 
 
+UNSETTABLE = """
+env_name = "point"
+new_starts = true
+seed = 3
+centroids = 9
+[options]
+noise = 0.1
+samples = 4
+[randomize]
+friction = [0.5, 1.5]
+[env_options]
+healthy_reward = 0.5
+[env_options.material]
+friction = 0.8
+smoothing = 0.01
+"""
+
+
+def test_settings_of_a_file_get_their_defaults_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("run.toml").write_text(UNSETTABLE)
+    names = ["new_starts", "seed", "options.noise", "randomize", "centroids"]
+    names += ["env_options.material.friction", "env_options.healthy_reward"]
+    parser = argparse.ArgumentParser()
+    add_arguments(parser.add_subparsers(), lambda *_: 0)
+    unset = [part for name in names for part in ("--unset", name)]
+    base = ["evolve", "--config", "run.toml"]
+    config, out = settle(parser.parse_args([*base, *unset]))
+    assert config == EvolveConfig(env_name="point").replace(
+        options={"samples": 4}, env_options={"material": {"smoothing": 0.01}}
+    )
+    assert out == Path("results/point-seed0")
+    # what is given holds
+    more = [*base, "--unset", "options", "--option", "noise=0.2", "--seed", "4"]
+    config, out = settle(parser.parse_args([*more, "--unset", "seed"]))
+    assert dict(config.options) == {"noise": 0.2} and config.seed == 4
+
+
+@pytest.mark.parametrize(
+    ("name", "allowed"),
+    [
+        ("env_name", "algorithm, .*warm_start$"),
+        ("seed.x", "algorithm, .*warm_start$"),
+        ("options.nosie", "entries of options: noise, samples$"),
+        ("options.noise.x", "entries of options.noise: none$"),
+        ("env_options.material.x", "entries of env_options.material: friction, smo"),
+        (None, "only with --config or --study, whose settings it takes back"),
+    ],
+)
+def test_settings_that_cannot_be_unset_are_named(
+    name: str | None, allowed: str, tmp_path: Path
+) -> None:
+    (path := tmp_path / "run.toml").write_text(UNSETTABLE)
+    base = ["evolve", "point", "--unset", name or "seed"]
+    base += [] if name is None else ["--config", str(path)]
+    parser = argparse.ArgumentParser()
+    add_arguments(parser.add_subparsers(), lambda *_: 0)
+    with pytest.raises(ConfigError, match=f"^unset: got .*; allowed: {allowed}"):
+        settle(parser.parse_args(base))
+
+
 def test_settings_of_the_study_are_a_base(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

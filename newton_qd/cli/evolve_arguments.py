@@ -6,7 +6,7 @@ import argparse
 import ast
 import contextlib
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from newton_qd import checks
 from newton_qd.checks import Fact, message
 from newton_qd.cli import modules
 from newton_qd.cli.arguments import Commands, integers, warn_of_changes, widths
+from newton_qd.cli.changes import merged, other_cells, with_defaults
 from newton_qd.qd.algorithms import ALGORITHMS
 from newton_qd.qd.config import ConfigError, EvolveConfig, read_config
 from newton_qd.qd.study import study_config
@@ -118,6 +119,14 @@ def _add_beginnings(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="take the settings that the algorithm has for ENV in the study "
         "(docs/study.md), which are for a GPU; with --resume, the run knows both",
+    )
+    parser.add_argument(
+        "--unset",
+        action="append",
+        metavar="NAME",
+        help="give a setting of --config or --study its default again, such as "
+        "new_starts, options.discount or env_options.material.friction; may be "
+        "repeated",
     )
 
 
@@ -289,9 +298,11 @@ def settle(arguments: argparse.Namespace) -> tuple[EvolveConfig, Path]:
         warn_of_changes(facts, "when this config was written")
     if arguments.study:
         base = _of_study(arguments, given)
+    if arguments.unset:
+        base = with_defaults(base, arguments.unset)
     out = arguments.out
     if out is None:
-        named = _other_cells(base or _DEFAULTS, given).replace(**given)
+        named = other_cells(base or _DEFAULTS, given).replace(**given)
         if base is None and "env_name" not in given:
             raise ConfigError(_UNNAMED)
         # the name becomes a folder, so it must not be a path
@@ -309,13 +320,13 @@ def settle(arguments: argparse.Namespace) -> tuple[EvolveConfig, Path]:
         why = "which holds no run"
         refused = message("out", Fact(out), "the results folder of a run", why=why)
         raise ConfigError(f"{refused}. To start a run there: {_UNNAMED}")
-    base = _other_cells(base or _DEFAULTS, given)
+    base = other_cells(base or _DEFAULTS, given)
     if "options" in given:
         given["options"] = {**dict(base.options), **dict(given["options"])}
     if "randomize" in given:
         given["randomize"] = {**dict(base.randomize), **dict(given["randomize"])}
     if "env_options" in given:
-        given["env_options"] = _merged(dict(base.env_options), given["env_options"])
+        given["env_options"] = merged(dict(base.env_options), given["env_options"])
     return base.replace(**given), out
 
 
@@ -341,35 +352,3 @@ def _of_study(
             folder.compare_environment(given.get("env_name", kept.env_name))
     names |= {name: given[name] for name in ("env_name", "algorithm") if name in given}
     return study_config(**names) if "env_name" in names else None
-
-
-def _other_cells(base: EvolveConfig, given: Mapping[str, Any]) -> EvolveConfig:
-    """Returns settings without the cells that given ones replace, of either kind."""
-    if "grid" in given:
-        base = base.replace(centroids=None)
-    if "centroids" in given:
-        base = base.replace(grid=None)
-    return base
-
-
-def _merged(
-    options: dict[str, Any], given: Iterable[tuple[str, Any]]
-) -> dict[str, Any]:
-    """Returns options with others; ``material.friction`` is an entry of a table.
-
-    Raises:
-        ConfigError: A name with a dot does not belong to a table.
-    """
-    for path, value in given:
-        *tables, name = path.split(".")
-        inside = options
-        for table in tables:
-            below = inside.get(table, {})
-            if not isinstance(below, Mapping):
-                given_text = f"{path}, where {table} is {below!r}"
-                raise ConfigError(
-                    message("env_options", given_text, "names of a table")
-                )
-            inside[table] = inside = dict(below)
-        inside[name] = value
-    return options
