@@ -178,6 +178,22 @@ def test_options_out_of_range_are_refused(
         run(SMALL.replace(algorithm=name, options=options))
 
 
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"algorithm": "cma-me", "iso_sigma": 0.1}, "iso_sigma: got 0.1; .* no iso"),
+        ({"algorithm": "me-es", "line_sigma": 0}, "line_sigma: got 0.0; .*0.2, the"),
+        ({"statistic": "median"}, "statistic: got 'median'; .*'mean', .* starts = 1"),
+    ],
+)
+def test_settings_without_effect_are_refused(
+    settings: dict[str, Any], message: str
+) -> None:
+    """In a new run; others can be resumed, as those with such an option."""
+    with pytest.raises(ConfigError, match=f"^{message}"):
+        run(SMALL.replace(**settings))
+
+
 @pytest.mark.slow
 def test_a_run_with_an_option_without_effect_is_resumed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -185,6 +201,7 @@ def test_a_run_with_an_option_without_effect_is_resumed(
     """Earlier versions began such runs, and a resume cannot change an option."""
     options = {"noise": 0.02}
     config = SMALL.replace(algorithm="omg-mega", options=options, iterations=1)
+    config = config.replace(statistic="median", line_sigma=0.1)
     out = tmp_path / "new"
     with pytest.raises(ConfigError, match=r"noise: got 0.02, .* samples = 0"):
         run(config, out=out, resume=True)

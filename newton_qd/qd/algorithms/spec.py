@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, Generic, TypeAlias
 
 from newton_qd.checks import message
@@ -16,6 +16,8 @@ if TYPE_CHECKING:  # importing a list of algorithms imports no JAX
     from newton_qd.qd.scoring.rollout import Policy
     from newton_qd.qd.scoring.task import Task
     from newton_qd.types import ScoringFunction
+
+_DEFAULTS = EvolveConfig()
 
 Evaluations: TypeAlias = Callable[[EvolveConfig, Any], int]
 """Maps settings and options to a number of episodes of one generation."""
@@ -131,11 +133,29 @@ class AlgorithmSpec(Generic[OptionsT]):
         return read_options(self.options, config, least=self.least, **tuned)
 
     def check_effect(self, config: EvolveConfig) -> None:
-        """Checks that the options of a new run have an effect.
+        """Checks that the settings and options of a new run have an effect.
 
         A run that an earlier version began may have others, and can be resumed.
 
         Raises:
-            ConfigError: An option has no effect, or is refused by ``read_options``.
+            ConfigError: One has no effect, or is refused by ``read_options``.
         """
         check_effect(self.read_options(config), config)
+        variation = () if self.varies else ("iso_sigma", "line_sigma")
+        why = f"for {self.name!r}, which has no iso+line variations"
+        _check_plain(config, variation, why)
+        if config.starts == 1:
+            _check_plain(config, ("statistic",), "with starts = 1")
+
+
+def _check_plain(config: EvolveConfig, names: Iterable[str], why: str) -> None:
+    """Checks that settings without an effect have their defaults.
+
+    Raises:
+        ConfigError: One has another value.
+    """
+    for name in names:
+        value, default = getattr(config, name), getattr(_DEFAULTS, name)
+        if value != default:
+            allowed = f"{default!r}, the default, {why}"
+            raise ConfigError(message(name, value, allowed))
