@@ -362,7 +362,7 @@ def ascii_emitter(**changes: Any) -> AsciiEmitter:
 
 def exact_emitter(**changes: Any) -> ExactAsciiEmitter:
     given: Any = {"parents": 1, "branches": 1, **changes}
-    nothing: Any = None
+    nothing: Any = jnp.zeros_like
     return ExactAsciiEmitter(policy, nothing, nothing, SETTINGS, **given)
 
 

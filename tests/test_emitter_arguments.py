@@ -10,15 +10,19 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import pytest
+from point_runs import PointEnv
 from qdax.core.emitters.emitter import Emitter
 
 from newton_qd.qd import policy_of
 from newton_qd.qd.emitters import (
+    ActorCritic,
     ActorCriticEmitter,
+    ActorCriticSettings,
     AscentEmitter,
     AsciiEmitter,
     CMAMEGAEmitter,
     ConditionedActorEmitter,
+    EpisodeLearning,
     ExactAsciiEmitter,
     GradientLineEmitter,
     GradientsError,
@@ -72,15 +76,83 @@ def nothing(*given: Any) -> Any:
     raise NotImplementedError
 
 
-def actors(measures: int = 2) -> Emitter:
-    return ActorCriticEmitter(
-        NOTHING, NOTHING, actors=2, branches=1, updates=1, measures=measures
-    )
+def learning(**changes: Any) -> ActorCritic:
+    given = {"env": PointEnv(), "policy": nothing, "measure": nothing}
+    given |= {"episode_length": 5, "settings": ActorCriticSettings()}
+    return ActorCritic(**{**given, **changes})
 
 
-def conditioned() -> Emitter:
-    more: Any = {"copies": 1, "between": 1, "updates": 1}
-    return ConditionedActorEmitter(NOTHING, NOTHING, NOTHING, NOTHING, **more)
+def actors(**changes: Any) -> Emitter:
+    given: Any = {"method": learning(), "first": NOTHING, "actors": 2, "branches": 1}
+    given |= {"updates": 1, "measures": 2}
+    return ActorCriticEmitter(**{**given, **changes})
+
+
+def conditioned(**changes: Any) -> Emitter:
+    env: Any = Sizes()
+    policy = ConditionedPolicy(make_policy(env, (2,)), 2)
+    given: Any = {"method": learning(), "env": NOTHING, "policy": policy}
+    given |= {"first": NOTHING, "copies": 1, "between": 1, "updates": 1}
+    return ConditionedActorEmitter(**{**given, **changes})
+
+
+def ascii_exact(**changes: Any) -> Emitter:
+    given: Any = {"policy": nothing, "rollout": nothing, "gradient": nothing}
+    given |= {"settings": Interpolation(), "parents": 2, "branches": 1}
+    return ExactAsciiEmitter(**{**given, **changes})
+
+
+def episodes(**changes: Any) -> EpisodeLearning:
+    given = {"method": learning(), "env": PointEnv(), "after": 1, "updates": 1}
+    return EpisodeLearning(**{**given, "weight_noise": 0.1, **changes})
+
+
+@pytest.mark.parametrize(
+    ("make", "name", "value", "allowed"),
+    [
+        (actors, "method", PointEnv(), "an ActorCritic"),
+        (actors, "later", 3, "None, or an EpisodeLearning"),
+        (actors, "fitness", "0.1", "finite numbers"),
+        (actors, "spread", 0.1, "two numbers, 0 < smallest <= largest"),
+        (conditioned, "method", None, "an ActorCritic"),
+        (conditioned, "policy", nothing, "a ConditionedPolicy"),
+        (conditioned, "spread", (0.1,), "two numbers, 0 < smallest <= largest"),
+        (conditioned, "conditioned", "no", "True, False"),
+        (ascii_exact, "policy", None, "a function of weights and an observation"),
+        (ascii_exact, "rollout", 3, "a function of genotypes and a key"),
+        (ascii_exact, "gradient", None, "a function, such as Episode.gradient"),
+        (ascii_exact, "settings", {}, "an Interpolation"),
+        (ascii_exact, "rates", None, "two numbers, 0 < smallest <= largest"),
+        (learning, "env", "ant_uni", "an environment, as create"),
+        (learning, "policy", 3, "a function of weights and an observation"),
+        (learning, "measure", None, "a function of the states before and after"),
+        (learning, "settings", {}, "an ActorCriticSettings"),
+        (learning, "whitening", None, "a Whitening"),
+        (episodes, "method", nothing, "an ActorCritic"),
+        (episodes, "env", None, "an environment, as create"),
+        (episodes, "averaged", "no", "True, False"),
+    ],
+)
+def test_arguments_of_a_wrong_type_are_named(
+    make: Callable[..., Any], name: str, value: Any, allowed: str
+) -> None:
+    """Where the emitter is built, not deep in a trace of it."""
+    with pytest.raises(TypeError, match=f"^{name}: got .*; allowed: {allowed}"):
+        make(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("spread", "text"),
+    [
+        ((0.2, 0.1), r"spread: got \(0.2, 0.1\); allowed: two numbers, 0 < s"),
+        ((0.0, 0.1), r"spread\[0\]: got 0.0; allowed: finite numbers above 0"),
+        ((0.1, float("inf")), r"spread\[1\]: got inf; allowed: finite numbers above 0"),
+    ],
+)
+def test_a_range_is_one_of_finite_sizes(spread: tuple[float, float], text: str) -> None:
+    for make in (actors, conditioned):
+        with pytest.raises(ValueError, match=f"^{text}"):
+            make(spread=spread)
 
 
 STEPS: Any = {"shortest": 0.1, "longest": 0.2}
@@ -91,9 +163,7 @@ SHARED: dict[str, Callable[[], Emitter]] = {
     "ascii": lambda: AsciiEmitter(
         nothing, Interpolation(), batch_size=2, episode_length=5
     ),
-    "ascii_exact": lambda: ExactAsciiEmitter(
-        nothing, nothing, nothing, Interpolation(), parents=2, branches=1
-    ),
+    "ascii_exact": ascii_exact,
     "line": lambda: GradientLineEmitter(nothing, parents=2, branches=1, **STEPS),
 }
 
@@ -117,9 +187,9 @@ def test_parameters_of_a_network_are_no_genotypes(name: str) -> None:
 def test_measures_are_as_many_as_the_descriptor_has() -> None:
     told: Any = jnp.zeros((4, 3)), jnp.zeros(4), jnp.zeros((4, 2)), {}
     with pytest.raises(ValueError, match="measures: got 3; allowed: 2, the length of"):
-        actors(3).init(jax.random.key(0), NOTHING, *told)
+        actors(measures=3).init(jax.random.key(0), NOTHING, *told)
     with pytest.raises(ValueError, match="measures: got 0; allowed: "):
-        actors(0)
+        actors(measures=0)
 
 
 def test_a_target_needs_a_first_layer_that_is_known() -> None:

@@ -14,7 +14,7 @@ from qdax.core.containers.mapelites_repertoire import (
     compute_euclidean_centroids,
 )
 
-from newton_qd.qd.emitters import ActorCriticEmitter
+from newton_qd.qd.emitters import ActorCritic, ActorCriticEmitter, ActorCriticSettings
 from newton_qd.qd.emitters.whitening import Whitening
 from newton_qd.qd.scoring.networks import policy_of
 from newton_qd.qd.scoring.rollout import make_policy
@@ -72,9 +72,10 @@ def test_elites_are_whitened_before_actors_learn_from_them() -> None:
     """The conversion is linear, so what lies between whitened weights does so plain."""
     white = Whitening(np.arange(6).reshape(3, 2), np.array([6, 7]))
     scale = jnp.array([1.0, -2.0, 3.0]), jnp.array([0.5, 2.0, 4.0])
-    nothing: Any = SimpleNamespace(whitening=white)
+    nothing: Any = None
+    settings, sums = ActorCriticSettings(), lambda *_: jnp.zeros(2)
     made: Any = ActorCriticEmitter(
-        nothing,
+        ActorCritic(PointEnv(), sums, sums, 5, settings, white),
         nothing,
         actors=2,
         branches=1,

@@ -17,6 +17,7 @@ from newton_qd.checks import message
 from newton_qd.envs.state import select
 from newton_qd.physics.explicit_mesh import varying_alike
 from newton_qd.qd.emitters.actor_critic_learner import ActorCritic, Learner
+from newton_qd.qd.emitters.argument_checks import check_range
 from newton_qd.qd.emitters.cells import draw_elites, empty_targets
 from newton_qd.qd.emitters.episode_learner import EpisodeLearning
 from newton_qd.qd.emitters.restarts import LONGEST_LIFE, due_for_restart
@@ -119,18 +120,23 @@ class ActorCriticEmitter(Emitter):
                 their elite to an empty cell [-]; the others have random directions.
 
         Raises:
+            TypeError: ``method`` is no ``ActorCritic``, ``later`` no
+                ``EpisodeLearning``, or another value has the wrong type.
             ValueError: A number is out of its range.
         """
+        checks.instance("method", method, ActorCritic, "an ActorCritic")
+        allowed = "an EpisodeLearning"
+        checks.instance("later", later, EpisodeLearning, allowed, optional=True)
         counts = {"actors": actors, "branches": branches, "copies": copies}
         counts = {**counts, "updates": updates}
         for name, value in counts.items():
             checks.integer(name, value, most=None)
         checks.integer("lifetime", lifetime, most=LONGEST_LIFE)
         checks.integer("measures", measures)
-        if not 0 < spread[0] <= spread[1]:
-            raise ValueError(message("spread", spread, "0 < smallest <= largest"))
+        check_range("spread", spread)
         for name, share in {"steered": steered, "to_empty": to_empty}.items():
             checks.number(name, share, least=0, most=1)
+        checks.number("fitness", fitness)
         self._method = method
         self._first = first
         self._actors = actors

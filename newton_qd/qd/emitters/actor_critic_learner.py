@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from newton_qd import checks
 from newton_qd.envs.state import select
 from newton_qd.gradients.flow import passed_back
 from newton_qd.physics.explicit_mesh import varying_alike
@@ -86,6 +87,10 @@ class ActorCritic:
         settings: Settings of the learning.
         whitening: Converts the weights of an actor, which are for whitened
             observations, to those of ``policy``; the default changes nothing.
+
+    Raises:
+        TypeError: A function cannot be called, or another value has the wrong type.
+        ValueError: ``episode_length`` is not an integer from 1.
     """
 
     env: Environment
@@ -94,6 +99,23 @@ class ActorCritic:
     episode_length: int
     settings: ActorCriticSettings
     whitening: Whitening = dataclasses.field(default_factory=Whitening)
+
+    def __post_init__(self) -> None:
+        """Checks the arguments.
+
+        Raises:
+            TypeError: One has the wrong type.
+            ValueError: ``episode_length`` is not an integer from 1.
+        """
+        checks.environment(self.env)
+        allowed = "a function of weights and an observation"
+        checks.function("policy", self.policy, allowed)
+        allowed = "a function of the states before and after a control step"
+        checks.function("measure", self.measure, allowed)
+        checks.integer("episode_length", self.episode_length)
+        allowed = "an ActorCriticSettings"
+        checks.instance("settings", self.settings, ActorCriticSettings, allowed)
+        checks.instance("whitening", self.whitening, Whitening, "a Whitening")
 
     @property
     def steps(self) -> int:

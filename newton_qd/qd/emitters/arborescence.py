@@ -30,8 +30,8 @@ from newton_qd.checks import Fact, listed, message
 from newton_qd.envs.state import select
 from newton_qd.physics.explicit_mesh import varying_alike
 from newton_qd.qd.emitters.arborescence_state import ArborescenceState
+from newton_qd.qd.emitters.argument_checks import check_optimizer
 from newton_qd.qd.emitters.cma_es import CMAES, CMAESState
-from newton_qd.qd.emitters.optimizer_check import check_optimizer
 from newton_qd.qd.emitters.ranking import best_of
 from newton_qd.qd.emitters.restarts import RestartRule
 from newton_qd.qd.scoring.gradient_scores import (

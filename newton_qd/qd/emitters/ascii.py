@@ -13,6 +13,7 @@ from qdax.core.emitters.emitter import Emitter
 from newton_qd import checks
 from newton_qd.checks import message
 from newton_qd.gradients.exact import EpisodeGradient
+from newton_qd.qd.emitters.argument_checks import check_range
 from newton_qd.qd.emitters.behaviors import (
     Behavior,
     FlatPolicy,
@@ -77,8 +78,11 @@ class AsciiEmitter(Emitter):
             discount: Discount of a control step [-].
 
         Raises:
+            TypeError: ``policy`` is no function, ``settings`` no ``Interpolation``, or
+                another value has the wrong type.
             ValueError: A number is out of its range.
         """
+        _check_operator(policy, settings)
         checks.integer("batch_size", batch_size, most=None)
         checks.integer("episode_length", episode_length, most=None)
         checks.number("rate", rate, above=0)
@@ -255,14 +259,19 @@ class ExactAsciiEmitter(Emitter):
                 replacement; ``None``: all.
 
         Raises:
+            TypeError: A function cannot be called, ``settings`` is no
+                ``Interpolation``, or another value has the wrong type.
             ValueError: A number is out of its range.
         """
+        _check_operator(policy, settings)
+        checks.function("rollout", rollout, "a function of genotypes and a key")
+        allowed = "a function, such as Episode.gradient"
+        checks.function("gradient", gradient, allowed)
         for name, value in (("parents", parents), ("branches", branches)):
             checks.integer(name, value, most=None)
         checks.integer("samples", samples, most=None, optional=True)
         checks.number("reach", reach, above=0)
-        if not 0 < rates[0] <= rates[1]:
-            raise ValueError(message("rates", rates, "0 < smallest <= largest"))
+        check_range("rates", rates)
         self._policy = policy
         self._rollout = rollout
         self._gradient = gradient
@@ -343,3 +352,13 @@ def improved(own: Behavior, slopes: jax.Array, reach: float) -> jax.Array:
     typical = jnp.where(typical > 0, typical, 1)
     unit = slopes / jnp.maximum(lengths, typical)[..., None]
     return jnp.clip(own.actions + reach * unit, -1, 1)
+
+
+def _check_operator(policy: FlatPolicy, settings: Interpolation) -> None:
+    """Checks what the operator needs.
+
+    Raises:
+        TypeError: ``policy`` is no function, or ``settings`` no ``Interpolation``.
+    """
+    checks.function("policy", policy, "a function of weights and an observation")
+    checks.instance("settings", settings, Interpolation, "an Interpolation")

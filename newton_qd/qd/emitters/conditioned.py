@@ -14,6 +14,7 @@ from newton_qd.checks import message
 from newton_qd.physics.explicit_mesh import varying_alike
 from newton_qd.qd.emitters.actor_critic_learner import ActorCritic, Learner
 from newton_qd.qd.emitters.aims import AimedEnv, AimedState, ConditionedPolicy
+from newton_qd.qd.emitters.argument_checks import check_range
 from newton_qd.qd.emitters.cells import draw_cells, draw_elites
 from newton_qd.qd.scoring.gradient_scores import genotype_matrix
 from newton_qd.types import (
@@ -109,19 +110,23 @@ class ConditionedActorEmitter(Emitter):
                 return alone, and all copies are equal.
 
         Raises:
+            TypeError: ``method`` is no ``ActorCritic``, ``policy`` no
+                ``ConditionedPolicy``, or another value has the wrong type.
             ValueError: A number is out of its range.
         """
+        checks.instance("method", method, ActorCritic, "an ActorCritic")
+        checks.instance("policy", policy, ConditionedPolicy, "a ConditionedPolicy")
         for name, value in (("copies", copies), ("between", between)):
             checks.integer(name, value, least=0, most=None)
         if copies + between < 1:
             allowed = "at least 1 as their sum"
             raise ValueError(message("copies, between", (copies, between), allowed))
         checks.integer("updates", updates, most=None)
-        if not 0 < spread[0] <= spread[1]:
-            raise ValueError(message("spread", spread, "0 < smallest <= largest"))
+        check_range("spread", spread)
         checks.number("empty", empty, least=0, most=1)
         checks.number("tolerance", tolerance, above=0)
         checks.number("dual_rate", dual_rate, least=0)
+        checks.flag("conditioned", conditioned)
         self._method = method
         self._env = env
         self._policy = policy

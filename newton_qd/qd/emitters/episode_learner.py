@@ -47,7 +47,7 @@ class EpisodeLearning:
         averaged: Whether the descriptor is a mean over the steps of an episode.
 
     Raises:
-        TypeError: A number has a wrong type.
+        TypeError: A value has a wrong type.
         ValueError: A number is out of its range.
     """
 
@@ -59,15 +59,18 @@ class EpisodeLearning:
     averaged: bool = False
 
     def __post_init__(self) -> None:
-        """Checks the numbers.
+        """Checks the arguments.
 
         Raises:
-            TypeError: A number has a wrong type.
+            TypeError: A value has a wrong type.
             ValueError: A number is out of its range.
         """
+        checks.instance("method", self.method, ActorCritic, "an ActorCritic")
+        checks.environment(self.env)
         checks.integer("after", self.after, least=0)
         checks.integer("updates", self.updates, most=None)
         checks.number("weight_noise", self.weight_noise, least=0)
+        checks.flag("averaged", self.averaged)
 
     def update(
         self, learner: Learner, scale: tuple[jax.Array, jax.Array], key: jax.Array

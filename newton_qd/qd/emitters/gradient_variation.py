@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike
 from qdax.core.emitters.repertoire_selectors.selector import Selector
 
 from newton_qd.checks import Fact, message
+from newton_qd.qd.emitters.argument_checks import check_optimizer
 from newton_qd.qd.emitters.elite_gradients import EliteGradientEmitter, check_steps
-from newton_qd.qd.emitters.optimizer_check import check_optimizer
 from newton_qd.qd.scoring.gradient_scores import normalize, read_scores
 from newton_qd.types import (
     ExtraScores,
