@@ -172,6 +172,8 @@ def test_wrong_actions_are_refused() -> None:
     for actions in (jnp.zeros(3), jnp.zeros((4, 2)), jnp.zeros((2, 4, 3))):
         with pytest.raises(ValueError, match="actions: got an array of shape"):
             env.rollout(state, actions)
+    with pytest.raises(TypeError, match=r"^actions: got an array of int32; .*32"):
+        env.rollout(state, jnp.zeros((2, 3), jnp.int32))
 
 
 def test_float64_needs_the_mode_of_jax() -> None:

@@ -70,7 +70,7 @@ def rollout(env: Any, state: State, actions: Action, params: Params) -> State:
     checks.x64(base.dtype)
     inputs.require_robot_state(state, base.system, ())
     actions = jax.vmap(
-        lambda action: inputs.checked_action(action, base.action_size, base.dtype)
+        lambda action: checks.array("actions", action, (base.action_size,), base.dtype)
     )(actions)
     given = (state, actions, params)
     state, actions, params = split_as([state.obs, actions], given)
