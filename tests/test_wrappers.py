@@ -347,6 +347,8 @@ def test_smooth_feet_contact_can_have_an_algebraic_tail() -> None:
     allowed = r"got 'flat'; allowed: exponential, algebraic"
     with pytest.raises(ValueError, match=f"smooth_tail: {allowed}"):
         FeetContactWrapper(Ant(), "ant", smooth_width=0.1, smooth_tail="flat")
+    with pytest.raises(ValueError, match=r"smooth_tail: got 'algebraic'; .* above 0"):
+        FeetContactWrapper(Ant(), "ant", smooth_tail="algebraic")
     with pytest.raises(ValueError, match=f"feet_tail: {allowed}"):
         Ant().with_feet_width(0.1, "flat")
 

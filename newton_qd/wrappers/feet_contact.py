@@ -57,7 +57,8 @@ class FeetContactWrapper(DescriptorWrapper):
             TypeError: The width is not a number, or ``straight_through`` is not
                 ``True`` or ``False``.
             ValueError: The width is not finite or not above 0, or is missing for a
-                straight-through gradient; or the tail is not allowed.
+                straight-through gradient or an algebraic tail; or the tail is not
+                allowed.
         """
         robot = env.unwrapped
         if not isinstance(robot, PhysicsEnv) or not len(robot.system.feet):
@@ -74,6 +75,9 @@ class FeetContactWrapper(DescriptorWrapper):
                 "is smooth"
             )
             raise ValueError(message("smooth_width", None, allowed))
+        if smooth_tail != "exponential" and smooth_width is None:
+            allowed = "'exponential', or a smooth_width above 0 too"
+            raise ValueError(message("smooth_tail", smooth_tail, allowed))
         if smooth_width is not None:
             env = env.with_base(
                 lambda base: _with_smooth_feet(base, smooth_width, smooth_tail)
