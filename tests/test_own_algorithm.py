@@ -147,6 +147,10 @@ def test_an_emitter_that_proposes_otherwise_is_refused(
     [
         ({"make": None}, "spec.make: got None; allowed: a function"),
         ({"scoring": 3}, "spec.scoring: got 3; allowed: None, or a function"),
+        ({"evaluations": 32}, "spec.evaluations: got 32; allowed: a function of set"),
+        ({"gradients": 32}, "spec.gradients: got 32; allowed: None, or a function"),
+        ({"from_one_start": 1}, "spec.from_one_start: got 1; allowed: None, or a f"),
+        ({"initial_scale": 0.1}, "spec.initial_scale: got 0.1; allowed: a function"),
         ({"options": dict}, "spec.options: got <class 'dict'>; allowed: a dataclass"),
         ({"options": {"a": 1}}, "spec.options: got {'a': 1}; allowed: a dataclass"),
     ],

@@ -88,6 +88,13 @@ def register_algorithm(spec: AlgorithmSpec[Any], *, replace: bool = False) -> No
     checks.function("spec.make", spec.make, allowed)
     allowed = "a function that makes a scoring function"
     checks.function("spec.scoring", spec.scoring, allowed, optional=True)
+    allowed = "a function of settings and options that counts episodes"
+    for name in ("evaluations", "gradients", "from_one_start"):
+        optional = name != "evaluations"
+        count = getattr(spec, name)
+        checks.function(f"spec.{name}", count, allowed, optional=optional)
+    allowed = "a function of options that returns a factor"
+    checks.function("spec.initial_scale", spec.initial_scale, allowed)
     check_fields(spec.options)
     checks.flag("replace", replace)
     library = [known.name for known in ALGORITHMS]
