@@ -324,6 +324,12 @@ def test_resuming_with_a_changed_setting_names_it(reference: Path, name: str) ->
     assert snapshot(reference) == before
 
 
+def test_a_run_to_resume_is_in_a_folder() -> None:
+    """Before, a run without one began anew, and saved nothing."""
+    with pytest.raises(ConfigError, match=r"^resume: got True; .*results folder"):
+        run(SMALL, resume=True)
+
+
 def test_every_setting_has_a_changed_value() -> None:
     names = {field.name for field in dataclasses.fields(EvolveConfig)}
     assert names - set(CHANGES) == {"env_name", "centroids", "options"}

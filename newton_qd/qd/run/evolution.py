@@ -181,16 +181,15 @@ def _folder(
     """Checks folder and packages before the slow part of a run.
 
     Raises:
-        ConfigError: The folder is in use, its run is of another environment, or
-            TensorBoard's files have no folder.
+        ConfigError: The folder is in use, its run is of another environment, or there
+            is none for TensorBoard's files or a run to resume.
         MissingExtra: QDax, matplotlib or tensorboardX is not installed.
     """
     require_extra("qdax", "qd")
     if out is None:
-        if tensorboard:
-            raise ConfigError(
-                message("tensorboard", True, "with a results folder (out)")
-            )
+        for name, given in (("tensorboard", tensorboard), ("resume", resume)):
+            if given:
+                raise ConfigError(message(name, True, "with a results folder (out)"))
         return None
     folder = RunFolder(out)
     folder.check(resume=resume)
