@@ -160,3 +160,5 @@ def test_a_task_factory_makes_a_task() -> None:
         ConfigError, match=r"task_factory: got .* returned None; allowed"
     ):
         evolve(CONFIG, progress=False, task_factory=nothing)
+    with pytest.raises(ConfigError, match="task_factory: got None; allowed: a functi"):
+        evolve(CONFIG, progress=False, task_factory=nothing(CONFIG))

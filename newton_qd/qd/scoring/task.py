@@ -185,10 +185,12 @@ def made_task(
     """Returns the task that a function makes for a configuration.
 
     Raises:
-        ConfigError: It makes something else.
+        ConfigError: It makes something else, or cannot be called.
     """
-    task = task_factory(config)
     allowed = "a function of the settings that returns a Task"
+    if not callable(task_factory):
+        raise ConfigError(message("task_factory", task_factory, allowed))
+    task = task_factory(config)
     if not isinstance(task, Task):
         given = Fact(f"one that returned {shown(task)}")
         raise ConfigError(message("task_factory", given, allowed))
