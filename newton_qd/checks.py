@@ -288,9 +288,9 @@ def environment(value: object, *, needs: str = "step") -> None:
     """Checks that ``env`` is an environment: it must have the attribute ``needs``.
 
     Raises:
-        TypeError: It has no such attribute.
+        TypeError: It has no such attribute, or is a class.
     """
-    if not hasattr(value, needs):
+    if isinstance(value, type) or not hasattr(value, needs):
         raise TypeError(message("env", value, "an environment, as create() makes it"))
 
 

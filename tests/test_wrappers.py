@@ -14,7 +14,7 @@ import pytest
 from line_env import KEY, Line, column, play
 
 import newton_qd
-from newton_qd import memory
+from newton_qd import brax_views, memory, wrappers
 from newton_qd.envs.ant import Ant
 from newton_qd.envs.state import State
 from newton_qd.types import Params
@@ -300,6 +300,27 @@ def test_with_base_keeps_the_wrappers() -> None:
         VectorWrapper,
     ]
     assert changed.unwrapped is env.unwrapped and env.env.env is env.unwrapped
+
+
+@pytest.mark.parametrize("env", [None, "ant", Ant])
+@pytest.mark.parametrize(
+    "wrap",
+    [
+        wrappers.QDWrapper,
+        wrappers.FixedInitialStateWrapper,
+        brax_views.FixedInitialStateWrapper,
+        lambda env: wrappers.FeetContactWrapper(env, "ant"),
+        lambda env: wrappers.MazeWrapper(env, "ant"),
+        lambda env: wrappers.NoForwardRewardWrapper(env, "ant"),
+        lambda env: wrappers.RandomParamsWrapper(env, friction=(0.5, 1)),
+        lambda env: wrappers.TrapWrapper(env, "ant"),
+        lambda env: wrappers.XYPositionWrapper(env, "ant"),
+    ],
+)
+def test_a_wrapper_is_around_an_environment(wrap: Any, env: Any) -> None:
+    """Not around its name or its class; before, a missing attribute was the error."""
+    with pytest.raises(TypeError, match=r"^env: got .*; allowed: an environment, as"):
+        wrap(env)
 
 
 def test_feet_contact_is_a_state_descriptor() -> None:

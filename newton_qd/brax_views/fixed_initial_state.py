@@ -40,10 +40,11 @@ class FixedInitialStateWrapper(fixed_initial_state.FixedInitialStateWrapper):
                 ``None``: the observation of the environment.
 
         Raises:
-            TypeError: ``get_obs_fn`` is not a function.
+            TypeError: ``env`` is not an environment, or ``get_obs_fn`` no function.
             NotImplementedError: The environment has no ``fixed_state``. Or
                 ``get_obs_fn`` is given and the environment has no bodies.
         """
+        checks.environment(env, needs="unwrapped")
         base = env.unwrapped
         allowed = "a function of (qp, info, action)"
         checks.function("get_obs_fn", get_obs_fn, allowed, optional=True)

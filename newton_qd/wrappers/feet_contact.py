@@ -54,12 +54,13 @@ class FeetContactWrapper(DescriptorWrapper):
 
         Raises:
             NotImplementedError: The environment is not a simulated robot with feet.
-            TypeError: The width is not a number, or ``straight_through`` is not
-                ``True`` or ``False``.
+            TypeError: ``env`` is not an environment, the width is not a number, or
+                ``straight_through`` is not ``True`` or ``False``.
             ValueError: The width is not finite or not above 0, or is missing for a
                 straight-through gradient or an algebraic tail; or the tail is not
                 allowed.
         """
+        checks.environment(env, needs="unwrapped")
         robot = env.unwrapped
         if not isinstance(robot, PhysicsEnv) or not len(robot.system.feet):
             allowed = "simulated robots with feet"

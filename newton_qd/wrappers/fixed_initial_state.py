@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from newton_qd import checks
 from newton_qd.checks import message
 from newton_qd.envs.base import Env
 from newton_qd.envs.state import State
@@ -30,9 +31,10 @@ class FixedInitialStateWrapper(Wrapper):
                 ``newton_qd.brax_views`` takes a function.
 
         Raises:
-            TypeError: A ``get_obs_fn`` is given.
+            TypeError: ``env`` is not an environment, or a ``get_obs_fn`` is given.
             NotImplementedError: The environment has no ``fixed_state``.
         """
+        checks.environment(env, needs="unwrapped")
         base = env.unwrapped
         if get_obs_fn is not None:
             allowed = (

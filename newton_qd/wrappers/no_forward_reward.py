@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from newton_qd import checks
 from newton_qd.checks import Fact, message
 from newton_qd.envs.base import Env, PhysicsEnv
 from newton_qd.envs.rollouts import RolloutOrder
@@ -25,8 +26,10 @@ class NoForwardRewardWrapper(Wrapper):
 
         Raises:
             NotImplementedError: The reward has no forward part.
+            TypeError: ``env`` is not an environment.
             ValueError: The environment repeats actions, or has this wrapper already.
         """
+        checks.environment(env, needs="unwrapped")
         why = "and the forward part would be subtracted twice"
         refuse_second(env, NoForwardRewardWrapper, why)
         base = env.unwrapped

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from newton_qd import checks
 from newton_qd.checks import Fact, message
 from newton_qd.envs.base import Env, PhysicsEnv
 from newton_qd.envs.rollouts import RolloutOrder
@@ -45,8 +46,10 @@ class SceneTaskWrapper(Wrapper):
 
         Raises:
             NotImplementedError: The environment is not such a robot.
+            TypeError: ``env`` is not an environment.
             ValueError: The robot has a scene already.
         """
+        checks.environment(env, needs="unwrapped")
         base = env.unwrapped
         if not isinstance(base, PhysicsEnv) or not _floats(base.system):
             raise NotImplementedError(

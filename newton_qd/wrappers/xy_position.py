@@ -57,11 +57,12 @@ class XYPositionWrapper(DescriptorWrapper):
 
         Raises:
             NotImplementedError: The environment is not a simulated robot.
-            TypeError: ``offset`` is not three numbers.
+            TypeError: ``env`` is not an environment, or ``offset`` not three numbers.
             ValueError: A limit is not two finite numbers, the lowest value is not
                 below the highest, the robot has no such link, or ``offset`` is not
                 finite, or is given without a link.
         """
+        checks.environment(env, needs="unwrapped")
         if not isinstance(env.unwrapped, PhysicsEnv):
             raise NotImplementedError(unsupported(env, env_name, "simulated robots"))
         super().__init__(env, env_name)
