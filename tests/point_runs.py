@@ -18,7 +18,8 @@ import pytest
 from newton_qd import files
 from newton_qd.extractors import get_feet_contact_proportion
 from newton_qd.qd.config import EvolveConfig
-from newton_qd.qd.run.evolution import EvolveResult, evolve
+from newton_qd.qd.run.evolution import evolve
+from newton_qd.qd.run.evolve_result import EvolveResult
 from newton_qd.qd.run.search import Search
 from newton_qd.qd.scoring.task import Task
 

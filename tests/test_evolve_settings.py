@@ -61,6 +61,13 @@ def test_a_wrong_time_between_checkpoints_is_named(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("name", ["resume", "progress", "tensorboard"])
+def test_a_wrong_flag_is_named(name: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=f"^{name}: got 'no'; allowed: True, False$"):
+        run(SMALL, out=tmp_path / "run", **{name: "no"})
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_grid_must_fit_the_descriptor(tmp_path: Path) -> None:
     out = tmp_path / "run"
     with pytest.raises(

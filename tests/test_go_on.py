@@ -29,7 +29,8 @@ from newton_qd.qd import load_run, make_policy, to_ribs
 from newton_qd.qd.config import ConfigError, read_config, same_run, settings_text
 from newton_qd.qd.run.archive import Archive, load_archive
 from newton_qd.qd.run.checkpoint import CheckpointError
-from newton_qd.qd.run.evolution import EvolveResult, evolve
+from newton_qd.qd.run.evolution import evolve
+from newton_qd.qd.run.evolve_result import EvolveResult
 from newton_qd.qd.run.folder import RunFolder
 from newton_qd.qd.run.search import Search
 from newton_qd.qd.run.warm_start import digest_of, start_genotypes

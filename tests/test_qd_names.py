@@ -9,7 +9,7 @@ import pytest
 
 from newton_qd.qd.config import EvolveConfig
 from newton_qd.qd.run.archive import Archive
-from newton_qd.qd.run.evolution import EvolveResult
+from newton_qd.qd.run.evolve_result import EvolveResult
 from newton_qd.qd.run.reevaluation import Reevaluated
 
 QD = "newton_qd.qd"

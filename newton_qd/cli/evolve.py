@@ -21,7 +21,7 @@ from newton_qd.qd.run.folder import RunFolder
 from newton_qd.qd.run.interrupt import INTERRUPTED, graceful_stop
 
 if TYPE_CHECKING:
-    from newton_qd.qd.run.evolution import EvolveResult
+    from newton_qd.qd.run.evolve_result import EvolveResult
     from newton_qd.qd.scoring.task import Task
 
 

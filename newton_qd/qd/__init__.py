@@ -40,7 +40,8 @@ if TYPE_CHECKING:
     from newton_qd.qd.run.archive import Archive, ArchiveError, load_archive
     from newton_qd.qd.run.checkpoint import CheckpointError
     from newton_qd.qd.run.evaluation import Evaluation
-    from newton_qd.qd.run.evolution import EvolveResult, evolve
+    from newton_qd.qd.run.evolution import evolve
+    from newton_qd.qd.run.evolve_result import EvolveResult
     from newton_qd.qd.run.opened import Elite, Run, load_run
     from newton_qd.qd.run.plot import plot_archive
     from newton_qd.qd.run.reevaluation import Reevaluated, reevaluate
@@ -111,7 +112,7 @@ _HOME = {
     "EmitterContext": ".algorithms",
     "Evaluation": ".run.evaluation",
     "EvolveConfig": ".config",
-    "EvolveResult": ".run.evolution",
+    "EvolveResult": ".run.evolve_result",
     "Options": ".algorithms.options",
     "Policy": ".scoring.rollout",
     "Reevaluated": ".run.reevaluation",

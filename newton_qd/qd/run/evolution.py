@@ -5,10 +5,8 @@ from __future__ import annotations
 import dataclasses
 import os
 import time
-import warnings
 from collections.abc import Callable
 from contextlib import ExitStack
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -22,14 +20,14 @@ from newton_qd.physics import interrupts
 from newton_qd.qd.algorithms import algorithm_named
 from newton_qd.qd.config import ConfigError, EvolveConfig
 from newton_qd.qd.facts import environment_facts
-from newton_qd.qd.run.archive import Archive, archive_of
+from newton_qd.qd.run.archive import archive_of
 from newton_qd.qd.run.checkpoint import Checkpoint
+from newton_qd.qd.run.evolve_result import EvolveResult
 from newton_qd.qd.run.folder import COLUMNS, EVENTS, RunFolder
 from newton_qd.qd.run.interrupt import StopFlag, graceful_stop
 from newton_qd.qd.run.loop import Saver, run_generations
 from newton_qd.qd.run.plot import archive_png
-from newton_qd.qd.run.progress import Progress, results_text
-from newton_qd.qd.run.reevaluation import Reevaluated
+from newton_qd.qd.run.progress import Progress
 from newton_qd.qd.run.search import Search, SearchState
 from newton_qd.qd.run.sizes import check_memory
 from newton_qd.qd.run.tensorboard import EventLog
@@ -37,47 +35,6 @@ from newton_qd.qd.run.warm_start import StartFrom, digest_of, start_genotypes
 from newton_qd.qd.scoring.networks import policy_for
 from newton_qd.qd.scoring.sharding import device_mesh, device_named
 from newton_qd.qd.scoring.task import Task, made_task, make_task, randomized
-
-
-@dataclasses.dataclass(frozen=True)
-class EvolveResult:
-    """The result of an evolution.
-
-    Attributes:
-        config: Settings with a grid or a number of centroids.
-        archive: The elites, one row per cell.
-        metrics: Name of each column of ``metrics.csv`` to its values
-            (iteration + 1,).
-        iteration: Generations that are finished; -1 if a signal came before the
-            initial population.
-        interrupted: Whether a signal ended the run before its last generation or
-            during the re-evaluation.
-        out: Results folder, if there is one.
-        seconds: Duration of this call [s].
-        reevaluated: Metrics of a finished run, from re-evaluated elites.
-    """
-
-    config: EvolveConfig
-    archive: Archive
-    metrics: dict[str, np.ndarray]
-    iteration: int
-    interrupted: bool
-    out: Path | None
-    seconds: float
-    reevaluated: Reevaluated | None = None
-
-    def __repr__(self) -> str:
-        return f"<EvolveResult: {results_text(self.config, self.metrics)}>"
-
-    @property
-    def corrected(self) -> Reevaluated | None:
-        """Old name of ``reevaluated``."""
-        warnings.warn(
-            "EvolveResult.corrected is now EvolveResult.reevaluated",
-            DeprecationWarning,
-            stacklevel=2,
-        )
-        return self.reevaluated
 
 
 def evolve(
@@ -138,6 +95,12 @@ def evolve(
     checks.number(
         "checkpoint_seconds", seconds, least=0, endless=True, error=ConfigError
     )
+    for name, value in (
+        ("resume", resume),
+        ("progress", progress),
+        ("tensorboard", tensorboard),
+    ):
+        checks.flag(name, value, error=ConfigError)
     algorithm_named(config.algorithm).read_options(config)
     mesh = _mesh(devices, resume)
     chosen = _device(device, devices)
