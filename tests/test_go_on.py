@@ -89,6 +89,7 @@ def test_a_run_goes_on_in_its_environment(
     assert snapshot(out) == before
 
 
+@pytest.mark.usefixtures("sigint")
 def test_a_stopped_run_may_end_earlier(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
