@@ -56,8 +56,8 @@ MUTATIONS = {
     # an adjoint has the wrong sign
     "adjoint": Mutation(
         "physics/kernels/cpp/operators.py",
-        '"Real x = adj_RET / B; adj_A += x; adj_B -= x * RET;"',
-        '"Real x = adj_RET / B; adj_A += x; adj_B += x * RET;"',
+        "adj_A += x; adj_B -= x * A * y;",
+        "adj_A += x; adj_B += x * A * y;",
         "test_algebra.py",
     ),
     # the cost of control is a reward
@@ -77,8 +77,8 @@ MUTATIONS = {
     # steps after the end count
     "descriptor": Mutation(
         "extractors.py",
-        "return folded_sum(data.state_desc * valid, 1)",
-        "return folded_sum(data.state_desc, 1)",
+        "return folded_sum(values * valid, 1)",
+        "return folded_sum(values, 1)",
         "test_extractors.py",
     ),
     # a world at fault goes on
@@ -90,10 +90,10 @@ MUTATIONS = {
     ),
     # of the individuals of a cell only the first counts
     "ties": Mutation(
-        "qd/run/generation.py",
+        "qd/emitters/cells.py",
         "fitnesses[order][1:] == fitnesses[order][:-1]",
         "fitnesses[order][1:] >= fitnesses[order][:-1]",
-        "test_evolve.py",
+        "test_generation.py",
     ),
     # windows of the gradient are one step longer
     "window": Mutation(

@@ -7,7 +7,6 @@ The task needs no physics, so that a run takes a fraction of a second;
 from __future__ import annotations
 
 import dataclasses
-import functools
 import json
 from pathlib import Path
 from typing import Any
@@ -17,11 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from point_runs import SMALL, PointEnv, compile_once, point_task, reference, run
-from qdax.core.containers.mapelites_repertoire import MapElitesRepertoire
 
 from newton_qd.qd.config import ConfigError
-from newton_qd.qd.emitters.cells import break_ties
-from newton_qd.qd.run import generation
 from newton_qd.qd.run.archive import load_archive
 from newton_qd.qd.run.cells import cell_centroids
 from newton_qd.qd.run.evolution import evolve
@@ -88,49 +84,6 @@ def test_metrics_see_quality(reference: Path) -> None:
     )
     assert np.all(initial == initial[0]) and np.isfinite(initial[0])
     assert np.all(np.diff(gain) >= 0) and gain[-1] > gain[0] >= 0
-
-
-class Unchanging:
-    """An emitter whose state never changes."""
-
-    def init(self, **told: Any) -> int:
-        del told
-        return 0
-
-    def state_update(self, state: int, **told: Any) -> int:
-        del told
-        return state
-
-
-def metrics_of(fitnesses: list[float], told: dict[str, Any]) -> tuple[Any, Any]:
-    """Metrics of a first generation, and of one of the same individuals after it."""
-    count = len(fitnesses)
-    genotypes = jnp.zeros((count, 2))
-    grid = jnp.linspace(0, 1, 5)[:, None]
-    empty = MapElitesRepertoire.init_default(genotype=genotypes[0], centroids=grid)
-    emitter: Any = Unchanging()
-    made = generation.Generation(
-        emitter, jax.random.key(0), takes_faulty=False, offset=0.0
-    )
-    scores: Any = jnp.float32(fitnesses), jnp.linspace(0, 1, count)[:, None], {}
-
-    @functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
-    def begin_and_tell() -> tuple[Any, Any]:
-        repertoire, state, first = made.begin(empty, genotypes, scores)
-        initial = first["initial_fitness"]
-        later = made.tell(repertoire, state, genotypes, told, scores, initial)[2]
-        return first, later
-
-    return begin_and_tell()
-
-
-def test_lost_gradients_of_every_part_of_an_emitter_are_rejected() -> None:
-    lost = {"climbers_overflowed": jnp.array([True, False, True])}
-    assert metrics_of([1.0, 2.0, 3.0], lost)[1]["rejected"] == 2
-
-
-def test_the_initial_fitness_is_the_median_of_what_is_finite() -> None:
-    assert metrics_of([1.0, 2.0, 9.0, -np.inf], {})[0]["initial_fitness"] == 2
 
 
 @pytest.mark.slow
@@ -318,14 +271,6 @@ def test_genotypes_of_another_policy_are_refused() -> None:
             ValueError, match=rf"genotypes: got shape .* allowed: \(N, {policy.size}\)"
         ):
             jax.eval_shape(score, jnp.zeros(shape), jax.random.key(0))
-
-
-def test_equal_individuals_of_a_cell_do_not_compete() -> None:
-    descriptors = jnp.array([[0.1, 0.1], [0.9, 0.9], [0.1, 0.2], [0.2, 0.1]])
-    fitnesses = jnp.array([1.0, 1.0, 1.0, 2.0])
-    centroids = jnp.array([[0.2, 0.2], [0.8, 0.8]])
-    kept = break_ties(fitnesses, descriptors, centroids)
-    np.testing.assert_array_equal(kept, [1.0, 1.0, -np.inf, 2.0])
 
 
 def test_what_cannot_be_settings_is_named() -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from fresh_python import run_python
+from mutate import MUTATIONS
 
 import newton_qd
 
@@ -275,3 +276,11 @@ def test_facade() -> None:
     }
     assert names <= set(newton_qd.__all__)
     assert all(hasattr(newton_qd, name) for name in newton_qd.__all__)
+
+
+@pytest.mark.parametrize("name", MUTATIONS)
+def test_places_that_mutate_breaks_are_there(name: str) -> None:
+    """Three of them had moved to other files, so ``mutate.py`` stopped at them."""
+    mutation = MUTATIONS[name]
+    text = (PACKAGE / mutation.file).read_text(encoding="utf-8")
+    assert text.count(mutation.before) == 1
