@@ -81,6 +81,19 @@ def test_follows_the_tutorial(n: int, population: int, x64: None) -> None:
     np.testing.assert_allclose(state.covariance, reference.C, rtol=1e-5, atol=1e-9)
 
 
+@pytest.mark.parametrize("share", [0.95, 1.05])
+def test_the_covariance_path_stops_at_the_limit(share: float, x64: None) -> None:
+    """The first path is short because it is new, which the limit takes into account."""
+    strategy, reference = CMAES(4, 13, 0.5), Reference(4, 13, 0.5)
+    limit = reference.chi * (1.4 + 2 / 5) * reference.sigma / np.sqrt(reference.mu_eff)
+    ranked = np.tile(share * limit * np.array([0.6, 0.0, 0.8, 0.0]), (13, 1))
+    state = strategy.update(strategy.init(jnp.dtype("float64")), jnp.asarray(ranked))
+    reference.tell(ranked)
+    assert reference.pc.any() == (share < 1)
+    np.testing.assert_allclose(state.path_covariance, reference.pc, rtol=1e-12)
+    np.testing.assert_allclose(state.covariance, reference.C, rtol=1e-12, atol=1e-15)
+
+
 def test_samples_have_the_covariance(x64: None) -> None:
     covariance = np.diag([1.0, 4.0, 9.0]) + 0.5
     values, basis = np.linalg.eigh(covariance)
@@ -110,6 +123,7 @@ def test_stops() -> None:
     assert not stopped(scales=[1.0, 1e-3])
     assert stopped(scales=[1.0, 1e-4])
     assert stopped(sigma=1e-12)
+    assert stopped(sigma=1e-6, scales=[1e-6, 1e-6])
     assert stopped(sigma=np.inf)
     assert stopped(sigma=np.nan)
 

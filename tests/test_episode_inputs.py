@@ -201,6 +201,20 @@ def test_a_faulty_episode_has_no_gradient() -> None:
     assert np.isfinite(found.descriptors).all()
 
 
+def test_a_descriptor_that_is_not_finite_is_a_fault() -> None:
+    """The fitness alone does not say so."""
+    episode = Episode(
+        line_env.Line(),
+        None,
+        lambda data, _: jnp.log(data.state_desc[:, -1]),
+        episode_length=2,
+    )
+    found = jax.vmap(episode, (0, None))(jnp.array([[[1.0]] * 2, [[-1.0]] * 2]), KEY)
+    assert found.faulty.tolist() == [False, True]
+    assert np.isfinite(found.fitness).tolist() == [True, False]
+    assert jnp.all(jnp.isfinite(jnp.asarray(found.reward_sum)))
+
+
 def test_a_gradient_that_one_leaf_has_lost_is_lost() -> None:
     def policy(tree: Any, obs: jax.Array) -> jax.Array:
         del obs
@@ -221,6 +235,11 @@ def test_transitions_go_on_with_another_episode() -> None:
     assert 0 < start < 0.5
     np.testing.assert_allclose(steps["obs"] - start, [0, 1, 0, 1, 0], atol=1e-6)
     np.testing.assert_allclose(steps["next_obs"] - start, [1, 2, 1, 2, 1], atol=1e-6)
+    # the state descriptor and the reward of this environment are the position
+    assert np.array_equal(steps["state_desc"], steps["obs"])
+    assert np.array_equal(steps["next_state_desc"], steps["next_obs"])
+    assert np.array_equal(steps["rewards"], steps["next_obs"])
+    assert steps["actions"].tolist() == [1] * 5
     assert steps["dones"].tolist() == [0, 1, 0, 1, 0]
     assert not steps["truncations"].any()
     assert found.fitness == pytest.approx(2 * start + 3, rel=1e-6)

@@ -45,6 +45,8 @@ def test_a_full_archive_of_the_best_policy_has_score_one() -> None:
     assert quality.normalized_qd_score(np.full(7, 4.5), -1.5, 4.5) == 1
     with pytest.raises(ValueError, match=r"best_known: got 1.0; allowed: above .* 2"):
         quality.normalized_qd_score(ONE, 2.0, 1.0)
+    with pytest.raises(ValueError, match=r"best_known: got 2.0; allowed: above .* 2"):
+        quality.normalized_qd_score(ONE, 2.0, 2.0)
 
 
 def test_an_offset_moves_the_old_score_only() -> None:

@@ -74,6 +74,25 @@ def test_sound_evaluations_count_with_their_medians() -> None:
     np.testing.assert_array_equal(found, [7, 2, EMPTY, EMPTY])
 
 
+def test_after_a_fault_the_others_count_with_their_median() -> None:
+    """Their mean descriptor is in another cell."""
+    rows = [[(EMPTY, 0.9), (1.0, 0.1), (3.0, 0.1), (2.0, 0.9)]]
+    found = corrected_fitnesses(archive(1), scoring(rows), jax.random.key(0), 4)
+    np.testing.assert_array_equal(found, [1.5, EMPTY, EMPTY, EMPTY])
+
+
+def test_each_evaluation_has_its_own_key() -> None:
+    keys = []
+
+    def score(genotypes: Any, key: jax.Array) -> Any:
+        keys.append(jax.random.key_data(key).tolist())
+        return np.ones(len(genotypes)), np.zeros((len(genotypes), 1)), {}
+
+    corrected_fitnesses(archive(1), score, jax.random.key(0), 3)
+    given = jax.random.key_data(jax.random.split(jax.random.key(0), 3))
+    assert keys == given.tolist()
+
+
 def test_the_fittest_elite_of_a_cell_counts() -> None:
     rows = [[(7.0, 0.1)], [(2.0, 0.1)]]
     found = corrected_fitnesses(archive(2), scoring(rows), jax.random.key(0), 1)
