@@ -21,7 +21,7 @@ from newton_qd.qd.config import ConfigError
 from newton_qd.qd.run.archive import load_archive
 from newton_qd.qd.run.cells import cell_centroids
 from newton_qd.qd.run.evolution import evolve
-from newton_qd.qd.run.search import SearchError
+from newton_qd.qd.run.search import Search, SearchError
 from newton_qd.qd.scoring.rollout import make_policy, make_scoring_function
 
 __all__ = ["compile_once", "reference"]  # fixtures
@@ -64,6 +64,21 @@ def test_archive_rows_are_what_the_policies_do(reference: Path) -> None:
     distance = np.abs(descriptors[:, None] - archive.centroids[None]).max(-1)
     assert np.all(distance.min(1) <= 0.125 + 1e-6)
     assert np.all(distance[np.arange(filled.sum()), np.flatnonzero(filled)] < 0.126)
+
+
+def test_each_generation_has_a_key_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    search = Search(SMALL, point_task(SMALL))
+    state, keys, ask = search.advance(search.empty()), [], search._ask
+
+    def propose(*told: Any) -> Any:
+        keys.append(str(jax.random.key_data(told[-1])))
+        return ask(*told)
+
+    monkeypatch.setattr(search, "_ask", propose)
+    for _ in range(3):
+        state = search.advance(state)
+    first = str(jax.random.key_data(search._drawn.emitter_key))
+    assert len({first, *keys}) == 4
 
 
 def test_metrics_file(reference: Path) -> None:

@@ -110,6 +110,10 @@ def test_noise_of_a_search_follows_from_the_genotype() -> None:
     np.testing.assert_array_equal(found, turned[::-1])
     # one period further, only the noise is another one
     assert np.abs(found - np.roll(found, 1, axis=0)).max(axis=(1, 2)).min() > 0.1
+    # the order of the numbers of a genotype counts too
+    mixed = jnp.array([[[0.0, 1.0, 2.0]], [[2.0, 0.0, 1.0]], [[1.0, 2.0, 0.0]]])
+    orders = np.asarray(of_search(mixed, key).gradients[:, 0])
+    assert np.abs(orders - np.roll(orders, 1, axis=0)).max(axis=(1, 2)).min() > 0.1
     by_place = episode.mixed(places, key, samples=4, sigma=0.5).gradients[:, 0]
     assert np.abs(by_place - found).max() > 0.1
 

@@ -68,6 +68,10 @@ def test_draws_are_within_their_ranges() -> None:
     # every entry by itself
     scales = np.asarray(params.mass_scale)
     assert np.abs(np.corrcoef(scales.T) - np.eye(9)).max() < 0.4
+    # and every parameter, of those with one shape
+    for names in (("gravity", "friction"), ("mass_scale", "inertia_scale")):
+        one, other = (np.asarray(getattr(params, n)).reshape(-1) for n in names)
+        assert abs(np.corrcoef(one, other)[0, 1]) < 0.4
 
 
 def test_draws_depend_on_key_and_world_alone() -> None:

@@ -267,11 +267,6 @@ def test_new_starts_in_each_generation(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = SMALL.replace(new_starts=True, iterations=4)
-    search = Search(config, point_task(config))
-    keys = [search._start(i) for i in (0, 1, 2)]
-    assert len({str(jax.random.key_data(key)) for key in keys}) == 3
-    fixed = Search(SMALL, point_task(SMALL))
-    assert fixed._start(0) is fixed._start(7)
     whole = run(config)
     with monkeypatch.context() as patch:
         interrupt_after(patch, 2)
@@ -280,11 +275,14 @@ def test_new_starts_in_each_generation(
     assert np.array_equal(whole.archive.genotypes, parts.archive.genotypes)
 
 
-def test_reevaluations_have_start_states_that_no_generation_had() -> None:
+def test_generations_and_reevaluations_have_start_states_of_their_own() -> None:
     config = SMALL.replace(new_starts=True)
     search = Search(config, point_task(config))
     keys = [search._start(i) for i in range(4)]
     assert all(key != search._key_reevaluations for key in keys)
+    assert len({str(jax.random.key_data(key)) for key in keys}) == 4
+    fixed = Search(SMALL, point_task(SMALL))
+    assert fixed._start(0) is fixed._start(7)
 
 
 @pytest.mark.parametrize("new", [False, True])

@@ -24,7 +24,7 @@ from newton_qd.qd.config import ConfigError, EvolveConfig
 from newton_qd.qd.run.archive import Archive
 from newton_qd.qd.run.cells import cell_centroids
 from newton_qd.qd.run.evolution import evolve
-from newton_qd.qd.run.same_task import require_same_task
+from newton_qd.qd.run.same_task import changed_elites, require_same_task
 
 __all__ = ["compile_once", "reference"]  # fixtures
 
@@ -125,3 +125,22 @@ def test_elites_of_other_starts_are_not_compared(
     more = config.replace(iterations=2)
     run(more, out=tmp_path, resume=True, progress=True)
     assert "other results" not in capsys.readouterr().err
+
+
+def test_another_fitness_or_another_descriptor_is_a_change() -> None:
+    """Elites that fill up a generation are not counted twice."""
+    stored = Archive(
+        genotypes=np.arange(5, dtype=np.float32)[:, None],
+        fitnesses=np.array([-np.inf, 1, 2, 3, -np.inf], np.float32),
+        descriptors=np.zeros((5, 2), np.float32),
+        centroids=np.zeros((5, 2), np.float32),
+    )
+
+    def score(genotypes: jax.Array, fitness: float, place: float) -> Any:
+        first = genotypes == 1
+        found = jnp.zeros((len(genotypes), 2)).at[:, 1:].set(place * first)
+        return genotypes[:, 0] + fitness * first[:, 0], found
+
+    for changes, count in (((0, 0), 0), ((1, 0), 1), ((0, 1), 1), ((1, 1), 1)):
+        found = changed_elites(stored, lambda rows, c=changes: score(rows, *c), 8)
+        assert found == (count, 3), changes
