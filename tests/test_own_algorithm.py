@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from newton_qd.qd import EvolveConfig, Options, algorithms, make_task
@@ -71,6 +72,10 @@ def test_a_descriptor_that_is_not_finite_enters_no_archive(task: Task) -> None:
     assert filled.any() and held.fitnesses[filled].max() < 1e3
     assert jnp.isfinite(held.descriptors[filled]).all()
     assert held.metrics[:, COLUMNS.index("rejected")].tolist() == [3, 3]
+    # of given elites, those beyond one generation were counted by their fitness alone
+    given = jax.random.normal(jax.random.key(0), (20, held.genotypes.shape[1]))
+    state = one.advance(one.empty(np.asarray(given)))
+    assert state.metrics[0, COLUMNS.index("rejected")] == 3 + 3 + 3
 
 
 @pytest.mark.parametrize(

@@ -27,6 +27,7 @@ from newton_qd.qd.run.leaves import leaf_to_host, tree_to_device
 from newton_qd.qd.run.reevaluation import Reevaluated, corrected_fitnesses, reevaluate
 from newton_qd.qd.run.same_task import changed_elites, require_same_task
 from newton_qd.qd.scoring.checked import checked_scoring, why_empty
+from newton_qd.qd.scoring.gradient_scores import finite_scores
 from newton_qd.qd.scoring.networks import policy_for
 from newton_qd.qd.scoring.robust import robust, run_scoring
 from newton_qd.qd.scoring.rollout import episode_of, make_scoring_function
@@ -170,9 +171,8 @@ class Search:
                 scores,
                 initial,
             )
-            each = self._episodes
             before = state.metrics[-1][COLUMNS.index("evaluations")]
-            evaluations = int(before) + each
+            evaluations = int(before) + self._episodes
         row = {
             "iteration": iteration,
             "evaluations": evaluations,
@@ -212,7 +212,7 @@ class Search:
             some = jnp.asarray(start[rows])
             scores = self._score(some, self._start(0))
             repertoire = self._enter(repertoire, some, scores)
-            rejected += int((~np.isfinite(scores[0])[: len(start) - begin]).sum())
+            rejected += int(jnp.sum(~finite_scores(*scores[:2])[: len(start) - begin]))
         best = start[:size]
         population = population.at[: len(best)].set(jnp.asarray(best))
         return population, repertoire, max(size, len(start)), rejected
