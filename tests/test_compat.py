@@ -332,7 +332,8 @@ def test_only_one_start_for_all_takes_a_key() -> None:
         assert bool(jnp.all(left == key)) != one_start
 
 
-def test_a_fault_after_the_end_costs_nothing() -> None:
+def test_what_comes_after_the_end_costs_nothing() -> None:
+    """Neither a fault nor a reward that is no number."""
     zero = jnp.zeros(())
     start = State(jnp.zeros((), jnp.int32), zero[None], zero, zero, {}, {})
     start = start.replace(info={"fault": jnp.zeros((), jnp.int32)})
@@ -341,7 +342,8 @@ def test_a_fault_after_the_end_costs_nothing() -> None:
         step = state.pipeline_state
         after = state.replace(pipeline_state=step + 1, info={"fault": faults[step]})
         done = (step == 2).astype(jnp.float32)
-        return after, faults, Steps(jnp.ones(()), done, state.obs)
+        reward = jnp.where(step > 2, jnp.nan, jnp.float32(1))
+        return after, faults, Steps(reward, done, state.obs)
 
     faults = jnp.array([[0, 0, 0, 1], [0, 1, 0, 0]])
     described: Any = lambda data, _: data.obs[:, 0]  # noqa: E731
