@@ -283,6 +283,7 @@ def test_generations_and_reevaluations_have_start_states_of_their_own() -> None:
     assert len({str(jax.random.key_data(key)) for key in keys}) == 4
     fixed = Search(SMALL, point_task(SMALL))
     assert fixed._start(0) is fixed._start(7)
+    assert fixed._start(0) != fixed._key_reevaluations
 
 
 @pytest.mark.parametrize("new", [False, True])
