@@ -78,6 +78,14 @@ def test_a_descriptor_that_is_not_finite_enters_no_archive(task: Task) -> None:
     assert state.metrics[0, COLUMNS.index("rejected")] == 3 + 3 + 3
 
 
+def test_weights_of_the_initial_population_are_scaled(task: Task) -> None:
+    spec = dataclasses.replace(ME, name="own", initial_scale=lambda options: 0.0)
+    algorithms.register_algorithm(spec)
+    one = Search(SETTINGS, task)
+    held = one.checkpoint(one.advance(one.empty()))
+    assert np.isfinite(held.fitnesses).any() and not held.genotypes.any()
+
+
 @pytest.mark.parametrize(
     ("change", "text"),
     [
