@@ -102,7 +102,7 @@ def test_a_gradient_that_overflowed_does_not_count(
 
 
 def test_a_climber_makes_steps_of_one_length_with_momentum() -> None:
-    emitter = climbing(lifetime=1000, momentum=0.5)
+    emitter = climbing(lifetime=1000, momentum=0.25)
     repertoire, state = begin(emitter)
     update = compiled(emitter.state_update)
     elites = np.asarray(repertoire.genotypes)[
@@ -118,12 +118,19 @@ def test_a_climber_makes_steps_of_one_length_with_momentum() -> None:
     for _ in range(2):
         slopes = np.asarray(uphill(jnp.asarray(x), jax.random.key(0))[0])
         norms = np.linalg.norm(slopes, axis=1, keepdims=True)
-        motion = 0.5 * motion + 0.5 * slopes / np.where(norms > 0, norms, 1)
+        motion = 0.25 * motion + 0.75 * slopes / np.where(norms > 0, norms, 1)
         norms = np.linalg.norm(motion, axis=1, keepdims=True)
         x = x + sizes[:, None] * motion / np.where(norms > 0, norms, 1)
         state = update(state, repertoire)
         emitted = compiled(emitter.emit)(repertoire, state, jax.random.key(0))[0]
         np.testing.assert_allclose(emitted, x, rtol=1e-4, atol=1e-5)
+
+
+def test_lengths_of_steps_are_log_uniform() -> None:
+    state = begin(climbing(climbers=400, shortest=1e-3, longest=1.0))[1]
+    tens = np.log10(state.steps)
+    assert -3 <= tens.min() < -2.9 and -0.1 < tens.max() <= 0
+    assert abs(np.median(tens) + 1.5) < 0.3
 
 
 def test_a_lost_climber_begins_again() -> None:

@@ -15,7 +15,12 @@ from qdax.core.containers.mapelites_repertoire import (
     compute_euclidean_centroids,
 )
 
-from newton_qd.qd.emitters import AsciiEmitter, ExactAsciiEmitter, Interpolation
+from newton_qd.qd.emitters import (
+    AsciiEmitter,
+    ExactAsciiEmitter,
+    Interpolation,
+    ascii,
+)
 from newton_qd.qd.emitters.ascii import improved
 from newton_qd.qd.emitters.behaviors import (
     Behavior,
@@ -210,6 +215,32 @@ def test_offspring_are_parents_varied_by_the_last_generation() -> None:
     assert len({int(best) for best in away.argmin(axis=0)}) > 1
 
 
+def test_parents_and_other_behaviors_are_drawn_apart(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Parents are elites with a known behavior."""
+    made, held, state = begun()
+    keys, draw = [], jax.random.randint
+
+    def randint(key: jax.Array, *arguments: Any) -> jax.Array:
+        keys.append(tuple(jax.random.key_data(key).tolist()))
+        return draw(key, *arguments)
+
+    def parent(policy: Any, weights: jax.Array, *others: Any) -> jax.Array:
+        del policy, others
+        return weights
+
+    monkeypatch.setattr(jax.random, "randint", randint)
+    monkeypatch.setattr(ascii, "interpolated", parent)
+    better = held.replace(fitnesses=held.fitnesses.at[0].add(1.0))
+    made._batch_size = 40
+    parents = made.emit(better, state, jax.random.key(3))[0]
+    assert len(set(keys)) == len(keys) == 2
+    places = [int(np.flatnonzero((held.genotypes == x).all(1))[0]) for x in parents]
+    known = np.asarray(state.fitnesses) > -np.inf
+    assert set(places) == set(np.flatnonzero(known)) - {0}
+
+
 def test_elites_keep_their_behavior() -> None:
     """The individual whose behavior is not finite is no parent."""
     made, held, state = begun()
@@ -300,6 +331,34 @@ def test_exact_offspring_raise_the_return(samples: int | None) -> None:
     assert (raised > 1e-3).all()
     # weights of the second action have no part in the return
     np.testing.assert_array_equal(gain[:, 1], 0)
+
+
+def test_rates_are_log_uniform(monkeypatch: pytest.MonkeyPatch) -> None:
+    def step(
+        policy: Any, weights: Any, aim: Any, counts: Any, rate: Any, *_: Any
+    ) -> Any:
+        del policy, aim, counts
+        return weights.at[0].set(rate)
+
+    def gradient(actions: jax.Array, key: jax.Array) -> Any:
+        del key
+        kept = jnp.zeros((len(actions), 1), bool)
+        return Found(jnp.ones_like(actions)[:, None], kept, kept[:, 0])
+
+    monkeypatch.setattr(ascii, "interpolated", step)
+    made = ExactAsciiEmitter(
+        policy,
+        rollout,
+        gradient,
+        SETTINGS,
+        parents=2,
+        branches=200,
+        rates=(1e-3, 1.0),
+    )
+    rates = compiled(made.emit)(begun()[1], None, jax.random.key(0))[0][:, 0]
+    tens = np.log10(rates)
+    assert -3.01 < tens.min() < -2.9 and -0.1 < tens.max() <= 0
+    assert abs(np.median(tens) + 1.5) < 0.3
 
 
 @pytest.mark.parametrize("why", ["overflowed", "faulty", "zero"])

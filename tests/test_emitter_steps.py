@@ -28,6 +28,7 @@ from qdax.core.containers.mapelites_repertoire import (
 
 from newton_qd.gradients import EpisodeGradients
 from newton_qd.qd.emitters import (
+    CMAMAEGAEmitter,
     CMAMEGAEmitter,
     GradientLineEmitter,
     GradientVariationEmitter,
@@ -63,6 +64,16 @@ def test_variation_climbs_as_gradient_ascent_does() -> None:
         gradient = 0.5 - expected
         expected += 0.1 * gradient / np.linalg.norm(gradient)
     np.testing.assert_allclose(genotypes, np.tile(expected, (4, 1)), atol=1e-5)
+
+
+def test_each_parent_draws_a_direction() -> None:
+    emitter = GradientVariationEmitter(
+        32, optax.sgd(0.1), directions=[(1, 0, 0), (0, 0, -1)]
+    )
+    steps = np.asarray(emit(emitter, *begin(emitter, 1)) - start()[:1]) / 0.1
+    rows = normalize(score(start()[:1], jax.random.key(0))[2]["gradients"][0].T)
+    near = [np.abs(steps - way).max(axis=1) < 1e-4 for way in (rows[0], -rows[2])]
+    assert np.all(near[0] ^ near[1]) and 4 < near[0].sum() < 28
 
 
 def test_steering_lands_in_empty_cells() -> None:
@@ -170,6 +181,28 @@ def test_lines_without_a_gradient_have_random_directions() -> None:
     assert told["overflowed"].tolist() == [True] * 4
 
 
+def test_lines_steer_towards_the_empty_cell() -> None:
+    """Every other cell has the same individual, so each parent is this one."""
+    emitter = GradientLineEmitter(
+        along(score), parents=4, branches=2, shortest=0.1, longest=0.2
+    )
+    parent = start()[:1]
+    _, place, _ = compiled(score)(parent, jax.random.key(0))
+    empty = jnp.arange(100)[:, None] == 7
+    repertoire = MapElitesRepertoire(
+        genotypes=jnp.tile(parent, (100, 1)),
+        fitnesses=jnp.where(empty, -jnp.inf, 0.0),
+        descriptors=jnp.tile(place, (100, 1)),
+        centroids=centroids(),
+        extra_scores={},
+        keys_extra_scores=(),
+    )
+    steered = emit(emitter, repertoire, ()).reshape(4, 2, SIZE)[2:]
+    found = compiled(score)(steered.reshape(-1, SIZE), jax.random.key(0))[1]
+    away = np.linalg.norm(found - centroids()[7], axis=1)
+    assert np.all(away < np.linalg.norm(place - centroids()[7]) - 0.01)
+
+
 def unbeatable(genotypes: jax.Array, key: jax.Array) -> tuple:
     """One cell, whose elite nobody beats."""
     _, descriptors, extra = score(genotypes, key)
@@ -225,6 +258,23 @@ def test_failed_offspring_do_not_move_the_distribution() -> None:
     # their fitness is no number, so it is above no bar
     none = jnp.zeros(4), jnp.full(4, -5.0), finite & ~finite
     assert not adapt(begun, coefficients, *none)[1]
+    # an individual at the bar does not enter
+    equal = jnp.zeros(4), jnp.zeros(4), finite | ~finite
+    assert not adapt(begun, coefficients, *equal)[1]
+
+
+def test_points_draw_offspring_of_their_own_along_unit_gradients() -> None:
+    emitter = CMAMEGAEmitter(score, sigma_g=0.5, batch_size=8, num_emitters=2)
+    state = begin(emitter)[1]
+    assert np.abs(state.coefficients[0] - state.coefficients[1]).max() > 0.1
+    np.testing.assert_allclose(np.linalg.norm(state.gradients, axis=-1), 1, rtol=1e-5)
+
+
+def test_annealed_offspring_are_ranked_by_what_they_exceed() -> None:
+    classes, values = CMAMAEGAEmitter(score, sigma_g=0.5, batch_size=5)._rank(
+        jnp.array([1.0, 2.0, -3.0]), jnp.array([0.0, 3.0, -9.0])
+    )
+    assert not classes.any() and values.tolist() == [1, -1, 6]
 
 
 def test_an_equal_fitness_is_no_improvement() -> None:
@@ -232,6 +282,11 @@ def test_an_equal_fitness_is_no_improvement() -> None:
         jnp.array([1.0, 2.0, -3.0]), jnp.array([1.0, 1.0, -jnp.inf])
     )
     assert [found.tolist() for found in ranked] == [[WORSE, IMPROVED, NEW], [0, 1, -3]]
+
+
+def test_failed_offspring_are_last() -> None:
+    classes, finite = jnp.array([WORSE, NEW, IMPROVED]), jnp.array([True, False, True])
+    assert best_of(classes, jnp.zeros(3), finite)[0].tolist() == [2, 0, 1]
 
 
 def test_offspring_that_all_failed_are_equally_good() -> None:

@@ -37,10 +37,12 @@ from newton_qd.qd.config import ConfigError
 from newton_qd.qd.emitters import ActorCriticEmitter
 from newton_qd.qd.emitters.actor_critic_learner import ActorCritic
 from newton_qd.qd.emitters.episode_learner import EpisodeLearning
+from newton_qd.qd.emitters.whitening import Whitening
 from newton_qd.qd.run.search import Search
 from newton_qd.qd.scoring.networks import policy_for
 from newton_qd.qd.scoring.rollout import episode_of
 
+KEY = jax.random.key(4)
 PLAIN = (jnp.zeros(3), jnp.ones(3))  # scale of observations
 
 
@@ -99,6 +101,37 @@ def test_each_world_has_weights_of_its_own() -> None:
 
 
 @pytest.mark.slow
+def test_weights_for_whitened_observations_have_their_own_gradient() -> None:
+    white = Whitening(np.arange(6).reshape(3, 2), np.array([6, 7]))
+
+    def biased(weights: jax.Array, obs: jax.Array) -> jax.Array:
+        return policy(weights[:6], obs) + weights[6:]
+
+    way = dataclasses.replace(
+        method(noise=0.0, worlds=1), policy=biased, whitening=white
+    )
+    later = EpisodeLearning(way, PointEnv(), after=0, updates=1, weight_noise=0.0)
+    scale = jnp.array([0.5, -1.0, 0.2]), jnp.array([0.5, 2.0, 1.0])
+    weights, aim = 0.1 * jax.random.normal(KEY, (8,)), jnp.array([1.0, 0.3, -0.2])
+    first = jax.vmap(PointEnv().reset)(KEY[None])
+
+    @compiled
+    def both() -> tuple[jax.Array, jax.Array]:
+        def worth(weights: jax.Array) -> jax.Array:
+            one = jax.tree.map(lambda x: x[0], first)
+            rest = jnp.zeros((LENGTH, 2))
+            return later._worth(white.plain(weights, scale), aim, one, rest)[0]
+
+        start = way.begin(KEY, weights, aim, first)
+        moments = later.update(start, scale, KEY)[0].moments[0]
+        mean = next(x for x in jax.tree.leaves(moments) if x.shape == (8,))
+        return mean, jax.grad(worth)(weights)
+
+    mean, slope = both()  # Adam's mean of the loss, whose length is limited
+    found, expected = (x / jnp.linalg.norm(x) for x in (-mean, slope))
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
 def test_a_fall_has_the_gradient_of_an_episode() -> None:
     """Against the gradient of the return that other algorithms use."""
     config = EvolveConfig(env_name="hopper_uni", episode_length=40, hidden=(4,))
