@@ -169,6 +169,65 @@ def test_values_inside_of_a_window_count() -> None:
         np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-3)
 
 
+def test_the_critic_learns_td_lambda_targets() -> None:
+    """The target of the first step, as the weighted mean of returns of all lengths."""
+    trace, discount, way = 0.6, SETTINGS.discount, method(noise=0.0, trace=0.6)
+    start, key = learner(way), jax.random.key(4)
+    scale = jnp.array([0.1, -0.2, 0.3]), jnp.array([0.5, 2.0, 1.0])
+    critic = jax.tree.map(lambda x: x + jax.random.normal(key, x.shape), start.critic)
+    start = dataclasses.replace(start, target=critic)
+    weights = 0.3 * jax.random.normal(key, (SIZE,))
+    world = jax.tree.map(lambda x: x[0], start.first)
+
+    def value(obs: np.ndarray) -> float:
+        (first, bias), (last, offset) = jax.device_get(critic)
+        hidden = np.tanh((obs - scale[0]) / scale[1] @ first + bias)
+        return float((hidden @ last + offset)[0]) / (1 - discount)
+
+    @compiled
+    def both() -> Any:
+        def step(state: Any, _: None) -> tuple[Any, Any]:
+            state = PointEnv().step(state, policy(weights, state.obs))
+            return state, (state.obs, state.reward)
+
+        rest = jnp.zeros((SETTINGS.window, 2))
+        found = way._window(weights, start, scale, world, world, rest)[1][2]
+        return found, jax.lax.scan(step, world, length=SETTINGS.window)[1]
+
+    targets, (seen, rewards) = jax.device_get(both())
+    total, returns = 0.0, []
+    for step, (obs, reward) in enumerate(zip(seen, rewards, strict=True)):
+        total += discount**step * reward
+        returns.append(total + discount ** (step + 1) * value(obs))
+    parts = (1 - trace) * trace ** np.arange(SETTINGS.window)
+    parts[-1] = trace ** (SETTINGS.window - 1)
+    np.testing.assert_allclose(targets[0], parts @ np.array(returns), rtol=1e-4)
+
+
+def test_an_update_follows_the_mean_gradient_and_moves_the_target_critic() -> None:
+    way, key = method(), jax.random.key(4)
+    start = dataclasses.replace(learner(way), weights=0.3 * jnp.ones(SIZE))
+    scale = jnp.zeros(3), jnp.ones(3)
+
+    @compiled
+    def both() -> Any:
+        def total(weights: jax.Array) -> jax.Array:
+            noise_key, _ = jax.random.split(key)
+            return way._windows(weights, start, scale, noise_key)[0].sum()
+
+        return way.update(start, scale, key)[0], jax.grad(total)(start.weights)
+
+    after, slope = both()
+    mean = next(x for x in jax.tree.leaves(after.moments[0]) if x.shape == (SIZE,))
+    # the optimizer limits the length to 1, after the mean over control steps
+    assert jnp.linalg.norm(slope / way.steps) < 1 < jnp.linalg.norm(slope)
+    np.testing.assert_allclose(mean, -0.3 * slope / way.steps, rtol=1e-3, atol=1e-5)
+    for new, old, fitted in zip(
+        *map(jax.tree.leaves, (after.target, start.target, after.critic)), strict=True
+    ):
+        np.testing.assert_allclose(new, 0.8 * fitted + 0.2 * old, rtol=1e-5, atol=1e-7)
+
+
 def test_the_age_of_a_world_begins_again_after_a_fall() -> None:
     right = jnp.array([1.0, 0.0])
     settings = dataclasses.replace(SETTINGS, window=10, noise=0.0)

@@ -27,7 +27,12 @@ from point_runs import (
 from newton_qd import cli, files
 from newton_qd.qd.config import read_config
 from newton_qd.qd.run.archive import Archive, ArchiveError, archive_bytes, load_archive
-from newton_qd.qd.run.checkpoint import CheckpointError, load_checkpoint
+from newton_qd.qd.run.checkpoint import (
+    Checkpoint,
+    CheckpointError,
+    load_checkpoint,
+    save_checkpoint,
+)
 from newton_qd.qd.run.folder import RunFolder
 from newton_qd.qd.run.search import Search
 
@@ -237,3 +242,15 @@ def test_metrics_that_an_earlier_version_did_not_have_are_not_known(
     assert metrics.shape == found.metrics.shape
     assert np.array_equal(metrics[:, :7], early.metrics)
     assert np.isnan(metrics[:, 7:]).all()
+
+
+def test_leaves_of_an_emitter_keep_their_order(tmp_path: Path) -> None:
+    """Also from the tenth on, whose names sort before that of the second."""
+    leaves = tuple(np.full(2, number, np.float32) for number in range(12))
+    rows = np.zeros((3, 2), np.float32)
+    stored = Checkpoint(
+        "{}", 0, rows, rows[:, 0], rows, rows, np.zeros((1, 10)), leaves
+    )
+    save_checkpoint(tmp_path / "checkpoint.bin", stored)
+    found = load_checkpoint(tmp_path / "checkpoint.bin").emitter
+    np.testing.assert_array_equal(found, leaves)

@@ -102,7 +102,12 @@ def test_a_gradient_that_overflowed_does_not_count(
 
 
 def test_a_climber_makes_steps_of_one_length_with_momentum() -> None:
-    emitter = climbing(lifetime=1000, momentum=0.25)
+    def uphill(weights: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        del key  # the directions of one climber change, so its momentum counts
+        turns = jnp.arange(weights.shape[1], dtype=weights.dtype)
+        return jnp.sin(9 * weights + turns), jnp.zeros(len(weights), bool)
+
+    emitter = climbing(slope=uphill, lifetime=1000, momentum=0.25)
     repertoire, state = begin(emitter)
     update = compiled(emitter.state_update)
     elites = np.asarray(repertoire.genotypes)[
