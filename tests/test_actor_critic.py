@@ -419,6 +419,23 @@ def test_a_single_copy_is_the_actor_itself() -> None:
     np.testing.assert_array_equal(offspring, state.snapshots.reshape(-1, SIZE))
 
 
+def test_noise_of_offspring_is_log_uniform() -> None:
+    """Actors and elites are equal, so there is nothing but noise between them."""
+    state = generations(1)[0][0]
+    point = state.snapshots[0, 0]
+    state = dataclasses.replace(state, snapshots=jnp.tile(point, (2, 3, 1)))
+    cells = compute_euclidean_centroids((4, 4), [-2.0, -2.0], [2.0, 2.0])
+    archive = MapElitesRepertoire.init_default(genotype=point, centroids=cells)
+    archive = archive.replace(
+        genotypes=jnp.tile(point, (16, 1)), fitnesses=jnp.zeros((16, 1))
+    )
+    made = emitter(copies=100, spread=(1e-3, 1.0))
+    offspring = compiled(made.emit)(archive, state, jax.random.key(0))[0][6:]
+    tens = np.log10(np.sqrt(np.mean(np.square(offspring - point), axis=1)))
+    assert tens.min() < -2.7 and -0.3 < tens.max()
+    assert abs(np.median(tens) + 1.5) < 0.3
+
+
 def test_steered_actors_begin_again() -> None:
     states = [state for state, *_ in generations(6)]
     assert max(state.learners.age.max() for state in states) < LENGTH

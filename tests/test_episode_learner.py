@@ -100,7 +100,6 @@ def test_each_world_has_weights_of_its_own() -> None:
         np.testing.assert_allclose(found[world], slope, rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.slow
 def test_weights_for_whitened_observations_have_their_own_gradient() -> None:
     white = Whitening(np.arange(6).reshape(3, 2), np.array([6, 7]))
 
@@ -132,6 +131,7 @@ def test_weights_for_whitened_observations_have_their_own_gradient() -> None:
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_fall_has_the_gradient_of_an_episode() -> None:
     """Against the gradient of the return that other algorithms use."""
     config = EvolveConfig(env_name="hopper_uni", episode_length=40, hidden=(4,))
