@@ -446,6 +446,10 @@ def test_steered_actors_begin_again() -> None:
     changed = (np.diff(aims, axis=0) != 0).any(axis=2)
     assert changed[:, 1].sum() == changed[:, 2].sum() == 2
     assert not (changed[:, 1] & changed[:, 2]).any()
+    # only with a new direction, the four updates of a generation do not go on
+    moments = [jax.tree.leaves(state.learners.moments[0]) for state in states]
+    counts = np.stack([next(x for x in one if x.dtype == jnp.int32) for one in moments])
+    np.testing.assert_array_equal(np.diff(counts, axis=0) != 4, changed)
 
 
 def test_a_long_life_is_counted_in_64_bits() -> None:
