@@ -115,11 +115,10 @@ def evaluate(
         allowed = "one world: newton_qd.create without batch_size"
         raise ValueError(message("env", given, allowed))
     mask = get_mask_from_transitions(data)
-    # after the end, a reward may be anything, also nan; 0 times nan is nan
-    counts = (mask == 0) | jnp.isfinite(data.rewards)
-    rewards = jnp.where(counts, data.rewards, jnp.zeros_like(data.rewards))
-    fitnesses = folded_sum(rewards * (1.0 - mask), 1)
-    fitnesses = jnp.where((faults & (mask == 0)).any(axis=1), -jnp.inf, fitnesses)
+    before_end = mask == 0
+    # not times 0, because 0 times nan is nan, and a reward may be nan after the end
+    fitnesses = folded_sum(jnp.where(before_end, data.rewards, 0), 1)
+    fitnesses = jnp.where((faults & before_end).any(axis=1), -jnp.inf, fitnesses)
     return fitnesses, descriptor_extractor(data, mask), {"transitions": data}
 
 
