@@ -42,6 +42,19 @@ def test_an_environment_is_described(capsys: pytest.CaptureFixture[str]) -> None
     assert "does not exist" in capsys.readouterr().err
 
 
+def test_a_description_says_what_wrappers_change(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert cli.main(["envs", "antmaze"]) == cli.OK
+    text = " ".join(capsys.readouterr().out.split())
+    assert text.startswith("antmaze: Ant, changed by XYPositionWrapper, MazeWrapper ")
+    assert "Ant: A torso on four legs" in text
+    assert "MazeWrapper: A maze with walls and a target." in text
+    assert "The reward is minus the horizontal distance" in text
+    assert cli.main(["envs", "ant"]) == cli.OK
+    assert capsys.readouterr().out.startswith("ant: A torso on four legs")
+
+
 def test_a_class_without_a_text(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

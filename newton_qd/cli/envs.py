@@ -131,6 +131,8 @@ def _facts(name: str, *, whole: bool) -> dict[str, Any]:
         {"joint": joint, "gear": gear}
         for joint, gear in getattr(getattr(base, "robot", None), "actuators", ())
     ][: env.action_size]
+    found["base"] = type(base).__name__
+    found["changes"] = _changes(name)
     found["wrappers"] = _wrappers(env)
     found["picture"] = _picture(name)
     return found
@@ -153,6 +155,18 @@ def _wrappers(env: Any) -> list[str]:
     return found
 
 
+def _changes(name: str) -> list[dict[str, str]]:
+    """Returns the texts of the task's own wrappers, from the inside to the outside."""
+    from newton_qd import tasks
+
+    found = []
+    for spec in tasks.ENVIRONMENTS[name].wrappers:
+        text = " ".join((spec.wrapper.__doc__ or "").split())
+        label = getattr(spec.wrapper, "__name__", "wrapper")
+        found.append({"wrapper": label, "meaning": text or "it has no description"})
+    return found
+
+
 def _picture(name: str) -> str | None:
     """Returns the path of the picture in a checkout, or ``None``."""
     import newton_qd
@@ -165,8 +179,15 @@ def _picture(name: str) -> str | None:
 def _description(found: dict[str, Any]) -> str:
     """Returns the text that describes an environment."""
     name, descriptor = found["name"], found["descriptor"]
-    lines = [f"{name}: {found['description'] or 'its class has no description'}"]
+    title, lines = name, []
+    if found["changes"]:  # they may change reward, end and observation of the base
+        title = found["base"]
+        names = ", ".join(change["wrapper"] for change in found["changes"])
+        lines = [f"{name}: {title}, changed by {names}", ""]
+    lines.append(f"{title}: {found['description'] or 'its class has no description'}")
     lines += ["", *(line for part in found["about"] for line in (part, ""))]
+    for change in found["changes"]:
+        lines += [f"{change['wrapper']}: {change['meaning']}", ""]
     lines += [
         f"step: {found['step_seconds']:g} s",
         f"observation: {_numbers(found['observation_size'])}",
