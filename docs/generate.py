@@ -44,6 +44,7 @@ environment of `newton_qd.create`. It is generated from the code by `docs/genera
 A dash means that there is no state descriptor. The first table of an environment is
 its `observation_layout`: the entries of the observation. A task without such a table
 has the observation of its robot. Options are keyword arguments of `create`.
+`newton-qd envs` lists the names, and `newton-qd envs NAME` describes one environment.
 [Differences](differences.md) compares these environments with those of QDax.
 
 | name | robot or task | observation | action | step [s] | state descriptor |

@@ -155,7 +155,8 @@ def create(
         env_name: One of ``registered_envs()``.
         episode_length: Control steps of an episode; ``None``: no limit.
         action_repeat: Control steps for each action.
-        auto_reset: Whether a finished world returns to its first state.
+        auto_reset: Whether a step that ends an episode returns the state of the last
+            reset, from which the next episode begins.
         batch_size: Number of worlds of a reset; ``None`` or 0: one world, without a
             batch axis.
         eval_metrics: Whether ``info`` sums the metrics of episodes.

@@ -21,12 +21,10 @@ TIP = ("body1", (0.11, 0.0, 0.0))
 class ArmReach(PhysicsEnv):
     """The arm of the reacher, driven by torques.
 
-    The red target of the reacher is still there, and means nothing. Reward: minus the
-    sum of squared actions. Never done. Of all motions that bring the tip to a place in
-    a given time, the fittest needs the least effort. Such a motion is smooth. Archives
-    of arms without dynamics prefer angles that are alike; this arm has two joints, so
-    at most two poses for each place, but it must move there. There is no friction: an
-    episode of 1 to 2 s (50 to 100 steps) asks more of it than a long one.
+    Reward: minus the sum of squared actions. Never done. Of all motions that bring the
+    tip to a place in a given time, the fittest needs the least effort. Such a motion is
+    smooth. There is no friction, so the task is harder in a short episode of 1 to 2 s
+    (50 to 100 steps). The red target of the reacher is still drawn. It has no effect.
 
     Metrics:
         reward_ctrl: Minus the sum of squared actions [-].

@@ -130,12 +130,11 @@ class Pusher(PhysicsEnv):
 class TablePusher(Pusher):
     """The arm of the pusher and an object that may end anywhere on the table.
 
-    There is no goal. Reward: that of the pusher without the distance from the goal, so
-    minus half of the distance of the object from the hand, minus a cost of control. It
-    is high if the hand goes to the object, and stays with it where it ends, without
-    effort. Never done. The table has drag: 2 N for an object of 1 m/s, so a pushed
-    object stops. It always starts at one place. ``XYPositionWrapper`` reads where the
-    object is.
+    There is no goal. Reward: minus half of the distance of the object from the hand,
+    minus a cost of control. So the hand should go to the object and stay with it, with
+    little effort. Never done. The table has drag, 2 N at a speed of 1 m/s, so a pushed
+    object stops. The object always starts at the same place. ``XYPositionWrapper``
+    reads where it is.
 
     Metrics:
         reward_ctrl: Minus the sum of squared actions, without its weight of 0.1 [-].

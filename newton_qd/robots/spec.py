@@ -44,14 +44,14 @@ class Material:
         slip_velocity: Velocity below which friction is viscous [m/s].
         dissipation: Hunt-Crossley dissipation [s/m].
         limit_overshoot: Angle past its limit at which a joint is in balance with its
-            full gear [rad]. It sets the stiffness of joint limits.
+            full gear [rad], of a slide [m]. It sets the stiffness of joint limits.
         limit_swing: Upper bound of the angle past its limit that a joint reaches from
-            rest with its full gear alone [rad]. It has no effect on the physics; tests
-            check it.
+            rest with its full gear alone [rad], of a slide [m]. It has no effect on the
+            physics; tests check it.
         limit_dissipation: Hunt-Crossley dissipation of joint limits [s/rad], of a slide
             [s/m].
-        limit_smoothing: Half width of the zone in which a limit switches on [rad]. The
-            zone begins at the limit, with torque 0.
+        limit_smoothing: Half width of the zone in which a limit switches on [rad], of a
+            slide [m]. The zone begins at the limit, with torque 0.
     """
 
     friction: float = 1.0
@@ -68,7 +68,7 @@ class Material:
 
 @dataclasses.dataclass(frozen=True)
 class RobotSpec:
-    """One robot of the suite.
+    """A robot: its URDF file, and what the file cannot describe.
 
     Attributes:
         name: Name of the robot.

@@ -29,7 +29,7 @@ class XYPositionWrapper(DescriptorWrapper):
     The state descriptor is clipped to the limits. ``info["xy_position"]`` is not
     clipped. If actions are repeated, the last repetition counts. The torso is the
     robot's first link, unless its spec names another one. The first link of an arm does
-    not move, so its position carries no information: ``link`` is another one.
+    not move, so give an arm another ``link``.
     """
 
     rollout_order = RolloutOrder.AT_ONCE

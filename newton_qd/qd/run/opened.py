@@ -211,8 +211,8 @@ class Run:
 
         Raises:
             TypeError: ``env`` is no environment.
-            ValueError: It has a batch, auto-reset or other sizes, or ends episodes
-                before.
+            ValueError: It has a batch, auto-reset or other sizes, or its episodes are
+                shorter than those of the run.
         """
         checks.environment(env)
         if isinstance(env, Env):

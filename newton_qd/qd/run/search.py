@@ -86,8 +86,8 @@ class Search:
         Raises:
             MissingExtra: QDax is not installed.
             ConfigError: The algorithm or one of its options does not exist, or it
-                does not run with these settings, or the environment of ``task`` ends
-                episodes before.
+                does not run with these settings, or the episodes of ``task`` are
+                shorter than ``config.episode_length``.
         """
         require_extra("qdax", "qd")
         check_length(task.env, config.episode_length, error=ConfigError)

@@ -47,7 +47,7 @@ class Task:
             score only.
         network: Network of the policies, as for ``policy_of``; ``None``: a perceptron
             with the hidden layers of the settings.
-        episode_length: Control steps of an episode; with so many, ``reads_end`` tries a
+        episode_length: Control steps of the episode with which ``reads_end`` tries a
             ``descriptor_extractor`` of your own.
     """
 
