@@ -6,13 +6,15 @@ import warnings
 from pathlib import Path
 
 import pytest
-from urdf_text import link, robot_text, write
+from urdf_text import link, robot_text, row, write
 
 from newton_qd.physics.model import (
     RobotDescriptionError,
     RobotDescriptionWarning,
+    build_system,
     newton_builder,
 )
+from newton_qd.viewing.drawing import drawing_of_system
 
 pytestmark = pytest.mark.usefixtures("no_network")
 
@@ -119,3 +121,13 @@ def test_a_colour_is_checked(folder: Path) -> None:
     opaque = colour.replace("1 red 0 1", "1 0 0")
     path = write(folder, robot_text(opaque, link("a")))
     assert newton_builder(path, True, 9.81).body_count == 1
+
+
+def test_a_robot_is_drawn_without_a_mesh_that_is_not_read(folder: Path) -> None:
+    """A mesh beside the folder trains: nothing touches it. So a page must show it."""
+    ball = "<collision><geometry><sphere radius='0.1'/></geometry></collision>"
+    text = drawn("collision", "../secret.obj").replace("</link>", f"{ball}</link>")
+    system = build_system(row(write(folder, text), "a"), "float32")
+    with pytest.warns(RobotDescriptionWarning, match="another one is not drawn"):
+        (shape,) = drawing_of_system(system).shapes
+    assert shape.kind == "sphere" and shape.visual

@@ -278,7 +278,7 @@ def _files(system: System) -> list[tuple[str, bool]]:
 
 
 def _builder(system: System, path: str, floats: bool) -> newton.ModelBuilder:
-    return newton_builder(path, floats, system.robot.gravity)
+    return newton_builder(path, floats, system.robot.gravity, drawn=True)
 
 
 def _shapes(system: System) -> Iterator[DrawnShape]:

@@ -57,6 +57,7 @@ def newton_builder(
     gravity: float,
     meshes: bool = True,
     packages: Sequence[str | Path] = (),
+    drawn: bool = False,
 ) -> newton.ModelBuilder:
     """Imports a URDF file into a Newton builder, with the settings of this package.
 
@@ -71,6 +72,8 @@ def newton_builder(
         meshes: Whether the files of meshes and textures are read.
         packages: Folders of packages: ``package://NAME/mesh.stl`` is found in a folder
             NAME, or in a folder that contains a folder NAME.
+        drawn: Whether the robot is only drawn. The mesh of a collider may be left out,
+            too, with a warning.
 
     Raises:
         RobotDescriptionError: The file is not XML, a colour is malformed, the mesh of a
@@ -79,7 +82,7 @@ def newton_builder(
     """
     import newton
 
-    given = NewtonInput(Path(path), meshes, packages)
+    given = NewtonInput(Path(path), meshes, packages, drawn)
     given.leave_out_unreadable(newton.ModelBuilder)
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, -gravity))
     # Links without <inertial> have no mass. By default Newton computes a mass from the

@@ -59,6 +59,8 @@ class NewtonInput:
         path: The file.
         meshes: Whether Newton may read the files of meshes and textures.
         packages: Folders whose files may be read, too.
+        drawn: Whether Newton only draws the robot, so that nothing touches its meshes.
+            The mesh of a collider may then be left out, too.
 
     Attributes:
         meshes: The meshes that Newton will read.
@@ -69,8 +71,15 @@ class NewtonInput:
         OSError: The file cannot be read.
     """
 
-    def __init__(self, path: Path, meshes: bool, packages: Sequence[str | Path]):
+    def __init__(
+        self,
+        path: Path,
+        meshes: bool,
+        packages: Sequence[str | Path],
+        drawn: bool = False,
+    ):
         self.meshes: list[Asset] = []
+        self._drawn = drawn
         self._reader = XmlReader(path)
         self._folders = Folders(path, packages)
         root = self._reader.root
@@ -109,7 +118,7 @@ class NewtonInput:
             new_builder: Makes an empty builder of Newton.
 
         Raises:
-            RobotDescriptionError: One is the mesh of a collider.
+            RobotDescriptionError: One is the mesh of a collider, and is not only drawn.
         """
         for mesh in self.meshes:
             why = _mesh_problem(mesh, new_builder)
@@ -120,10 +129,10 @@ class NewtonInput:
         """Leaves out a mesh or a texture that is only seen, with a warning.
 
         Raises:
-            RobotDescriptionError: It is the mesh of a collider.
+            RobotDescriptionError: It is the mesh of a collider, and is not only drawn.
         """
         name, allowed = asset.name, self._folders.allowed
-        if asset.collides:
+        if asset.collides and not self._drawn:
             field = "filename of a collider's mesh"
             text = message(field, name, allowed, why=why)
             raise self._reader.error(asset.element, text)
