@@ -112,6 +112,21 @@ def test_meshes_that_are_read(folder: Path) -> None:
             assert builder.shape_count == 1, name
 
 
+@pytest.mark.parametrize("name", ["package://pack/meshes/a.obj", "../meshes/a.obj"])
+def test_meshes_of_the_own_package_are_read(name: str, folder: Path) -> None:
+    """A package of ROS has its URDF files in one folder, and its meshes in another."""
+    inside = folder.parent / "pack" / "urdf"
+    inside.mkdir()
+    path = write(inside, drawn("collision", name))
+    with pytest.raises(RobotDescriptionError, match="allowed: files below"):
+        newton_builder(path, True, 9.81)
+    (inside.parent / "package.xml").touch()
+    assert newton_builder(path, True, 9.81).shape_count == 1
+    path = write(inside, drawn("collision", "../../secret.obj"))
+    with pytest.raises(RobotDescriptionError, match="allowed: files below"):
+        newton_builder(path, True, 9.81)
+
+
 def test_a_colour_is_checked(folder: Path) -> None:
     colour = '<material name="m"><color rgba="1 red 0 1"/></material>'
     path = write(folder, robot_text(colour, link("a")))

@@ -61,9 +61,9 @@ def newton_builder(
 ) -> newton.ModelBuilder:
     """Imports a URDF file into a Newton builder, with the settings of this package.
 
-    Nothing is downloaded. Meshes and textures are read only from the folder of the
-    URDF file, from ``packages`` and from the folders below. What is only seen and
-    cannot be read is left out, with a ``RobotDescriptionWarning``.
+    Nothing is downloaded. Meshes and textures are read only from the folder or the ROS
+    package of the URDF file, from ``packages`` and from the folders below. What is only
+    seen and cannot be read is left out, with a ``RobotDescriptionWarning``.
 
     Args:
         path: The file.

@@ -1,4 +1,4 @@
-"""Which files a URDF file may have read: those below its folder or a given package.
+"""Which files a URDF file may have read: those of its folder, package or a given one.
 
 A mesh or a texture is read for Newton's viewers only. A URDF file of somebody else must
 cause no request in a network, and must not read a file elsewhere on this machine. That
@@ -57,7 +57,7 @@ class Folders:
     def __init__(self, urdf: Path, packages: Sequence[str | Path] = ()):
         self._urdf = urdf.absolute()
         self._packages = [Path(package).expanduser().absolute() for package in packages]
-        roots = [self._urdf.parent, *self._packages]
+        roots = [*(_own_package(self._urdf) or [self._urdf.parent]), *self._packages]
         self._roots = [root.resolve() for root in roots]
         below = listed(roots)
         self.allowed = f"files below {below}, or below a folder given as packages=..."
@@ -101,6 +101,14 @@ class Folders:
 
     def _is_file(self, path: Path) -> bool:
         return self._is_inside(path) and path.is_file()
+
+
+def _own_package(urdf: Path) -> list[Path]:
+    """Returns the nearest folder around a URDF file that is a package of ROS.
+
+    There, the file is in a folder such as urdf/, and its meshes are beside this folder.
+    """
+    return [f for f in urdf.parents if (f / "package.xml").is_file()][:1]
 
 
 def _named(file: Path) -> list[str]:
