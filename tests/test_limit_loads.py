@@ -12,16 +12,18 @@ from urdf_text import joint, robot_text, row, write
 
 from newton_qd.physics import SoftLimitWarning, load_system
 from newton_qd.physics.model.limit_loads import limit_loads
-from newton_qd.robots import RobotSpec
+from newton_qd.robots import Material, RobotSpec
 
 ARM = """<link name="arm"><inertial><origin xyz="0.5 0 0"/><mass value="30"/>
   <inertia ixx="0.1" iyy="2.5" izz="2.5" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
 WEIGHT = 30 * 9.81  # [N]
 
 
-def held(folder: Path, kind: str, axis: str, **changes: object) -> RobotSpec:
+def held(
+    folder: Path, kind: str, axis: str, reach: float = 0.5, **changes: object
+) -> RobotSpec:
     """A heavy arm that lies, on a joint of the world."""
-    inside = f'<axis xyz="{axis}"/><limit lower="-0.5" upper="0.5"/>'
+    inside = f'<axis xyz="{axis}"/><limit lower="{-reach}" upper="{reach}"/>'
     text = robot_text(
         '<link name="world"/>', joint("held", kind, "world", "arm", inside), ARM
     )
@@ -51,3 +53,15 @@ def test_limits_that_give_way_are_named(tmp_path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error", SoftLimitWarning)
         load_system(held(tmp_path, "revolute", "0 1 0", actuators=(("held", 70.0),)))
+
+
+def test_a_range_shorter_than_the_way_past_a_limit_is_named(tmp_path: Path) -> None:
+    """The default limits hold a finger of 2 cm only 10 cm past its end."""
+    finger = {"reach": 0.01, "actuators": (("held", 10.0),)}
+    named = "limits of 'held': got a range of 0.02 m; allowed: at least 0.1 m"
+    with pytest.warns(SoftLimitWarning, match=named):
+        load_system(held(tmp_path, "prismatic", "1 0 0", **finger))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", SoftLimitWarning)
+        stiff = Material(limit_overshoot=0.002)
+        load_system(held(tmp_path, "prismatic", "1 0 0", material=stiff, **finger))

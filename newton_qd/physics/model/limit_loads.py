@@ -1,4 +1,4 @@
-"""The weight that presses a joint against its limits."""
+"""Limits that hold too little: for the weight on a joint, or for a short slide."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _EXPECTED = 2.0
 
 
 class SoftLimitWarning(UserWarning):
-    """A joint carries more than twice the weight that its limits hold."""
+    """Limits hold less than half of the weight on a joint, or a slide is short."""
 
 
 def held_at_limits(system: System) -> np.ndarray:
@@ -88,17 +88,30 @@ def _load(
 
 
 def soft_limits(system: System) -> tuple[str, ...]:
-    """Returns a text about each joint that carries twice what its limits hold."""
+    """Returns a text about each joint whose limits hold too little.
+
+    Such a joint carries more than twice what they hold. Or it is a slide, which its
+    motor pushes further past a limit than the limits are apart.
+    """
     loads, held = limit_loads(system), held_at_limits(system)
+    overshoot = system.robot.material.limit_overshoot
     texts = []
     for body in np.flatnonzero(system.joint_kind != JointKind.FREE):
         dof = system.v_start[body]
-        if loads[dof] <= _EXPECTED * held[dof]:
-            continue
         hinge = system.joint_kind[body] == JointKind.REVOLUTE
         unit, length = ("N m", "rad") if hinge else ("N", "m")
-        past = system.robot.material.limit_overshoot * loads[dof] / held[dof]
         name = f"robot {system.robot.name!r}, limits of {system.joint_names[body]!r}"
+        span = system.limit_upper[dof] - system.limit_lower[dof]
+        if not hinge and span < overshoot:
+            given = Fact(f"a range of {span:.3g} m")
+            allowed = (
+                f"at least {overshoot:g} m, as far as the full gear pushes the slide "
+                "past a limit. A smaller Material.limit_overshoot makes limits stiffer"
+            )
+            texts.append(message(name, given, allowed))
+        if loads[dof] <= _EXPECTED * held[dof]:
+            continue
+        past = overshoot * loads[dof] / held[dof]
         weight = Fact(f"a weight of {loads[dof]:.3g} {unit}")
         most = _EXPECTED * held[dof]
         allowed = (
