@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from itertools import pairwise
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from urdf_text import built, joint, link, refusal, robot_text, sphere, write
 
 from newton_qd import physics
 from newton_qd.physics import reference
+from newton_qd.physics.model import RobotDescriptionWarning
 from newton_qd.physics.model.description import read_description
 from newton_qd.physics.model.elements import is_real
 from newton_qd.physics.model.verify import _same_frame
@@ -120,3 +122,35 @@ REFUSED = {
 def test_refused_elements(name: str, tmp_path: Path) -> None:
     text, message = REFUSED[name]
     assert message in refusal(tmp_path, robot_text(text), "a")
+
+
+DEGREES = {
+    '<origin rpy="0 90 0"/>': "<origin>: rpy: got 0 90 0, which looks like degrees",
+    '<limit lower="-45" upper="1.5"/>': "<limit>: lower: got -45, which looks like",
+    '<limit lower="0" upper="180.0"/>': "<limit>: upper: got 180.0, which looks like",
+}
+
+
+@pytest.mark.parametrize("angle", DEGREES)
+def test_degrees_are_noticed(angle: str, tmp_path: Path) -> None:
+    bounds = "" if "limit" in angle else '<limit lower="-1" upper="1"/>'
+    hinge = joint("hinge", "revolute", "a", "b", angle + bounds)
+    text = robot_text(link("a"), link("b"), hinge)
+    with pytest.warns(RobotDescriptionWarning, match=DEGREES[angle]):
+        built(tmp_path, text, "a")
+
+
+@pytest.mark.parametrize(
+    ("kind", "inside"),
+    [
+        ("revolute", '<origin rpy="6.2832 -6.2832 3"/><limit lower="-12" upper="12"/>'),
+        ("revolute", '<limit lower="-27.7" upper="27.7"/>'),  # of an arm on the market
+        ("revolute", '<limit lower="-10000" upper="10000"/>'),  # means no limit
+        ("prismatic", '<limit lower="-20" upper="20"/>'),
+    ],
+)
+def test_other_angles_are_not(kind: str, inside: str, tmp_path: Path) -> None:
+    text = robot_text(link("a"), link("b"), joint("moved", kind, "a", "b", inside))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        built(tmp_path, text, "a")

@@ -24,7 +24,7 @@ from newton_qd.physics.model.elements import (
     read_joint,
     read_link,
 )
-from newton_qd.physics.model.spelling import misspelt
+from newton_qd.physics.model.spelling import in_degrees, misspelt
 from newton_qd.physics.model.unread import refuse_unread
 from newton_qd.physics.model.xml_reader import (
     IDENTITY,
@@ -71,7 +71,8 @@ class Description:
         still: World frames (7,) of the links that are fixed to the world, by name.
         fixed: Names of the fixed joints.
         unbounded: Names of the revolute joints for which the file gives no bounds.
-        misspelt: Texts about names in the file that are almost known ones.
+        doubtful: Texts about names in the file that are almost known ones, and about
+            angles that look like degrees.
     """
 
     path: Path
@@ -81,7 +82,7 @@ class Description:
     still: dict[str, np.ndarray]
     fixed: tuple[str, ...]
     unbounded: tuple[str, ...]
-    misspelt: tuple[str, ...]
+    doubtful: tuple[str, ...]
 
 
 def read_joints(reader: XmlReader, links: dict[str, Link]) -> dict[str, list[Joint]]:
@@ -244,8 +245,8 @@ def _check_floating(path: Path, joint: Joint, fixed: bool) -> None:
 
 
 def warn_about(description: Description) -> None:
-    """Warns about misspelt names, and about revolute joints without bounds."""
-    for text in description.misspelt:
+    """Warns about misspelt names, degrees, and revolute joints without bounds."""
+    for text in description.doubtful:
         warn(text, RobotDescriptionWarning)
     if description.unbounded:
         names = listed(description.unbounded)
@@ -343,5 +344,5 @@ def read_description(path: Path, fixed_base: bool | None = None) -> Description:
         still,
         fixed=tuple(joint.name for joint in joints if joint.kind == "fixed"),
         unbounded=tuple(joint.name for joint in joints if not joint.names_bounds),
-        misspelt=misspelt(reader),
+        doubtful=(*misspelt(reader), *in_degrees(reader)),
     )
