@@ -203,8 +203,9 @@ def rollout(
         params: Physical parameters of the world, as in :func:`step`.
 
     Returns:
-        The states after each step and their faults, leaves (T, ...). After a fault a
-        world keeps its state, and each later step has a fault too.
+        ``after``, the states after each step, and ``fault``, their faults, leaves
+        (T, ...). After a fault a world keeps its state, and each later step has a fault
+        too.
 
     Raises:
         TypeError: The type of the state, a control or a parameter is not that of the

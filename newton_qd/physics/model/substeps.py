@@ -178,9 +178,10 @@ def recommended_substeps(system: System) -> int:
     that the robot has.
 
     The speed of a joint is bounded by its damping (gear / damping), and by the work of
-    its motor over its range. The frequency of a contact is sqrt(stiffness / mass), with
-    the smallest mass that moves with the contact point. Both are computed in the
-    default pose. docs/physics.md, "Number of substeps", has the reasons.
+    its motor over its range. The work of gravity does not count. The frequency of a
+    contact is sqrt(stiffness / mass), with the smallest mass that moves with the
+    contact point. Both are computed in the default pose. docs/physics.md, "Number of
+    substeps", has the reasons.
 
     Args:
         system: The system.
