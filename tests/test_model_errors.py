@@ -157,7 +157,11 @@ BAD_FILES = {
         'friction="1"',
         r"friction: got 1.*joint friction is not",
     ),
-    "mimic": ("<dynamics", '<mimic joint="hip_2"/><dynamics', r"<mimic> is not supp"),
+    "mimic": (
+        "<dynamics",
+        '<mimic joint="hip_2"/><dynamics',
+        r"<mimic> is not supported; make",
+    ),
     "massless leaf": (
         "</robot>",
         '<link name="tip"/>' + joint("t", "revolute", "torso", "tip") + "</robot>",

@@ -252,7 +252,8 @@ def read_joint(reader: XmlReader, element: ElementTree.Element) -> Joint:
     if kind not in _JOINT_TYPES:
         raise reader.refused(element, "type", kind, listed(_JOINT_TYPES))
     if element.find("mimic") is not None:
-        raise reader.error(element, "<mimic> is not supported")
+        cure = "make the joint fixed, or remove <mimic> to let it move alone"
+        raise reader.error(element, f"<mimic> is not supported; {cure}")
     parent = reader.text(reader.child(element, "parent"), "link")
     child = reader.text(reader.child(element, "child"), "link")
     frame = reader.frame(element)
