@@ -127,6 +127,21 @@ def test_meshes_of_the_own_package_are_read(name: str, folder: Path) -> None:
         newton_builder(path, True, 9.81)
 
 
+def test_the_package_around_the_working_directory_is_another_one(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The path of a file may lead out of a package, as ../train/robot.urdf does."""
+    write(folder, drawn("collision", "a.obj"))
+    package = folder.parent / "pack"
+    (package / "package.xml").touch()
+    monkeypatch.chdir(package)
+    path = f"../{folder.name}/robot.urdf"
+    assert newton_builder(path, True, 9.81).shape_count == 1
+    write(folder, drawn("collision", "../pack/meshes/a.obj"))
+    with pytest.raises(RobotDescriptionError, match="allowed: files below"):
+        newton_builder(path, True, 9.81)
+
+
 def test_a_colour_is_checked(folder: Path) -> None:
     colour = '<material name="m"><color rgba="1 red 0 1"/></material>'
     path = write(folder, robot_text(colour, link("a")))

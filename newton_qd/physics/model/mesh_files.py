@@ -108,7 +108,10 @@ def _own_package(urdf: Path) -> list[Path]:
 
     There, the file is in a folder such as urdf/, and its meshes are beside this folder.
     """
-    return [f for f in urdf.parents if (f / "package.xml").is_file()][:1]
+    # resolved, because b of a/../b/robot.urdf is not in a
+    inside = urdf.parent.resolve()
+    around = (inside, *inside.parents)
+    return [folder for folder in around if (folder / "package.xml").is_file()][:1]
 
 
 def _named(file: Path) -> list[str]:
