@@ -154,3 +154,16 @@ def test_other_angles_are_not(kind: str, inside: str, tmp_path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         built(tmp_path, text, "a")
+
+
+@pytest.mark.parametrize("angle", ["0 90 0", "here"])
+def test_a_frame_that_means_nothing_is_not_read(angle: str, tmp_path: Path) -> None:
+    """A link has no ``<origin>`` of its own."""
+    text = robot_text(
+        link("a", f'<origin rpy="{angle}"/>'),
+        link("b"),
+        joint("moved", "continuous", "a", "b"),
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        built(tmp_path, text, "a")

@@ -62,7 +62,12 @@ _ATTRIBUTES = {
 _POSES = ("origin", "axis")
 """Elements in which an attribute of another form, such as ``quat``, would be lost."""
 
-_FRAMES = ("origin", "inertial/origin", "visual/origin", "collision/origin")
+_FRAMES = {
+    "link": ("inertial/origin", "visual/origin", "collision/origin"),
+    "joint": ("origin",),
+}
+"""Paths of the frames in links and joints."""
+
 _ROLL = 2.0 * math.pi + 0.01  # largest angle that a file needs, with rounding [rad]
 _TURNS = 4.0 * math.pi  # some joints turn twice [rad]
 
@@ -89,7 +94,8 @@ def in_degrees(reader: XmlReader) -> tuple[str, ...]:
     """
     texts = []
     for element in (*reader.root.findall("link"), *reader.root.findall("joint")):
-        for origin in (found for path in _FRAMES for found in element.iterfind(path)):
+        paths = _FRAMES[element.tag]
+        for origin in (found for path in paths for found in element.iterfind(path)):
             if (abs(reader.numbers(origin, "rpy", 3, "0 0 0")) > _ROLL).any():
                 texts.append(_degrees(reader, origin, "rpy"))
         if element.get("type") != "revolute":
