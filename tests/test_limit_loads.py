@@ -20,10 +20,15 @@ WEIGHT = 30 * 9.81  # [N]
 
 
 def held(
-    folder: Path, kind: str, axis: str, reach: float = 0.5, **changes: object
+    folder: Path,
+    kind: str,
+    axis: str,
+    ends: tuple[float, float] = (-0.5, 0.5),
+    **changes: object,
 ) -> RobotSpec:
     """A heavy arm that lies, on a joint of the world."""
-    inside = f'<axis xyz="{axis}"/><limit lower="{-reach}" upper="{reach}"/>'
+    lower, upper = ends
+    inside = f'<axis xyz="{axis}"/><limit lower="{lower}" upper="{upper}"/>'
     text = robot_text(
         '<link name="world"/>', joint("held", kind, "world", "arm", inside), ARM
     )
@@ -57,11 +62,14 @@ def test_limits_that_give_way_are_named(tmp_path: Path) -> None:
 
 def test_a_range_shorter_than_the_way_past_a_limit_is_named(tmp_path: Path) -> None:
     """The default limits hold a finger of 2 cm only 10 cm past its end."""
-    finger = {"reach": 0.01, "actuators": (("held", 10.0),)}
+    finger = {"ends": (-0.01, 0.01), "actuators": (("held", 10.0),)}
     named = "limits of 'held': got a range of 0.02 m; allowed: at least 0.1 m"
     with pytest.warns(SoftLimitWarning, match=named):
         load_system(held(tmp_path, "prismatic", "1 0 0", **finger))
     with warnings.catch_warnings():
         warnings.simplefilter("error", SoftLimitWarning)
+        # as long as the way past a limit, and computed as 0.09999999999999999
+        exact = {**finger, "ends": (-0.01, 0.09)}
+        load_system(held(tmp_path, "prismatic", "1 0 0", **exact))
         stiff = Material(limit_overshoot=0.002)
         load_system(held(tmp_path, "prismatic", "1 0 0", material=stiff, **finger))

@@ -10,6 +10,7 @@ from newton_qd.physics.system import JointKind, System
 
 # More gets a warning, as a share of what is held. The suite has at most 0.25.
 _EXPECTED = 2.0
+_ROUNDING = 1e-9  # 0.15 - 0.05 is less than 0.1
 
 
 class SoftLimitWarning(UserWarning):
@@ -90,8 +91,8 @@ def _load(
 def soft_limits(system: System) -> tuple[str, ...]:
     """Returns a text about each joint whose limits hold too little.
 
-    Such a joint carries more than twice what they hold. Or it is a slide, which its
-    motor pushes further past a limit than the limits are apart.
+    Such a joint carries more than twice what they hold. Or it is a slide, and the force
+    that they hold pushes it further past a limit than the limits are apart.
     """
     loads, held = limit_loads(system), held_at_limits(system)
     overshoot = system.robot.material.limit_overshoot
@@ -102,11 +103,12 @@ def soft_limits(system: System) -> tuple[str, ...]:
         unit, length = ("N m", "rad") if hinge else ("N", "m")
         name = f"robot {system.robot.name!r}, limits of {system.joint_names[body]!r}"
         span = system.limit_upper[dof] - system.limit_lower[dof]
-        if not hinge and span < overshoot:
+        if not hinge and span < (1 - _ROUNDING) * overshoot:
             given = Fact(f"a range of {span:.3g} m")
             allowed = (
-                f"at least {overshoot:g} m, as far as the full gear pushes the slide "
-                "past a limit. A smaller Material.limit_overshoot makes limits stiffer"
+                f"at least {overshoot:g} m, as far as the gear of its motor pushes it "
+                "past a limit or, without one, the robot's largest. A smaller "
+                "Material.limit_overshoot makes limits stiffer"
             )
             texts.append(message(name, given, allowed))
         if loads[dof] <= _EXPECTED * held[dof]:
