@@ -330,6 +330,20 @@ def test_a_vector_environment_made_from_a_spec_has_its_length() -> None:
         gymnasium.make_vec(name, max_episode_steps=2.5)
 
 
+def test_a_vector_environment_of_an_object_is_made_again_from_its_spec() -> None:
+    spec = gymnasium.envs.registration.EnvSpec(
+        "Clock-v0",
+        vector_entry_point=make_gymnasium_vector,
+        kwargs={"env": limited(3)},
+    )
+    first = gymnasium.make_vec(spec, num_envs=2)
+    assert first.spec is not None and first.spec.max_episode_steps == 3
+    again = gymnasium.make_vec(first.spec, num_envs=2)
+    assert again.spec is not None and again.spec.max_episode_steps == 3
+    with pytest.raises(ValueError, match="max_episode_steps: got 4; allowed: None, or"):
+        make_gymnasium_vector(limited(3), 2, max_episode_steps=4)
+
+
 @pytest.mark.parametrize("last", [0.0, 1.0])
 def test_an_environment_made_from_a_spec_ends_as_its_own(last: float) -> None:
     spec = gymnasium.envs.registration.EnvSpec(

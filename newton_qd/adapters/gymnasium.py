@@ -110,6 +110,12 @@ def check_reset_options(options: Mapping[str, Any] | None, *known: str) -> None:
         raise ValueError(message("options", unknown[0], listed(known)))
 
 
+def steps_of(env: Env) -> int | None:
+    """Returns the actions of an episode; ``None`` if there is no limit."""
+    length = getattr(env, "episode_length", None)
+    return None if length is None else -(-length // getattr(env, "action_repeat", 1))
+
+
 class WithLength:
     """An environment whose spec says how long its episodes are."""
 
@@ -126,10 +132,8 @@ class WithLength:
 
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
-        length = getattr(self.env, "episode_length", None)
-        if spec is not None and spec.max_episode_steps is None and length is not None:
-            steps = -(-length // getattr(self.env, "action_repeat", 1))
-            spec = dataclasses.replace(spec, max_episode_steps=steps)
+        if spec is not None and spec.max_episode_steps is None:
+            spec = dataclasses.replace(spec, max_episode_steps=steps_of(self.env))
         self._spec = spec
 
 

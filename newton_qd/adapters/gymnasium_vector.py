@@ -18,6 +18,7 @@ from newton_qd.adapters.gymnasium import (
     metadata_of,
     require_no_fork,
     spaces_of,
+    steps_of,
 )
 from newton_qd.adapters.live_camera import LiveCamera
 from newton_qd.adapters.pickled import Pickled
@@ -83,7 +84,8 @@ class GymnasiumVectorEnv(Pickled, WithLength, gymnasium.vector.VectorEnv):  # py
             width: Width of the picture of a world [px].
             height: Height of the picture of a world [px].
             max_episode_steps: Steps after which an episode is truncated, with
-                ``action_repeat`` control steps each; ``None``: as ``options`` say.
+                ``action_repeat`` control steps each; ``None``: as ``options`` or
+                ``env`` say. An ``env`` that is no name has its own number.
             **options: Arguments of ``newton_qd.create``, such as ``episode_length``.
 
         Raises:
@@ -94,13 +96,17 @@ class GymnasiumVectorEnv(Pickled, WithLength, gymnasium.vector.VectorEnv):  # py
             RuntimeError: The process was forked after the first environment was made.
         """
         require_no_fork()
-        if max_episode_steps is not None:
-            checks.integer("max_episode_steps", max_episode_steps)
+        steps = max_episode_steps
+        checks.integer("max_episode_steps", steps, optional=True)
+        if steps is not None and isinstance(env, str):
             repeat = options.get("action_repeat", 1)
             checks.integer("action_repeat", repeat)
-            options["episode_length"] = max_episode_steps * repeat
+            options["episode_length"] = steps * repeat
         checks.integer("num_envs", num_envs)
         world = one_world(env, options)
+        if steps is not None and steps != steps_of(world):
+            allowed = f"None, or {steps_of(world)} as the environment has"
+            raise ValueError(message("max_episode_steps", steps, allowed))
         if autoreset_mode not in (*AutoresetMode, *(m.value for m in AutoresetMode)):
             allowed = checks.listed([mode.value for mode in AutoresetMode])
             raise ValueError(message("autoreset_mode", autoreset_mode, allowed))
