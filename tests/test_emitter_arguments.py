@@ -9,6 +9,7 @@ from typing import Any
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from point_runs import PointEnv
 from qdax.core.emitters.emitter import Emitter
@@ -139,6 +140,11 @@ def test_arguments_of_a_wrong_type_are_named(
     """Where the emitter is built, not deep in a trace of it."""
     with pytest.raises(TypeError, match=f"^{name}: got .*; allowed: {allowed}"):
         make(**{name: value})
+
+
+@pytest.mark.parametrize("kind", [list, np.array, np.float32])
+def test_a_range_may_be_any_pair(kind: Callable[..., Any]) -> None:
+    actors(spread=kind([0.1, 0.2]))
 
 
 @pytest.mark.parametrize(

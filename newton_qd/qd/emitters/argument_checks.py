@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, cast
 
+import numpy as np
 import optax
 
 from newton_qd import checks
@@ -28,7 +29,9 @@ def check_range(name: str, value: object) -> None:
         ValueError: A number is not finite and above 0, or the first is the larger one.
     """
     allowed, ends = "two numbers, 0 < smallest <= largest", cast("Any", value)
-    if not isinstance(value, tuple | list) or len(ends) != 2:
+    if isinstance(value, np.ndarray):
+        ends = value.tolist()
+    if not isinstance(ends, tuple | list) or len(ends) != 2:
         raise TypeError(message(name, value, allowed))
     for index, end in enumerate(ends):
         checks.number(f"{name}[{index}]", end, above=0)
