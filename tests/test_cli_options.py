@@ -136,6 +136,12 @@ def test_settings_of_a_file_get_their_defaults_again(
     more = [*base, "--unset", "options", "--option", "noise=0.2", "--seed", "4"]
     config, out = settle(parser.parse_args([*more, "--unset", "seed"]))
     assert dict(config.options) == {"noise": 0.2} and config.seed == 4
+    # without its last entry, a table is that of the default: none
+    more = [
+        f"--unset=env_options.material.{name}" for name in ("friction", "smoothing")
+    ]
+    config, _ = settle(parser.parse_args([*base, *more]))
+    assert dict(config.env_options) == {"healthy_reward": 0.5}
 
 
 @pytest.mark.parametrize(
@@ -198,8 +204,9 @@ def test_a_resumed_run_of_the_study_knows_what_it_is(
     arguments = ["evolve", "--study", "--resume", "--quiet", "--out", str(out)]
     assert cli.main(arguments) == cli.BAD_ARGUMENTS
     assert f"out: got {out}, which holds no run" in capsys.readouterr().err
-    assert cli.main(["evolve", "--study", "--quiet"]) == cli.BAD_ARGUMENTS
-    assert "ENV: got None" in capsys.readouterr().err
+    for more in ([], ["--unset", "starts"]):
+        assert cli.main(["evolve", "--study", "--quiet", *more]) == cli.BAD_ARGUMENTS
+        assert "ENV: got None" in capsys.readouterr().err
     kept = study_config("hopper_uni", "me-actor-critic").replace(iterations=250)
     out.mkdir()
     (out / "config.json").write_text(config_to_json(kept, environment_facts()))

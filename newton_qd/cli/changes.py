@@ -49,9 +49,10 @@ def _without(table: Any, names: Sequence[str], path: str) -> dict[str, Any]:
         known = listed(table) if isinstance(table, Mapping) else "none"
         above = path.removesuffix(f".{'.'.join(names)}")
         raise ConfigError(message("unset", path, f"entries of {above}: {known}"))
-    if inside:
-        return {**table, name: _without(table[name], inside, path)}
-    return {key: value for key, value in table.items() if key != name}
+    others = {key: value for key, value in table.items() if key != name}
+    below = _without(table[name], inside, path) if inside else {}
+    # without its last entry, a table is not there, as by default
+    return {**others, name: below} if below else others
 
 
 def other_cells(base: EvolveConfig, given: Mapping[str, Any]) -> EvolveConfig:

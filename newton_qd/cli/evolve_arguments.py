@@ -298,7 +298,8 @@ def settle(arguments: argparse.Namespace) -> tuple[EvolveConfig, Path]:
         warn_of_changes(facts, "when this config was written")
     if arguments.study:
         base = _of_study(arguments, given)
-    if arguments.unset:
+    # without an environment, the study has no settings, and the error below says so
+    if arguments.unset and not (arguments.study and base is None):
         base = with_defaults(base, arguments.unset)
     out = arguments.out
     if out is None:
