@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import errno
+import functools
 import io
 import json
 import os
@@ -17,8 +19,11 @@ import newton_qd
 from newton_qd import cli, tasks
 from newton_qd.cli import health
 from newton_qd.cli.arguments import require_writable
+from newton_qd.envs.base import Env
 from newton_qd.envs.pointmaze import PointMaze
 from newton_qd.qd.config import ConfigError
+from newton_qd.tasks import WrapperSpec
+from newton_qd.wrappers import Wrapper
 
 
 def test_an_environment_is_described(capsys: pytest.CaptureFixture[str]) -> None:
@@ -53,6 +58,31 @@ def test_a_description_says_what_wrappers_change(
     assert "The reward is minus the horizontal distance" in text
     assert cli.main(["envs", "ant"]) == cli.OK
     assert capsys.readouterr().out.startswith("ant: A torso on four legs")
+
+
+class Same(Wrapper):
+    """Changes nothing.
+
+    And does so in each step.
+
+    Attributes:
+        price: What it costs.
+    """
+
+    def __init__(self, env: Env, env_name: str, price: float) -> None:
+        super().__init__(env)
+        self.price = price
+
+
+def test_what_an_own_wrapper_says_is_told_without_its_arguments(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    wrapper = WrapperSpec(functools.partial(Same, price=1.0))
+    task = dataclasses.replace(tasks.ENVIRONMENTS["pointmaze"], wrappers=(wrapper,))
+    monkeypatch.setitem(tasks.ENVIRONMENTS, "pointmaze", task)
+    assert cli.main(["envs", "pointmaze"]) == cli.OK
+    text = capsys.readouterr().out
+    assert "\nSame: Changes nothing. And does so in each step.\n\nstep: " in text
 
 
 def test_a_class_without_a_text(

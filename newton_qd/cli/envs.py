@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import inspect
 import json
 import re
@@ -161,8 +162,13 @@ def _changes(name: str) -> list[dict[str, str]]:
 
     found = []
     for spec in tasks.ENVIRONMENTS[name].wrappers:
-        text = " ".join((spec.wrapper.__doc__ or "").split())
-        label = getattr(spec.wrapper, "__name__", "wrapper")
+        wrapper = spec.wrapper
+        while isinstance(wrapper, functools.partial):  # whose text is about partial
+            wrapper = wrapper.func
+        # without sections such as "Args:", which are about the code
+        whole = inspect.cleandoc(wrapper.__doc__ or "")
+        text = " ".join(re.split(r"^\w+:\n", whole, flags=re.MULTILINE)[0].split())
+        label = getattr(wrapper, "__name__", "wrapper")
         found.append({"wrapper": label, "meaning": text or "it has no description"})
     return found
 
