@@ -265,7 +265,10 @@ def test_controls_fit_a_narrow_page(pages: Pages, tmp_path: Path) -> None:
 def test_scenes_are_not_mixed(monkeypatch: pytest.MonkeyPatch) -> None:
     """The page has one drawing: a robot would move among walls that it never had."""
     runs = [opened("grid", 2, (5, 4), seed) for seed in (0, 1)]
-    assert explorer_html(runs)
+    done: list[tuple[int, int]] = []
+    assert explorer_html(runs, progress=lambda *count: done.append(count))
+    counts = [len(run.cells) for run in runs]
+    assert done == [(counts[0], sum(counts)), (sum(counts), sum(counts))]
     recorded = []
 
     def record(*arguments: Any, **options: Any) -> Any:
@@ -286,6 +289,7 @@ def test_the_last_step_is_seen(steps: int, every: int) -> None:
     found = re.search(r'"every": ?(\d+), ?"lengths": ?\[(\d+)', text)
     assert found is not None
     assert [int(x) for x in found.groups()] == [every, steps // every]
+    assert re.search(r'"dt": ?([\d.]+)', text)[1] == f"{every}.0"  # of a frame
 
 
 def test_a_large_archive_is_thinned(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -340,12 +344,13 @@ def test_a_loss_is_positive_if_the_archive_is_better(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def evaluate(run: Run, cells: Any, keys: Any) -> Any:
-        return SimpleNamespace(fitnesses=np.zeros((len(cells), len(keys))))
+        return SimpleNamespace(fitnesses=np.tile([-1.0, 9.0, 0.25], (len(cells), 1)))
 
     monkeypatch.setattr(Run, "evaluate", evaluate)
     run = opened("grid", 2, (5, 4))
-    found = _metrics(run, run.cells, pushed(run, len(run.cells)), 2, 0)
-    assert np.array_equal(found["loss from other starts"], found["fitness"])
+    found = _metrics(run, run.cells, pushed(run, len(run.cells)), 3, 0)
+    assert np.all(found["median fitness from 3 other starts"] == 0.25)
+    assert np.array_equal(found["loss from other starts"], found["fitness"] - 0.25)
 
 
 def test_other_starts_are_not_the_start_of_the_run(
@@ -368,12 +373,32 @@ def test_distances_are_up_to_the_end() -> None:
     run = opened("grid", 2, (5, 4), steps=2)
     found = _metrics(run, run.cells, pushed(run, len(run.cells)), 0, 0)
     np.testing.assert_allclose(found["distance from the start [-]"], 0.1, rtol=1e-4)
+    walk = pushed(run, len(run.cells))
+    mean = walk.rewards[:, :2].mean(axis=1)
+    np.testing.assert_allclose(found["mean reward of a step"], mean, rtol=1e-6)
+    # a hop is no distance: the first slide now goes up
+    axes = np.roll(np.eye(3)[:2], -1, axis=1)
+    walk = dataclasses.replace(
+        walk, drawing=dataclasses.replace(walk.drawing, joint_axis=axes)
+    )
+    found = _metrics(run, run.cells, walk, 0, 0)
+    np.testing.assert_allclose(found["distance from the start [-]"], 0.0, atol=1e-6)
 
 
 def test_motion_belongs_to_its_elite() -> None:
     run = opened("grid", 2, (5, 4))
-    data = _run_data(run, run.cells[1:3], pushed(run, 2), 1, 0, 0)["moving"]["data"]
-    assert np.frombuffer(base64.b64decode(data), np.int32).tolist() == [1, 2]
+    found = _run_data(run, run.cells[1:3], pushed(run, 2), 1, 0, 0)
+    numbers = np.frombuffer(base64.b64decode(found["moving"]["data"]), np.int32)
+    assert numbers.tolist() == [1, 2]
+    rows = {row["name"]: row["values"] for row in found["metrics"]}
+    steps = base64.b64decode(rows["steps before the end"]["data"])
+    known = np.isfinite(np.frombuffer(steps, np.float32))
+    assert np.flatnonzero(known).tolist() == [1, 2]
+    for index, label in enumerate(found["labels"]):
+        values = base64.b64decode(rows[label]["data"])
+        wanted = run.archive.descriptors[run.cells, index]
+        assert np.array_equal(np.frombuffer(values, np.float32), wanted)
+    assert (found["low"], found["high"]) == ([0.0, 0.0], [1.0, 1.0])
 
 
 def test_the_best_elite_moves_in_any_page() -> None:
@@ -435,6 +460,7 @@ def test_the_feet_of_a_page_are_those_of_the_descriptor() -> None:
     data = _motion_data(shown, 2)
     assert data["lengths"] == [2] and data["steps"] == [3]
     assert list(base64.b64decode(data["feet"]["data"])) == [2, 0]
-    numbers = np.frombuffer(base64.b64decode(data["q"]["data"]), "<i2")
-    scale, offset = data["q"]["scale"][0], data["q"]["offset"][0]
-    np.testing.assert_allclose(numbers * scale + offset, [0, 2, 3], atol=1e-3)
+    for name, wanted in (("q", [0, 2, 3]), ("rewards", [2, 1])):
+        numbers = np.frombuffer(base64.b64decode(data[name]["data"]), "<i2")
+        scale, offset = data[name]["scale"][0], data[name]["offset"][0]
+        np.testing.assert_allclose(numbers * scale + offset, wanted, atol=1e-3)

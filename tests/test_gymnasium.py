@@ -130,6 +130,7 @@ def test_seeds() -> None:
     env = make_gymnasium(limited())
     for seed in (0, 7, 2**31, 2**32 - 1):
         observation, _ = env.reset(seed=seed)
+        assert observation.flags.writeable  # nobody else's
         key = jax.random.key(np.uint32(seed))
         assert np.array_equal(observation, Clock().reset(key).obs)
     first = [env.reset(seed=1)[0][0], *(env.reset()[0][0] for _ in range(3))]
@@ -171,11 +172,14 @@ def test_autoreset_as_gymnasiums_own_vector_does(mode: str) -> None:
         for a, b in zip(ours[1:4], other[1:4], strict=True):
             assert np.array_equal(a, b)
         assert np.array_equal(ours[0][:, 1], other[0][:, 1])
+        assert np.array_equal(ours[4]["pressed"], other[4]["pressed"])
         ended = ours[2] | ours[3]
         if mode == SAME and ended.any():
             final = np.stack(list(other[4]["final_obs"][ended]))
             assert np.array_equal(ours[4]["final_obs"][ended, 1], final[:, 1])
             assert np.array_equal(ours[4]["_final_obs"], ended)
+            seen, theirs_seen = (x[4]["final_info"]["pressed"] for x in (ours, other))
+            assert np.array_equal(seen[ended], theirs_seen[ended])
         if mode == OFF and ended.any():
             options = {"reset_mask": ended}
             mine = many.reset(options=dict(options))[0]
@@ -225,6 +229,17 @@ def test_a_reset_of_all_worlds_is_not_followed_by_another() -> None:
     begun, _ = many.reset()
     after = many.step(pressed(of=2))[0]
     assert after[:, 1].tolist() == [1, 1] and (after[:, 0] == begun[:, 0]).all()
+
+
+def test_the_reward_of_a_first_state_is_not_counted() -> None:
+    class Early(Clock):
+        def reset(self, rng: jax.Array) -> State:
+            return super().reset(rng).replace(reward=jnp.float32(7.0))
+
+    many = make_gymnasium_vector(Early(), 2)
+    many.reset(seed=0)
+    assert many.step(pressed(0, of=2))[1].tolist() == [1, 1]
+    assert many.step(pressed(of=2))[1].tolist() == [0, 2]
 
 
 @pytest.mark.slow

@@ -8,10 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from urdf_text import joint, robot_text, row, write
+from urdf_text import heavy, joint, robot_text, row, write
 
-from newton_qd.physics import SoftLimitWarning, load_system
+from newton_qd.physics import SoftLimitWarning, load_system, reference
 from newton_qd.physics.model.limit_loads import limit_loads
+from newton_qd.physics.system import System
 from newton_qd.robots import Material, RobotSpec
 
 ARM = """<link name="arm"><inertial><origin xyz="0.5 0 0"/><mass value="30"/>
@@ -49,6 +50,67 @@ def test_weight_on_a_limit(tmp_path: Path, kind: str, axis: str, load: float) ->
         warnings.simplefilter("ignore", SoftLimitWarning)
         system = load_system(held(tmp_path, kind, axis))
     np.testing.assert_allclose(limit_loads(system), load, atol=1e-9)
+
+
+def potential_energy(system: System, q: np.ndarray) -> float:
+    frames = reference.body_frames(system, q)
+    heights = [
+        frame[2] + (reference.rotation_matrix(frame[3:]) @ com)[2]
+        for frame, com in zip(frames, system.com, strict=True)
+    ]
+    return system.robot.gravity * float(system.mass @ np.array(heights))
+
+
+def test_loads_are_slopes_of_the_potential_energy(tmp_path: Path) -> None:
+    """Of skew joints in a chain, with limits that are not symmetric."""
+    kinds = ("revolute", "prismatic", "revolute")
+    ends = ((-0.3, 0.9), (-0.2, 0.5), (-1.4, 0.2))
+    names = ("world", "a", "b", "c")
+    turned = '<origin xyz="0.2 -0.1 0.3" rpy="0.4 -0.7 0.2"/>'
+    joints = [
+        joint(
+            f"to_{child}",
+            kind,
+            parent,
+            child,
+            f'{turned}<axis xyz="{axis}"/><limit lower="{low}" upper="{high}"/>',
+        )
+        for kind, (low, high), parent, child, axis in zip(
+            kinds,
+            ends,
+            names,
+            names[1:],
+            ("0 1 0.3", "1 0.2 0.5", "-0.4 -1 0"),
+            strict=False,
+        )
+    ]
+    links = [
+        heavy(name, mass, com, "0.1 0.2 0.15")
+        for name, mass, com in (
+            ("a", 2.0, "0.3 0.1 -0.2"),
+            ("b", 1.5, "-0.1 0.4 0.2"),
+            ("c", 0.7, "0.2 0.3 0.5"),
+        )
+    ]
+    pose = (("to_a", 0.5), ("to_b", 0.2), ("to_c", -0.6))
+    text = robot_text('<link name="world"/>', *links, *joints)
+    robot = row(write(tmp_path, text), "a", gravity=3.7, rest_pose=pose)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        system = load_system(robot)
+    expected = []
+    for dof, limits in enumerate(ends):
+        out = []
+        for limit, sign in zip(limits, (-1, 1), strict=True):
+            q = system.rest_q.copy()
+            energies = []
+            for step in (1e-5, -1e-5):
+                q[dof] = limit + step
+                energies.append(potential_energy(system, q))
+            out.append(-sign * (energies[0] - energies[1]) / 2e-5)
+        expected.append(max(0.0, *out))
+    assert min(expected) > 0.1
+    np.testing.assert_allclose(limit_loads(system), expected, rtol=1e-7)
 
 
 def test_limits_that_give_way_are_named(tmp_path: Path) -> None:

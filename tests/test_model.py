@@ -324,6 +324,17 @@ def test_limits_of_joints_without_gear(tmp_path: Path) -> None:
     np.testing.assert_allclose(stiffness[6:], 2000)
 
 
+def test_a_limit_on_one_side_is_stiff(tmp_path: Path) -> None:
+    for lower, upper in ((-0.5, 1e9), (-1e9, 0.5), (-1e9, 1e9)):
+        limit = f'<limit lower="{lower}" upper="{upper}"/>'
+        hinge = joint("hinge", "revolute", "base", "tail", limit)
+        robot = row(
+            write(tmp_path, robot_text(link("base"), link("tail"), hinge)), "base"
+        )
+        stiffness = build_system(robot, "float32").limit_stiffness[6]
+        assert stiffness == pytest.approx(2000 if min(-lower, upper) < 1 else 0)
+
+
 def test_fixed_links_join_their_parent(tmp_path: Path) -> None:
     toe = f'<link name="toe">{sphere(0.02, "0 0 0.1")}</link>'
     turned = '<origin xyz="0.3 0 0" rpy="0 1.5707963267948966 0"/>'

@@ -163,6 +163,15 @@ def test_robots_of_the_suite_are_far_from_singular(name: str) -> None:
     assert share > 1e-3
 
 
+def test_pivots_factor_the_mass_matrix() -> None:
+    """Their product is its determinant, in any pose."""
+    system = load_system(ROBOTS["ur5e"])
+    q = np.random.default_rng(0).uniform(-2, 2, system.nq)
+    product = np.prod([pivot.left for pivot in inertia.pivots(system, q)])
+    determinant = np.linalg.det(reference.mass_matrix(system, q))
+    assert product == pytest.approx(determinant, rel=1e-9)
+
+
 def test_a_rotor_is_an_inertia() -> None:
     system = load_system(ROBOTS["hopper"])
     heavy = dataclasses.replace(system, armature=system.armature + 1.0)
