@@ -89,14 +89,16 @@ def test_what_pyribs_would_refuse_counts_as_faulty() -> None:
     def score(genotypes: jax.Array, key: jax.Array) -> Any:
         return jnp.ones(3), descriptors, {"gradients": gradients}
 
-    common: dict[str, Any] = {"limits": LIMITS, "worst": -100.0}
+    low, high = np.array([-1.0, -2.0]), np.ones(2)
+    common: dict[str, Any] = {"limits": (low, high), "worst": -100.0}
     solutions, key = np.zeros((3, 4)), jax.random.key(0)
     plain = make_ribs_evaluation(score, key, **common)(solutions)
     np.testing.assert_array_equal(plain[0], [1, -100, 1])
-    np.testing.assert_array_equal(plain[1], [[0.5, 0.5], [0, 0], [0.5, 0.5]])
+    np.testing.assert_array_equal(plain[1], [[0.5, 0.5], low, [0.5, 0.5]])
     dqd = make_ribs_evaluation(score, key, jacobian=True, **common)(solutions)
     np.testing.assert_array_equal(dqd[0], [1, -100, -100])
     np.testing.assert_array_equal(dqd[2].any(axis=(1, 2)), [True, False, False])
+    assert dqd[2].flags.writeable  # pyribs normalizes them in place
 
     def without(genotypes: jax.Array, key: jax.Array) -> Any:
         return jnp.ones(3), descriptors, {}
@@ -185,6 +187,30 @@ def test_archives_survive_the_way_there_and_back(kind: str, individuals: Any) ->
     )
     np.testing.assert_array_equal(again.fitnesses, repertoire.fitnesses)
     np.testing.assert_array_equal(again.genotypes, repertoire.genotypes)
+
+
+def test_cells_of_a_grid_keep_their_elites() -> None:
+    from ribs.archives import GridArchive
+
+    ranges: Any = [(0.0, 1.0), (-1.0, 2.0)]
+    archive = GridArchive(solution_dim=2, dims=(2, 3), ranges=ranges, dtype=np.float32)
+    measures = np.array([[0.75, -0.5], [0.25, 1.5]], np.float32)  # of cells 3 and 2
+    archive.add(np.array([[1, 2], [3, 4]]), np.array([5, 6]), measures)
+    repertoire = from_ribs(archive)
+    centroids = [[x, y] for x in (0.25, 0.75) for y in (-0.5, 0.5, 1.5)]
+    np.testing.assert_allclose(repertoire.centroids, centroids)
+    filled = np.isfinite(repertoire.fitnesses[:, 0])
+    assert np.flatnonzero(filled).tolist() == [2, 3]
+    assert repertoire.genotypes[2:4].tolist() == [[3, 4], [1, 2]]
+    limits = (np.array([0.0, -1.0]), np.array([1.0, 2.0]))
+    back = to_ribs(repertoire, limits, (2, 3)).data(
+        ["index", "solution", "objective", "measures"]
+    )
+    order = np.argsort(back["index"])
+    assert back["index"][order].tolist() == [2, 3]
+    assert back["solution"][order].tolist() == [[3, 4], [1, 2]]
+    assert back["objective"][order].tolist() == [6, 5]
+    np.testing.assert_array_equal(back["measures"][order], measures[::-1])
 
 
 @pytest.mark.slow

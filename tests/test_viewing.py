@@ -190,6 +190,7 @@ def test_arrays_are_encoded() -> None:
     assert np.array_equal(raw.reshape(exact["shape"]), array.astype(np.float32))
     short = html.encode(array, "int16")
     raw = np.frombuffer(base64.b64decode(short["data"]), "<i2")
+    assert (raw.min(), raw.max()) == (-32_767, 32_767)  # no bit is lost
     back = raw.reshape(-1, 3) * short["scale"] + short["offset"]
     assert np.abs(back - array.reshape(-1, 3)).max() < 8 / 65_535
     nothing = html.encode(np.zeros((2, 0, 3)), "int16")  # an episode of one step
