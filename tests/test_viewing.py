@@ -87,6 +87,13 @@ def test_contacts_are_those_of_the_bodies(ant: Any, walk: Trajectory) -> None:
     assert np.array_equal(carried > threshold, walk.feet[:, 1:] > 0)
 
 
+def test_feet_of_a_replay_are_those_of_the_trajectory(walk: Trajectory) -> None:
+    shown = html.trajectory_data(walk)["feet"]
+    found = np.frombuffer(base64.b64decode(shown["data"]), np.uint8)
+    assert 0 < found.sum() < found.size
+    assert np.array_equal(found.reshape(shown["shape"]), walk.feet)
+
+
 def test_a_policy_and_auto_reset() -> None:
     env = newton_qd.create("pointmaze", episode_length=4)
     up = record(env, lambda obs: jnp.ones_like(obs), jax.random.key(1), worlds=3)
