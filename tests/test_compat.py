@@ -135,13 +135,23 @@ def test_a_search_leaves_the_imports_of_others_alone() -> None:
 def test_functions_of_jumpy() -> None:
     jp: Any = importlib.import_module("brax.v1.jumpy")
     x = jnp.array([[3.0, 4.0], [0.0, 0.0]])
-    assert jp.norm(x) == 5 and jp.safe_norm(x, axis=1).tolist() == [5, 0]
+    assert (
+        jp.norm(x) == 5
+        and jp.norm(x, 1).tolist() == [5, 0]
+        and jp.safe_norm(x, axis=1).tolist() == [5, 0]
+    )
     slope = jax.grad(lambda x: jp.safe_norm(x, axis=1).sum())(x)
     np.testing.assert_allclose(slope, [[0.6, 0.8], [0, 0]], rtol=1e-6)
     assert jp.safe_norm(x[1]) == 0
     assert jp.take({"x": x}, [1, 0])["x"].tolist() == [[0, 0], [3, 4]]
     assert jp.take(x, 5).tolist() == [0, 0]  # as the last: JAX would give NaN
     assert jp.random_uniform(jp.random_prngkey(0), (9,), -1.0, 0.0).max() <= 0
+    uniform = jax.jit(lambda low: jp.random_uniform(jp.random_prngkey(0), (9,), low))
+    assert 0.5 <= uniform(0.5).min() < uniform(0.5).max() < 1
+    for include in ([True, False], (True, False)):
+        summed = jp.vmap(lambda a, b: (a * b).sum(), include)(x, x[0])
+        assert summed.tolist() == [25, 0]
+    assert jp.vmap(jnp.dot)(x, x).tolist() == [25, 0]
     assert jp.index_update(x, (1, 0), 7).tolist() == [[3, 4], [7, 0]]
     assert 2 <= jp.randint(jp.random_prngkey(0), low=2, high=4) < 4
 

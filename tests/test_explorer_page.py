@@ -289,7 +289,7 @@ def test_the_last_step_is_seen(steps: int, every: int) -> None:
     found = re.search(r'"every": ?(\d+), ?"lengths": ?\[(\d+)', text)
     assert found is not None
     assert [int(x) for x in found.groups()] == [every, steps // every]
-    assert re.search(r'"dt": ?([\d.]+)', text)[1] == f"{every}.0"  # of a frame
+    assert f'"dt":{every}.0,' in text  # of a frame
 
 
 def test_a_large_archive_is_thinned(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -201,7 +201,7 @@ def test_cells_of_a_grid_keep_their_elites() -> None:
     np.testing.assert_allclose(repertoire.centroids, centroids)
     filled = np.isfinite(repertoire.fitnesses[:, 0])
     assert np.flatnonzero(filled).tolist() == [2, 3]
-    assert repertoire.genotypes[2:4].tolist() == [[3, 4], [1, 2]]
+    assert np.asarray(repertoire.genotypes)[2:4].tolist() == [[3, 4], [1, 2]]
     limits = (np.array([0.0, -1.0]), np.array([1.0, 2.0]))
     back = to_ribs(repertoire, limits, (2, 3)).data(
         ["index", "solution", "objective", "measures"]

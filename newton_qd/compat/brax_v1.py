@@ -6,13 +6,14 @@ If brax v1 is installed, it stays, and only learns of the environments of this l
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from newton_qd.brax_views.configuration import JointSettings as Joint
 from newton_qd.brax_views.views import QP, SystemView
@@ -23,6 +24,7 @@ __all__ = [
     "QP",
     "Joint",
     "index_update",
+    "norm",
     "randint",
     "random_prngkey",
     "random_split",
@@ -32,6 +34,7 @@ __all__ = [
     "save_html",
     "take",
     "vec_to_arr",
+    "vmap",
 ]
 
 
@@ -48,12 +51,13 @@ def random_split(rng: jax.Array, num: int = 2) -> jax.Array:
 def random_uniform(
     rng: jax.Array,
     shape: tuple[int, ...] = (),
-    low: float | None = 0.0,
-    high: float | None = 1.0,
+    low: ArrayLike | None = 0.0,
+    high: ArrayLike | None = 1.0,
 ) -> jax.Array:
     """Returns uniform random numbers from ``low`` to ``high``."""
-    most = 1.0 if high is None else high
-    return jax.random.uniform(rng, shape, jnp.float32, low or 0.0, most)
+    # no "low or 0.0": a traced number has no truth value
+    least, most = 0.0 if low is None else low, 1.0 if high is None else high
+    return jax.random.uniform(rng, shape, jnp.float32, least, most)
 
 
 def randint(
@@ -72,6 +76,20 @@ def take(tree: Any, i: Any, axis: int = 0) -> Any:
 def index_update(x: jax.Array, idx: Any, y: Any) -> jax.Array:
     """Returns a copy with ``x[idx]`` replaced by ``y``."""
     return jnp.asarray(x).at[idx].set(y)
+
+
+def norm(x: ArrayLike, axis: int | tuple[int, ...] | None = None) -> jax.Array:
+    """Returns the norm of a vector. The second argument of JAX's is another one."""
+    return jnp.linalg.norm(jnp.asarray(x), axis=axis)
+
+
+def vmap(
+    fun: Callable[..., Any], include: Sequence[bool] | None = None
+) -> Callable[..., Any]:
+    """Maps a function over the first axis of its arguments, or of those included."""
+    if not include:
+        return jax.vmap(fun)
+    return jax.vmap(fun, tuple(0 if inside else None for inside in include))
 
 
 def safe_norm(x: jax.Array, axis: int | None = None) -> jax.Array:
