@@ -313,6 +313,13 @@ def test_rest_height(tmp_path: Path) -> None:
     np.testing.assert_allclose(planar.rest_q, [0, -1.25, 0, 0], atol=1e-15)
     ant = build_system(dataclasses.replace(ANT, rest_height=0.75), "float32")
     assert ant.rest_q[2] == 0.75
+    # a slide that begins above the ground, and points down
+    raised = PLANAR.replace('<axis xyz="0 0 -1"/>', '<axis xyz="0 0 -1"/>{}')
+    raised = raised.format('<origin xyz="0 0 2"/>')
+    robot = dataclasses.replace(
+        planar_spec(tmp_path, rest_height=1.25), urdf=write(tmp_path, raised)
+    )
+    np.testing.assert_allclose(build_system(robot, "float32").rest_q[1], 0.75)
 
 
 def test_limits_of_joints_without_gear(tmp_path: Path) -> None:

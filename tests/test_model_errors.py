@@ -393,17 +393,18 @@ def test_missing_file(tmp_path: Path) -> None:
         find_urdf("")
 
 
-def test_a_height_beyond_the_limits_of_its_slide(tmp_path: Path) -> None:
-    limits = '<axis xyz="0 0 1"/><limit lower="0" upper="0.5"/>'
+@pytest.mark.parametrize(("axis", "heights"), [(1, "0 to 0.5"), (-1, "-0.5 to 0")])
+def test_a_height_beyond_the_limits_of_its_slide(
+    axis: int, heights: str, tmp_path: Path
+) -> None:
+    limits = f'<axis xyz="0 0 {axis}"/><limit lower="0" upper="0.5"/>'
     text = robot_text(
         '<link name="world"/>',
         joint("z", "prismatic", "world", "body", limits),
         link("body", sphere(0.7)),
     )
+    allowed = f"rest_height: got .*'z' must be at .*; allowed: .* torso of {heights} m"
     for changes in ({"rest_height": 3.0}, {"contacts": (Contact("body"),)}):
-        allowed = (
-            r"rest_height: got .*'z' must be at .*; allowed: .* torso of 0 to 0.5 m"
-        )
         with pytest.raises(RobotDescriptionError, match=allowed):
             built(tmp_path, text, "body", **changes)
 

@@ -18,7 +18,8 @@ from urdf_text import joint, link, row, sphere, write
 from newton_qd.assets import AssetNotFoundError, find_urdf
 from newton_qd.physics import reference
 from newton_qd.physics.model import build_system, load_system, newton_builder
-from newton_qd.physics.model.scene import read_scene
+from newton_qd.physics.model.elements import Shape
+from newton_qd.physics.model.scene import read_scene, whole_collider
 from newton_qd.physics.model.xml_reader import (
     RobotDescriptionError,
     RobotDescriptionWarning,
@@ -63,6 +64,16 @@ def wall_ends(system: System) -> np.ndarray:
         half = size[1] * reference.rotation_matrix(frame[3:])[:, 2]
         ends.append([frame[:3] - half, frame[:3] + half])
     return np.array(ends)
+
+
+def test_a_turned_capsule_keeps_its_axis() -> None:
+    turn = reference.rpy_quaternion(0, np.pi / 2, np.pi / 2)  # z to x, then to y
+    frame = np.concatenate([[1, 2, 3], turn])
+    shape = Shape("leg", "capsule", frame, np.array([0.1, 0.4, 0]))
+    row = whole_collider(5, 2, shape)
+    np.testing.assert_allclose(row.segment, [0, 0.4, 0], atol=1e-12)
+    np.testing.assert_array_equal(row.position, [1, 2, 3])
+    assert (row.body, row.obstacle, row.radius) == (5, 2, 0.1)
 
 
 @pytest.mark.parametrize("name", WALLS)

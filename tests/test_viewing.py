@@ -113,6 +113,11 @@ def test_a_state_of_ones_own_is_the_start() -> None:
     later = env.rollout(state, jnp.full((3, 2), 0.5))
     for q in seen.q:
         np.testing.assert_array_equal(q, jnp.stack([state.obs, *later.obs]))
+    plan = jnp.linspace(0, 1, 6).reshape(3, 2)
+    long, short = (record(env, plan, jax.random.key(1), steps=n) for n in (3, 2))
+    first = env.reset(jax.random.key(1)).obs
+    np.testing.assert_allclose(long.q[0, 0], first, rtol=1e-6)
+    np.testing.assert_allclose(short.q, long.q[:, :3], rtol=1e-6)
     batch = jax.tree.map(lambda x: x[None], state)
     with pytest.raises(ValueError, match=r"^key: got a state of a batch of shape \(1,"):
         record(env, jnp.zeros((3, 2)), batch)
@@ -172,6 +177,8 @@ def test_every_shape_is_one_of_the_files(name: str) -> None:
         assert sum(shape.visual is visual for shape in drawing.shapes) == count
     assert {shape.body for shape in drawing.shapes} <= set(range(-1, system.nb))
     assert drawing.radius > 0
+    fixed = ("acrobot", "grasp", "pusher", "reacher", "reacherangle", "ur5e")
+    assert drawing.follow is (name not in fixed)
     target = [s for s in drawing.shapes if s.body < 0 and s.color[3] < 1]
     assert len(target) == 1  # of the maze, which one can see through
 
@@ -188,6 +195,8 @@ def test_the_maze_is_that_of_the_environment() -> None:
         [float(s.frame[1] + sign * s.size[1]) for s in boxes[:2]] for sign in (-1, 1)
     )
     assert np.allclose(low, [-0.5, 0.2]) and np.allclose(high, [-0.49, 0.21])
+    # borders are as thick as the walls
+    assert np.allclose([s.size[:2].min() for s in boxes[:6]], 0.005)
 
 
 def test_arrays_are_encoded() -> None:
