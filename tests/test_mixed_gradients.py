@@ -190,22 +190,38 @@ def test_tolerance_finds_a_jump() -> None:
     np.testing.assert_allclose(careful.gradients[0, 0, 0, 0], slope, rtol=0.1)
 
 
+def test_noise_does_not_repeat_the_reset(monkeypatch: pytest.MonkeyPatch) -> None:
+    def key_of_noise(*arguments: Any, **options: Any) -> jax.Array:
+        del options
+        return jax.random.key_data(arguments[3])
+
+    monkeypatch.setattr("newton_qd.gradients.episode.mixed_gradients", key_of_noise)
+    env: Any = Landscape(jnp.sum)
+    key = jax.random.key(3)
+    found = Episode(env, None, episode_length=1).mixed(jnp.zeros((1, 1, 3)), key)
+    assert not np.array_equal(np.asarray(found), jax.random.key_data(key))
+
+
 def test_samples_that_are_not_finite_are_left_out() -> None:
     """Faulty samples; slopes beyond the numbers; an individual that is faulty."""
 
     def reward(action: jax.Array) -> jax.Array:
-        bad = jnp.where(action[1] > 0.1, jnp.nan, 0.0).astype(jnp.float32)
+        wrong = (action[1] > 0.1) | (action[1] == -1.0)
+        bad = jnp.where(wrong, jnp.nan, 0.0).astype(jnp.float32)
         steep = action[2] > 0.5
         # forward 0; backward infinity times 0
         cliff = jnp.sqrt(jnp.where(steep, 0 * action[2], 1))
         return action[0] + bad + jnp.where(steep, cliff, 0)
 
-    actions = np.array([[[0, 0, 0]], [[0, 1, 0]], [[0, 0, 0.5]]])
+    actions = np.array([[[0, 0, 0]], [[0, 1, 0]], [[0, 0, 0.5]], [[0, -1, 0]]])
     result = estimate(reward, actions, sigma=0.1, samples=64)
-    np.testing.assert_array_equal(result.faulty, [False, True, False])
+    np.testing.assert_array_equal(result.faulty, [False, True, False, True])
     assert all(np.isfinite(x).all() for x in (result.gradients, result.order))
     np.testing.assert_allclose(result.gradients[0, 0, 0, 0], 1.0, 1e-4)
-    assert not result.gradients[1].any() and result.fitnesses[1] == -np.inf
+    for fault in (1, 3):  # the last has samples without a fault
+        assert not result.gradients[fault].any()
+        assert result.fitnesses[fault] == -np.inf
+    assert not result.overflowed.any()
     # the third's first order has samples that are not finite: the zeroth alone
     assert result.order[2, 0] == 0 and np.isinf(result.first_variance[2, 0])
     np.testing.assert_allclose(result.gradients[2, 0, 0, 0], 1.0, atol=0.6)

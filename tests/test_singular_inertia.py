@@ -163,10 +163,15 @@ def test_robots_of_the_suite_are_far_from_singular(name: str) -> None:
     assert share > 1e-3
 
 
-def test_pivots_factor_the_mass_matrix() -> None:
+def test_pivots_factor_the_mass_matrix(tmp_path: Path) -> None:
     """Their product is its determinant, in any pose."""
-    system = load_system(ROBOTS["ur5e"])
-    q = np.random.default_rng(0).uniform(-2, 2, system.nq)
+    axes = {"a": "0 0 1", "b": "0.2 1 0", "c": "1 0 0.3"}
+    text = chain(axes, heavy("c", 1.5, "-0.1 0.4 0.2", "0.1 0.5 0.45"))
+    for name in ("a", "b"):
+        inside = heavy(name, 2.0, "0.3 0.1 -0.2", "0.6 0.2 0.7")
+        text = text.replace(f'<link name="{name}"/>', inside)
+    system = built(tmp_path, text, "c")
+    q = np.array([0.7, -1.2, 0.4])
     product = np.prod([pivot.left for pivot in inertia.pivots(system, q)])
     determinant = np.linalg.det(reference.mass_matrix(system, q))
     assert product == pytest.approx(determinant, rel=1e-9)
