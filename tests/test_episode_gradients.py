@@ -27,7 +27,9 @@ from newton_qd.gradients import (
     make_episode_gradient,
     with_smooth_descriptor,
 )
+from newton_qd.gradients.exact import differentiate
 from newton_qd.gradients.flow import passed_back
+from newton_qd.gradients.outcome import Outcome
 from newton_qd.qd.scoring.gradient_scoring import make_gradient_scoring_function
 from newton_qd.qd.scoring.task import Task
 
@@ -314,6 +316,19 @@ def test_a_descriptor_that_is_not_finite_is_a_fault() -> None:
         jnp.ones((2, 1)), jax.random.key(0)
     )
     assert found.faulty and found.fitness == -np.inf
+
+
+def test_a_faulty_episode_has_no_gradient() -> None:
+    def run(x: jax.Array) -> Outcome:
+        return Outcome(x.sum(), x[:1], x[0] > 1)
+
+    slopes = [differentiate(run, jnp.array([x, 3.0]), None).gradients for x in (0, 2)]
+    assert slopes[0].tolist() == [[1, 1], [1, 0]] and not slopes[1].any()
+
+
+def test_the_first_state_is_in_the_first_window() -> None:
+    factors = GradientOptions(window=3, discount=0.5).factors(7)
+    assert factors.tolist() == [1, 0.5, 0.5, 0, 0.5, 0.5, 0]
 
 
 def test_a_gradient_that_is_cut_is_zero_whatever_it_was() -> None:
