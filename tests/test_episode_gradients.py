@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -30,6 +31,7 @@ from newton_qd.gradients import (
 from newton_qd.gradients.exact import differentiate
 from newton_qd.gradients.flow import passed_back
 from newton_qd.gradients.outcome import Outcome
+from newton_qd.gradients.plans import run_plan
 from newton_qd.qd.scoring.gradient_scoring import make_gradient_scoring_function
 from newton_qd.qd.scoring.task import Task
 
@@ -306,6 +308,24 @@ def test_no_gradient_is_silently_not_finite() -> None:
 def test_a_fault_after_the_end_costs_nothing() -> None:
     result = on_line(1.0, [[[1.0], [20.0], [2000.0], [0.0]]], GradientOptions())
     assert result.fitnesses[0] == 1 + 21 and not result.faulty.any()
+
+
+@pytest.mark.parametrize(("fault", "counts"), [(1, True), (2, False)])
+def test_steps_of_a_plan_that_count(fault: int, counts: bool) -> None:
+    """Faults up to the end, and descriptors before each step."""
+    rewards, done = jnp.array([1.0, 2.0, 4.0]), jnp.array([0.0, 1.0, 0.0])
+    info = {
+        "fault": (jnp.arange(3) == fault).astype(jnp.int32),
+        "state_descriptor": rewards[:, None],
+    }
+    env: Any = SimpleNamespace(
+        rollout=lambda *_: State((), rewards[:, None], rewards, done, {}, info)
+    )
+    first = SimpleNamespace(info={"state_descriptor": jnp.array([9.0])})
+    plan = jnp.zeros((3, 1))
+    fitness, seen, over, bad = run_plan(env, first, plan, None, described=True)
+    assert fitness == 3 and over.tolist() == [False, False, True] and bad == counts
+    assert seen is not None and seen[:, 0].tolist() == [9, 1, 2]
 
 
 def test_a_descriptor_that_is_not_finite_is_a_fault() -> None:
