@@ -338,6 +338,13 @@ def test_a_descriptor_that_is_not_finite_is_a_fault() -> None:
     assert found.faulty and found.fitness == -np.inf
 
 
+@pytest.mark.parametrize("size", [0.0, 1e-30, 1.0, 1e38, 3e38])
+def test_long_adjoints_are_clipped(size: float) -> None:
+    _, back = jax.vjp(lambda x: passed_back(x, jnp.float32(1), 0.5), jnp.ones(2))
+    (found,) = back(jnp.array([size, 0.0], jnp.float32))
+    assert found.tolist() == pytest.approx([min(size, 0.5), 0.0], rel=1e-6)
+
+
 def test_a_faulty_episode_has_no_gradient() -> None:
     def run(x: jax.Array) -> Outcome:
         return Outcome(x.sum(), x[:1], x[0] > 1)

@@ -111,6 +111,12 @@ def test_pytree_genotypes_and_plans() -> None:
     )
 
 
+def test_directions_of_the_largest_numbers() -> None:
+    """Their norm is no number, and their direction is."""
+    rows = unit_rows(jnp.array([[[3e38, -3e38, 3e38, 3e38]]]).swapaxes(1, 2))
+    np.testing.assert_allclose(rows[0, :, 0], [0.5, -0.5, 0.5, 0.5], rtol=1e-6)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["omg", "cma"])
 def test_qdax_emitters_take_the_gradients(name: str) -> None:

@@ -252,6 +252,13 @@ def test_one_sound_pair_is_too_few() -> None:
     assert not found.gradients[lost, 0].any()
 
 
+def test_slopes_near_the_largest_number() -> None:
+    """Their sums are no numbers, and neither are reciprocals."""
+    steep = 2e38
+    found = estimate(lambda a: a[0] * steep, np.zeros((1, 1, 3)), samples=2)
+    np.testing.assert_allclose(found.gradients[0, 0, 0], [steep, 0, 0], rtol=1e-6)
+
+
 def test_slopes_whose_squares_are_no_numbers() -> None:
     """Squares above 1e38 are infinite in float32: the zeroth order takes over."""
 

@@ -16,6 +16,7 @@ from newton_qd.types import PyTree
 
 Tree = TypeVar("Tree")
 Carry = TypeVar("Carry")
+_LARGE = 2.0**64  # numbers above it are shrunk by it before they are clipped
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -115,11 +116,15 @@ def _backward(
 ) -> tuple[list[jax.Array], jax.Array]:
     scale = factor
     if clip is not None:
-        norm = tree_norm(adjoint)
+        # a power of two changes no digit; clip / norm would be too small for the dtype
+        shrink = jnp.where(tree_largest(adjoint) > _LARGE, 1 / _LARGE, 1)
+        small = [x * shrink.astype(x.dtype) for x in adjoint]
+        norm = tree_norm(small)
         # no division without clipping; an adjoint that is not finite stays like this
-        scale = scale * jnp.where(
-            norm > clip, clip / jnp.where(norm > clip, norm, 1), 1
-        )
+        longer = norm > clip * shrink
+        scale = scale * jnp.where(longer, clip / jnp.where(longer, norm, 1), 1)
+        pairs = zip(small, adjoint, strict=True)
+        adjoint = [jnp.where(longer, shrunk, x) for shrunk, x in pairs]
     cut = factor == 0
     changed = [jnp.where(cut, 0, x * scale.astype(x.dtype)) for x in adjoint]
     return changed, jnp.zeros_like(factor)
@@ -182,7 +187,7 @@ def tree_norm(tree: PyTree) -> jax.Array:
     """
     # scaled first: squares of numbers above 1e19 are not finite in single precision
     largest = tree_largest(tree)
-    unit = jnp.where((largest > 0) & jnp.isfinite(largest), largest, 1)
+    unit = divisor(jnp.where(jnp.isfinite(largest), largest, 1))
     squares = [jnp.sum(jnp.square(x / unit)) for x in jax.tree.leaves(tree)]
     return unit * jnp.sqrt(functools.reduce(jnp.add, squares))
 
@@ -195,3 +200,13 @@ def tree_largest(tree: PyTree) -> jax.Array:
     """
     leaves = [jnp.max(jnp.abs(x), initial=0) for x in jax.tree.leaves(tree)]
     return functools.reduce(jnp.maximum, leaves)
+
+
+def divisor(size: jax.Array) -> jax.Array:
+    """Returns a number () to divide by numbers up to a size () with; 1 for size 0.
+
+    It is the size, or a quarter of the largest number if the size is above. XLA
+    multiplies by the reciprocal of a divisor, which would be too small for the dtype.
+    """
+    most = 1 / jnp.finfo(size.dtype).tiny
+    return jnp.minimum(jnp.where(size == 0, 1, size), most)

@@ -293,7 +293,9 @@ def _samples(
     zeroth = jax.tree.map(
         lambda w: jax.vmap(jnp.multiply.outer)(slope, w / sigma), noise
     )
-    first = jax.tree.map(lambda g: 0.5 * g[:, 0] + 0.5 * g[:, 1], gradients)
+    # the barrier keeps XLA from adding before it halves, which may overflow
+    halves = jax.lax.optimization_barrier(jax.tree.map(lambda g: 0.5 * g, gradients))
+    first = jax.tree.map(lambda g: g[:, 0] + g[:, 1], halves)
     missing = ~jax.vmap(finite_rows)(zeroth).all(axis=0)
 
     def without(samples: PyTree, gone: jax.Array) -> PyTree:
@@ -313,13 +315,17 @@ def _scaled(samples: PyTree, unit: jax.Array) -> PyTree:
 
 
 def _unit(samples: PyTree) -> jax.Array:
-    """Returns a power of two (rows,), or 1, near the largest of samples."""
+    """Returns a power of two (rows,) near the largest of samples; 1 if that is 0."""
     sizes = [
         jnp.abs(jnp.moveaxis(x, 1, 0)).reshape(x.shape[1], -1).max(axis=1, initial=0)
         for x in jax.tree.leaves(samples)
     ]
     largest = functools.reduce(jnp.maximum, sizes)
-    exponent = jnp.frexp(largest)[1] - 1  # exact: division by it changes no digit
+    # exact: division by it changes no digit. XLA multiplies by the reciprocal, which is
+    # too small for the dtype if the power is larger.
+    exponent = jnp.minimum(
+        jnp.frexp(largest)[1] - 1, jnp.finfo(largest.dtype).maxexp - 3
+    )
     one = jnp.ones_like(largest)
     return jnp.where(largest > 0, jnp.ldexp(one, exponent), one)
 

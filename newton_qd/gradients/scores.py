@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from newton_qd.gradients.exact import EpisodeGradients
-from newton_qd.gradients.flow import tree_largest, tree_norm
+from newton_qd.gradients.flow import divisor, tree_largest, tree_norm
 from newton_qd.gradients.outcome import Outcome
 from newton_qd.types import ExtraScores, Genotype
 
@@ -49,9 +49,8 @@ def _unit(gradient: Genotype) -> Genotype:
     """Returns a gradient of norm 1, or 0 where it is 0."""
     # scaled twice, because the norm of large numbers may overflow
     for norm in (tree_largest, tree_norm):
-        size = norm(gradient)
-        divisor = jnp.where(size == 0, jnp.ones_like(size), size)
-        gradient = jax.tree.map(lambda x, d=divisor: x / d, gradient)
+        size = divisor(norm(gradient))
+        gradient = jax.tree.map(lambda x, size=size: x / size, gradient)
     return gradient
 
 
