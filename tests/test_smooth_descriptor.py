@@ -80,6 +80,8 @@ def test_smooth_descriptor_leaves_the_environment_as_it_was() -> None:
     assert not readings[0].any()
     np.testing.assert_array_equal(readings[1], readings[2])
     assert readings[1].all()
+    stepped = with_smooth_descriptor(env, 0.05, straight_through=True)
+    assert not np.asarray(stepped.reset(key).info["state_descriptor"]).any()
     tail: Any = with_smooth_descriptor(env, 0.05, tail="algebraic")
     assert (tail.system.feet_width, tail.system.feet_tail) == (0.05, "algebraic")
     for name in ("ant_omni", "pointmaze"):

@@ -176,6 +176,24 @@ def test_contact_is_that_of_the_observation(batch: BraxState) -> None:
     assert np.all(still.vel == 0) and np.all(still.ang == 0)
 
 
+def test_contact_changes_velocities_by_mass_and_inertia(batch: BraxState) -> None:
+    system, physics = ANT.system, batch.pipeline_state
+    impulse = jax.random.normal(KEY, physics.impulse.shape)
+    qp = dataclasses.replace(
+        batch.qp, physics=dataclasses.replace(physics, impulse=impulse)
+    )
+    found = ANT.sys.info(qp).contact
+    for world, body in ((0, 0), (2, 4)):  # all links of an ant have a row
+        turn = reference.rotation_matrix(np.roll(np.asarray(qp.rot[world, body]), -1))
+        inertia = turn @ system.inertia[body] @ turn.T
+        push, twist = np.split(np.asarray(impulse[world, body]), 2)
+        for change, wanted in (
+            (found.vel, push / system.mass[body]),
+            (found.ang, np.linalg.solve(inertia, twist)),
+        ):
+            np.testing.assert_allclose(change[world, body], wanted, rtol=1e-4)
+
+
 @pytest.mark.parametrize("repeat", [1, 3])
 def test_config(repeat: int) -> None:
     env: Any = newton_qd.create("ant_uni", action_repeat=repeat, brax_views=True)
