@@ -427,3 +427,27 @@ def test_the_root_is_raised_and_not_a_lift(tmp_path: Path) -> None:
     system = built(tmp_path, text, "head", contacts=(Contact("base"),))
     assert np.asarray(system.rest_q)[[2, 7]].tolist() == [0.2, 0.0]
     assert raising_coordinate(system) == (2, 1.0)
+
+
+def test_contacts_without_gravity_are_as_stiff_as_on_earth() -> None:
+    system, material = (
+        build_system(ROBOTS["pusher"], "float32"),
+        ROBOTS["pusher"].material,
+    )
+    held = material.support * material.static_penetration
+    assert system.contact_stiffness == pytest.approx(9.81 * system.total_mass / held)
+
+
+def test_the_lying_humanoid_looks_up() -> None:
+    turn = build_system(ROBOTS["humanoidstandup"], "float32").rest_q[3:7]
+    ahead = reference.rotation_matrix(turn)[:, 0]
+    np.testing.assert_allclose(ahead, [0, 0, 1], atol=1e-9)
+
+
+def test_actions_of_the_quadruped_go_from_hip_to_knee() -> None:
+    system = build_system(ROBOTS["quadruped"], "float32")
+    bodies = np.searchsorted(system.v_start, system.control_dof[:4])
+    names = [system.joint_names[body] for body in bodies]
+    assert names == [f"{x}_front_left" for x in ("hip", "thigh", "knee")] + [
+        "hip_front_right"
+    ]

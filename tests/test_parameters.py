@@ -20,9 +20,9 @@ import newton_qd
 from newton_qd import physics
 from newton_qd.envs.base import Env
 from newton_qd.envs.state import State
-from newton_qd.physics.parameters import FIELDS, parameter_shapes
+from newton_qd.physics.parameters import FIELDS, parameter_row, parameter_shapes
 from newton_qd.physics.system import PhysicsState, System
-from newton_qd.robots import ANT, HOPPER, RobotSpec
+from newton_qd.robots import ANT, HOPPER, ROBOTS, RobotSpec
 
 WORLDS = 16
 Params = physics.PhysicsParams
@@ -397,3 +397,19 @@ def test_friction_holds_a_box(x64: None, tmp_path: Path) -> None:
     free = system.robot.gravity * np.sin(angle) * steps * system.robot.dt
     assert slide(0.0)[:3] @ along == pytest.approx(free, rel=1e-3)
     assert abs(slide(1.0)[:3] @ along) < 0.05 * free
+
+
+def test_default_parameters_are_those_of_the_robot() -> None:
+    for name in ("halfcheetah", "fetch"):
+        found = physics.default_params(physics.load_system(ROBOTS[name]))
+        assert found.friction == np.float32(ROBOTS[name].material.friction) != 1
+        assert found.gravity == np.float32(ROBOTS[name].gravity)
+
+
+@pytest.mark.parametrize("field", ["mass_scale", "inertia_scale"])
+def test_a_body_has_mass_and_inertia(field: str) -> None:
+    system = physics.load_system(ROBOTS["hopper"])
+    params = physics.default_params(system)
+    zero = {field: 0 * getattr(params, field)}
+    with pytest.raises(ValueError, match=f"params.{field}: got 0.0; allowed: finite"):
+        parameter_row(system, params.replace(**zero))

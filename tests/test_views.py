@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -22,13 +23,15 @@ from newton_qd.brax_views import (
     FixedInitialStateWrapper,
     Info,
 )
+from newton_qd.brax_views.views import SystemView
 from newton_qd.compat import brax_envs, env_creators
 from newton_qd.envs.ant import Ant
+from newton_qd.envs.joints import solid_bodies
 from newton_qd.envs.pointmaze import PointMaze
 from newton_qd.envs.state import State
-from newton_qd.physics import reference
+from newton_qd.physics import load_system, reference
 from newton_qd.robots import ANT as ANT_SPEC
-from newton_qd.robots import Material
+from newton_qd.robots import ROBOTS, Material
 from newton_qd.wrappers import TrapWrapper
 
 ANT: Any = BraxViewsWrapper(Ant())
@@ -176,22 +179,34 @@ def test_contact_is_that_of_the_observation(batch: BraxState) -> None:
     assert np.all(still.vel == 0) and np.all(still.ang == 0)
 
 
-def test_contact_changes_velocities_by_mass_and_inertia(batch: BraxState) -> None:
-    system, physics = ANT.system, batch.pipeline_state
-    impulse = jax.random.normal(KEY, physics.impulse.shape)
-    qp = dataclasses.replace(
-        batch.qp, physics=dataclasses.replace(physics, impulse=impulse)
-    )
-    found = ANT.sys.info(qp).contact
-    for world, body in ((0, 0), (2, 4)):  # all links of an ant have a row
-        turn = reference.rotation_matrix(np.roll(np.asarray(qp.rot[world, body]), -1))
+def test_contact_changes_velocities_by_mass_and_inertia() -> None:
+    system = load_system(ROBOTS["quadruped"])  # others have the original's inertia of 1
+    rng, solid = np.random.default_rng(0), solid_bodies(system)
+    rot = rng.normal(size=(len(solid) + 1, 4))
+    rot /= np.linalg.norm(rot, axis=1, keepdims=True)
+    impulse = rng.normal(size=(system.nb, 6))
+    physics: Any = SimpleNamespace(impulse=jnp.asarray(impulse, np.float32))
+    none = jnp.zeros((len(rot), 3), np.float32)
+    qp = QP(none, jnp.asarray(rot, np.float32), none, none, physics)
+    found = SystemView(system).info(qp).contact
+    for place, body in enumerate(solid):
+        turn = reference.rotation_matrix(np.roll(rot[place], -1))
         inertia = turn @ system.inertia[body] @ turn.T
-        push, twist = np.split(np.asarray(impulse[world, body]), 2)
-        for change, wanted in (
-            (found.vel, push / system.mass[body]),
-            (found.ang, np.linalg.solve(inertia, twist)),
-        ):
-            np.testing.assert_allclose(change[world, body], wanted, rtol=1e-4)
+        speeds = impulse[body, :3] / system.mass[body]
+        rates = np.linalg.solve(inertia, impulse[body, 3:])
+        np.testing.assert_allclose(found.vel[place], speeds, rtol=1e-4)
+        np.testing.assert_allclose(found.ang[place], rates, rtol=1e-3, atol=0.01)
+    assert not found.vel[-1].any() and not found.ang[-1].any()  # the ground
+
+
+def test_limits_of_joints_are_ordered() -> None:
+    joints = {joint.name: joint for joint in ANT.sys.config.joints}
+    (hip,), (ankle,) = joints["hip_1"].angle_limit, joints["ankle_1"].angle_limit
+    assert (hip.min, hip.max) == pytest.approx((-30, 30))
+    assert (ankle.min, ankle.max) == pytest.approx((30, 70))
+    turning: Any = newton_qd.create("acrobot", brax_views=True)
+    (free,) = turning.sys.config.joints[0].angle_limit
+    assert (free.min, free.max) == (-360, 360)
 
 
 @pytest.mark.parametrize("repeat", [1, 3])
