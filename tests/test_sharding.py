@@ -282,6 +282,7 @@ def test_keys_of_several_processes_keep_their_generator(
 def test_two_processes_agree_with_one(devices: Devices) -> None:
     """In the scores of a batch, and in the archive of a run."""
     code = """
+import tempfile
 from jax.sharding import NamedSharding, PartitionSpec
 score, genotypes = problem("ant_uni", 16, 5)
 mesh = device_mesh(count)
@@ -295,7 +296,9 @@ found = jax.jit(run)(*jax.device_put((genotypes, data), everywhere))
 scored = [mesh.size, *(np.asarray(x).tolist() for x in found[:2])]
 
 try:
-    refused, found = "", evolved("pointmaze", devices=count, resume=True)
+    with tempfile.TemporaryDirectory() as out:
+        found = evolved("pointmaze", devices=count, resume=True, out=out)
+    refused = ""
 except newton_qd.qd.ConfigError as error:
     refused, found = str(error), evolved("pointmaze", devices=count)
 answer = [scored, found, refused]
