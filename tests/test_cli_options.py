@@ -148,7 +148,7 @@ def test_settings_of_a_file_get_their_defaults_again(
     ("name", "allowed"),
     [
         ("env_name", "algorithm, .*warm_start$"),
-        ("seed.x", "algorithm, .*warm_start$"),
+        ("seed.x", "seed, or entries of options, env_options, randomize$"),
         ("options.nosie", "entries of options: noise, samples$"),
         ("options.noise.x", "entries of options.noise: none$"),
         ("env_options.material.x", "entries of env_options.material: friction, smo"),

@@ -28,8 +28,11 @@ def with_defaults(base: EvolveConfig | None, paths: Iterable[str]) -> EvolveConf
             allowed = "only with --config or --study, whose settings it takes back"
             raise ConfigError(message("unset", path, allowed))
         name, *inside = path.split(".")
-        if name not in _NAMES or (inside and name not in _TABLES):
+        if name not in _NAMES:
             raise ConfigError(message("unset", path, listed(_NAMES)))
+        if inside and name not in _TABLES:
+            allowed = f"{name}, or entries of {listed(_TABLES)}"
+            raise ConfigError(message("unset", path, allowed))
         value: Any = _DEFAULTS[name]
         if inside:
             value = _without(dict(getattr(base, name)), inside, path)
