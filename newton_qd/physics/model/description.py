@@ -14,6 +14,7 @@ import numpy as np
 
 from newton_qd.checks import Fact, listed, message
 from newton_qd.errors import warn
+from newton_qd.physics.model.degrees import in_degrees
 from newton_qd.physics.model.elements import (
     Joint,
     Link,
@@ -24,7 +25,7 @@ from newton_qd.physics.model.elements import (
     read_joint,
     read_link,
 )
-from newton_qd.physics.model.spelling import in_degrees, misspelt
+from newton_qd.physics.model.spelling import misspelt
 from newton_qd.physics.model.unread import refuse_unread
 from newton_qd.physics.model.xml_reader import (
     IDENTITY,

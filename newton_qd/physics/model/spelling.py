@@ -1,4 +1,4 @@
-"""Finds misspelt names in a URDF file, which would silently mean nothing, and degrees.
+"""Finds misspelt names in a URDF file, which would silently mean nothing.
 
 A URDF file may have elements and attributes of simulators, so a name that this package
 does not know is no error. But one that is almost a known name is a slip.
@@ -6,7 +6,6 @@ does not know is no error. But one that is almost a known name is a slip.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from xml.etree import ElementTree
 
@@ -62,15 +61,6 @@ _ATTRIBUTES = {
 _POSES = ("origin", "axis")
 """Elements in which an attribute of another form, such as ``quat``, would be lost."""
 
-_FRAMES = {
-    "link": ("inertial/origin", "visual/origin", "collision/origin"),
-    "joint": ("origin",),
-}
-"""Paths of the frames in links and joints."""
-
-_ROLL = 2.0 * math.pi + 0.01  # largest angle that a file needs, with rounding [rad]
-_TURNS = 4.0 * math.pi  # some joints turn twice [rad]
-
 
 def misspelt(reader: XmlReader) -> tuple[str, ...]:
     """Returns a text about each name in links and joints that is almost a known one.
@@ -84,37 +74,6 @@ def misspelt(reader: XmlReader) -> tuple[str, ...]:
         for element in reader.root.findall(tag)
         for text in _inside(reader, element)
     )
-
-
-def in_degrees(reader: XmlReader) -> tuple[str, ...]:
-    """Returns a text about each angle that looks like degrees.
-
-    That is an angle of ``<origin>`` of more than a turn, or a limit of a hinge that is
-    a whole number between two turns and 360.
-    """
-    texts = []
-    for element in (*reader.root.findall("link"), *reader.root.findall("joint")):
-        paths = _FRAMES[element.tag]
-        for origin in (found for path in paths for found in element.iterfind(path)):
-            if (abs(reader.numbers(origin, "rpy", 3, "0 0 0")) > _ROLL).any():
-                texts.append(_degrees(reader, origin, "rpy"))
-        if element.get("type") != "revolute":
-            continue
-        for limit in element.iterfind("limit"):
-            texts += [
-                _degrees(reader, limit, key)
-                for key in ("lower", "upper")
-                if limit.get(key) is not None
-                and _TURNS < abs(value := float(limit.attrib[key])) <= 360.0
-                and value.is_integer()
-            ]
-    return tuple(texts)
-
-
-def _degrees(reader: XmlReader, element: ElementTree.Element, key: str) -> str:
-    why = "which looks like degrees"
-    text = message(key, Fact(element.attrib[key]), "radians, as it is read", why=why)
-    return str(reader.error(element, text))
 
 
 def _inside(reader: XmlReader, element: ElementTree.Element) -> Iterator[str]:
