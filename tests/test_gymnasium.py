@@ -357,6 +357,8 @@ def test_a_vector_environment_of_an_object_is_made_again_from_its_spec() -> None
     assert again.spec is not None and again.spec.max_episode_steps == 3
     with pytest.raises(ValueError, match="max_episode_steps: got 4; allowed: None, or"):
         make_gymnasium_vector(limited(3), 2, max_episode_steps=4)
+    with pytest.raises(ValueError, match=r"max_episode_steps: got 4; allowed: None$"):
+        make_gymnasium_vector(limited(), 2, max_episode_steps=4)
 
 
 @pytest.mark.parametrize("last", [0.0, 1.0])

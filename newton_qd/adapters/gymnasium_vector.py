@@ -105,7 +105,10 @@ class GymnasiumVectorEnv(Pickled, WithLength, gymnasium.vector.VectorEnv):  # py
         checks.integer("num_envs", num_envs)
         world = one_world(env, options)
         if steps is not None and steps != steps_of(world):
-            allowed = f"None, or {steps_of(world)} as the environment has"
+            own = steps_of(world)
+            allowed = (
+                "None" if own is None else f"None, or {own} as the environment has"
+            )
             raise ValueError(message("max_episode_steps", steps, allowed))
         if autoreset_mode not in (*AutoresetMode, *(m.value for m in AutoresetMode)):
             allowed = checks.listed([mode.value for mode in AutoresetMode])
