@@ -14,7 +14,7 @@ from contract import make, random_actions, reset, row, same, step
 import newton_qd
 from newton_qd import PhysicsParams, State, randomize_params
 from newton_qd.physics.parameters import FIELDS
-from newton_qd.wrappers import Wrapper
+from newton_qd.wrappers import RandomParamsWrapper, Wrapper
 
 KEY = jax.random.key(7)
 RANGES: dict[str, Any] = {
@@ -123,6 +123,14 @@ def test_ranges_of_arrays_and_of_one_value() -> None:
 def test_wrong_ranges(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         randomize_params(KEY, make("ant_uni"), **options)
+
+
+def test_a_wrapper_without_ranges_is_refused() -> None:
+    """It would change nothing."""
+    none: Any = {"gravity": None}
+    for ranges in ({}, none):
+        with pytest.raises(ValueError, match=r"^ranges: got \{.*; allowed: a range of"):
+            RandomParamsWrapper(make("ant_uni"), **ranges)
 
 
 def replaced(**changes: Any) -> PhysicsParams:

@@ -39,12 +39,12 @@ class RandomParamsWrapper(Wrapper):
             env: The environment.
             env_name: Its name; not used.
             **ranges: Lowest and highest value of parameters by name, as
-                :func:`~newton_qd.randomize_params` takes them.
+                :func:`~newton_qd.randomize_params` takes them; at least one.
 
         Raises:
             TypeError: ``env`` is not an environment, or a parameter does not exist.
             ValueError: The environment has no physical parameters, or draws them
-                already, or a range is wrong.
+                already, there is no range, or a range is wrong.
         """
         del env_name
         why = "and the ranges of the outer one alone would count"
@@ -53,6 +53,9 @@ class RandomParamsWrapper(Wrapper):
             if name not in FIELDS:
                 why = "which is no physical parameter"
                 raise TypeError(message(name, ranges[name], listed(FIELDS), why=why))
+        if all(limits is None for limits in ranges.values()):
+            allowed = f"a range of at least one of {listed(FIELDS)}"
+            raise ValueError(message("ranges", ranges, allowed))
         super().__init__(env)
         self.ranges = dict(ranges)
         jax.eval_shape(lambda: self._drawn(jax.random.key(0)))
