@@ -36,6 +36,8 @@ def test_text_and_attributes_of_an_environment() -> None:
     )
     moving = RandomParamsWrapper(newton_qd.create("ant_uni"), friction=(0.5, 1.5))
     assert "RandomParamsWrapper(ranges={'friction': (0.5, 1.5)})>" in repr(moving)
+    maze = repr(newton_qd.create("antmaze"))
+    assert maze.count("MazeWrapper") == 1 and "Ant, MazeWrapper(scene=maze" in maze
     # what the wrappers forward
     names = dir(env)
     for name in ("batch_size", "episode_length", "system", "state_descriptor_limits"):

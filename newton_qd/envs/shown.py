@@ -14,6 +14,9 @@ REGISTERED = "_registered"
 OPTIONS = "_options"
 """Attribute with the keyword arguments of the constructor."""
 
+EFFECTIVE = "_effective"
+"""Attribute of wrappers that move inside others: whether this one acts by itself."""
+
 
 def described(env: Any) -> str:
     """Returns the text of an environment, for ``repr``."""
@@ -29,7 +32,9 @@ def described(env: Any) -> str:
     if hasattr(env, "batch_size"):
         sizes.append(f"batch {env.batch_size}")
     sizes.append(f"{env.dt:g} s")
-    parts = ", ".join(_layer(layer) for layer in reversed(layers))
+    # a wrapper that moved inside others is shown there, not where it was applied
+    acting = [layer for layer in layers if vars(layer).get(EFFECTIVE, True)]
+    parts = ", ".join(_layer(layer) for layer in reversed(acting))
     return f"<{name}: {', '.join(sizes)}; {parts}>"
 
 
