@@ -383,6 +383,54 @@ def test_every_environment_is_registered() -> None:
     project = tomllib.loads(path.read_text(encoding="utf-8"))["project"]
     module, name = project["entry-points"]["gymnasium.envs"]["newton_qd"].split(":")
     getattr(importlib.import_module(module), name)()  # again: no second registration
+class Fragile(Clock):
+    """A clock that has a fault from an action above 0.5 on."""
+
+    def reset(self, rng: jax.Array) -> State:
+        state = super().reset(rng)
+        return state.replace(info={"fault": jnp.zeros((), jnp.int32)})
+
+    def step(self, state: State, action: jax.Array, params: Any = None) -> State:
+        after = super().step(state, action, params)
+        info = {**after.info, "fault": after.done.astype(jnp.int32)}
+        return after.replace(info=info)
+
+
+@pytest.mark.parametrize("length", [3, 4])
+def test_a_fault_within_the_last_action_is_in_the_last_step(length: int) -> None:
+    """The count of control steps stops there, before the length of the episode."""
+    from newton_qd.wrappers import EpisodeWrapper
+
+    env = EpisodeWrapper(Fragile(), length, 2)
+    spec = gymnasium.envs.registration.EnvSpec(
+        "Fragile-v0", make_gymnasium, kwargs={"env": env}
+    )
+    first = gymnasium.make(spec)
+    again = gymnasium.make(first.spec)  # with Gymnasium's TimeLimit
+    for actions, truncated in (([1.0], False), ([0.0, 1.0], True)):
+        for each in (first, again):
+            each.reset(seed=0)
+            ends = [each.step(np.full(1, action, np.float32)) for action in actions]
+            assert ends[-1][2:4] == (True, truncated)
+
+
+def test_an_environment_may_count_its_steps_elsewhere() -> None:
+    class Own(Clock):
+        episode_length = 2
+
+        def step(self, state: State, action: jax.Array, params: Any = None) -> State:
+            after = super().step(state, action, params)
+            over = (after.obs[1] >= 2).astype(jnp.float32)
+            info = {"truncation": over * (1 - after.done)}
+            return after.replace(done=jnp.maximum(after.done, over), info=info)
+
+    env = make_gymnasium(Own())
+    for last in (False, True):
+        env.reset(seed=0)
+        assert env.step(np.zeros(1))[2:4] == (False, False)
+        assert env.step(np.full(1, float(last)))[2:4] == (last, not last)
+
+
 
 
 @pytest.mark.parametrize(

@@ -79,16 +79,20 @@ def ends_of(env: Env, state: State) -> tuple[np.ndarray, np.ndarray]:
     """Returns whether worlds are terminated, and whether they are truncated.
 
     Both are true where an episode ended by itself in its last step, as with
-    Gymnasium's ``TimeLimit``, which ``gymnasium.make(env.spec)`` adds.
+    Gymnasium's ``TimeLimit``, which ``gymnasium.make(env.spec)`` adds. An environment
+    of your own without ``steps`` in its ``info`` does not tell the last step: there,
+    ``truncation`` alone counts.
     """
     done = np.asarray(state.done) > 0
     if "truncation" not in state.info:
         return done, np.zeros_like(done)
     truncated = np.asarray(state.info["truncation"]) > 0
     terminated = done & ~truncated
-    length = getattr(env, "episode_length", None)
-    if length is not None:
-        truncated = truncated | (np.asarray(state.info["steps"]) >= length)
+    actions = steps_of(env)
+    if actions is not None and "steps" in state.info:
+        # a fault within the last action stops the count before its end
+        before = (actions - 1) * getattr(env, "action_repeat", 1)
+        truncated = truncated | (np.asarray(state.info["steps"]) > before)
     return terminated, truncated
 
 
