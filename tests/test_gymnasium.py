@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 import os
 import pickle
@@ -82,8 +83,14 @@ def test_gymnasiums_own_check(registered: bool) -> None:
 
 @pytest.mark.parametrize("size", ["width", "height"])
 def test_sizes_of_pictures_are_checked_at_the_start(size: str) -> None:
-    with pytest.raises(ValueError, match=f"^{size}: got 0; allowed: integers from 1"):
-        make_gymnasium(limited(100), render_mode="rgb_array", **{size: 0})
+    options: dict[str, Any] = {size: 0}
+    for mode in (None, "rgb_array"):
+        for make in (
+            make_gymnasium,
+            functools.partial(make_gymnasium_vector, num_envs=1),
+        ):
+            with pytest.raises(ValueError, match=f"^{size}: got 0; allowed: integers"):
+                make(limited(100), render_mode=mode, **options)
 
 
 def test_videos_of_slow_environments_have_a_frame_rate() -> None:
@@ -376,13 +383,6 @@ def test_an_environment_made_from_a_spec_ends_as_its_own(last: float) -> None:
         assert first.step(given)[2:4] == again.step(given)[2:4] == (last * ends, ends)
 
 
-def test_every_environment_is_registered() -> None:
-    names = {f"newton_qd/{name}-v0" for name in newton_qd.registered_envs()}
-    assert names <= set(gymnasium.registry)
-    path = Path(__file__).resolve().parent.parent / "pyproject.toml"
-    project = tomllib.loads(path.read_text(encoding="utf-8"))["project"]
-    module, name = project["entry-points"]["gymnasium.envs"]["newton_qd"].split(":")
-    getattr(importlib.import_module(module), name)()  # again: no second registration
 class Fragile(Clock):
     """A clock that has a fault from an action above 0.5 on."""
 
@@ -431,6 +431,13 @@ def test_an_environment_may_count_its_steps_elsewhere() -> None:
         assert env.step(np.full(1, float(last)))[2:4] == (last, not last)
 
 
+def test_every_environment_is_registered() -> None:
+    names = {f"newton_qd/{name}-v0" for name in newton_qd.registered_envs()}
+    assert names <= set(gymnasium.registry)
+    path = Path(__file__).resolve().parent.parent / "pyproject.toml"
+    project = tomllib.loads(path.read_text(encoding="utf-8"))["project"]
+    module, name = project["entry-points"]["gymnasium.envs"]["newton_qd"].split(":")
+    getattr(importlib.import_module(module), name)()  # again: no second registration
 
 
 @pytest.mark.parametrize(

@@ -63,14 +63,21 @@ def spaces_of(env: Env) -> tuple[spaces.Box, spaces.Box]:
     return seen, spaces.Box(-1.0, 1.0, (env.action_size,), dtype)
 
 
-def metadata_of(env: Env, render_mode: str | None, **more: Any) -> dict[str, Any]:
-    """Returns the metadata of an environment.
+def check_pictures(render_mode: str | None, width: int, height: int) -> None:
+    """Checks the options of pictures, also if nobody asks for pictures.
 
     Raises:
-        ValueError: ``render_mode`` is not allowed.
+        ValueError: ``render_mode`` is not allowed, or ``width`` or ``height`` is not an
+            integer from 1.
     """
     if render_mode is not None:
         checks.choice("render_mode", render_mode, RENDER_MODES)
+    checks.integer("width", width)
+    checks.integer("height", height)
+
+
+def metadata_of(env: Env, **more: Any) -> dict[str, Any]:
+    """Returns the metadata of an environment."""
     rate = max(1, round(1 / env.dt))
     return {"render_modes": list(RENDER_MODES), "render_fps": rate, **more}
 
@@ -191,8 +198,9 @@ class GymnasiumEnv(Pickled, WithLength, gymnasium.Env):  # pyright: ignore[repor
             RuntimeError: The process was forked after the first environment was made.
         """
         require_no_fork()
+        check_pictures(render_mode, width, height)
         self.env = one_world(env, options)
-        self.metadata = metadata_of(self.env, render_mode)
+        self.metadata = metadata_of(self.env)
         self.render_mode = render_mode
         self.observation_space, self.action_space = spaces_of(self.env)
         self.state: State | None = None

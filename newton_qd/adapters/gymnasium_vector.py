@@ -12,6 +12,7 @@ from newton_qd import checks
 from newton_qd.adapters.gymnasium import (
     RENDER_MODES,
     WithLength,
+    check_pictures,
     check_reset_options,
     ends_of,
     info_of,
@@ -96,6 +97,7 @@ class GymnasiumVectorEnv(Pickled, WithLength, gymnasium.vector.VectorEnv):  # py
             RuntimeError: The process was forked after the first environment was made.
         """
         require_no_fork()
+        check_pictures(render_mode, width, height)
         steps = max_episode_steps
         checks.integer("max_episode_steps", steps, optional=True)
         if steps is not None and isinstance(env, str):
@@ -115,7 +117,7 @@ class GymnasiumVectorEnv(Pickled, WithLength, gymnasium.vector.VectorEnv):  # py
             raise ValueError(message("autoreset_mode", autoreset_mode, allowed))
         self._mode = AutoresetMode(autoreset_mode)
         self.env = VectorWrapper(world, num_envs)
-        self.metadata = metadata_of(world, render_mode, autoreset_mode=self._mode)
+        self.metadata = metadata_of(world, autoreset_mode=self._mode)
         self.num_envs, self.render_mode = num_envs, render_mode
         seen, taken = spaces_of(world)
         self.single_observation_space, self.single_action_space = seen, taken

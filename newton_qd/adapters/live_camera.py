@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from newton_qd import checks
 from newton_qd.adapters.pickled import Pickled
 from newton_qd.envs.base import Env, PhysicsEnv
 from newton_qd.envs.state import State
@@ -26,14 +25,9 @@ class LiveCamera(Pickled):
             env: The environment.
             width: Width of a picture [px].
             height: Height of a picture [px].
-
-        Raises:
-            ValueError: ``width`` or ``height`` is not an integer from 1.
         """
         from newton_qd.viewing import drawing_of
 
-        checks.integer("width", width)
-        checks.integer("height", height)
         self._drawing = drawing_of(env)
         self._physical = isinstance(env.unwrapped, PhysicsEnv)
         self._size = width, height
