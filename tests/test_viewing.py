@@ -122,8 +122,13 @@ def test_a_state_of_ones_own_is_the_start() -> None:
     with pytest.raises(ValueError, match=r"^key: got a state of a batch of shape \(1,"):
         record(env, jnp.zeros((3, 2)), batch)
     other = newton_qd.create("hopper", auto_reset=False).reset(jax.random.key(0))
-    with pytest.raises(ValueError, match=r"^state: got obs of shape \(11,\)"):
+    with pytest.raises(ValueError, match=r"^key: got obs of shape \(11,\)"):
         record(env, jnp.zeros((3, 2)), other)
+    with pytest.raises(ValueError, match=r"^key: got obs of shape \(11,\)"):
+        record(env, lambda seen: seen @ jnp.eye(2), other)
+    wide = state.replace(obs=np.zeros(2, np.int32))
+    with pytest.raises(TypeError, match=r"^key\.obs: got an array of .*int32; allowed"):
+        record(env, jnp.zeros((3, 2)), wide)
 
 
 def test_wrong_arguments_are_named(ant: Any, walk: Trajectory) -> None:

@@ -67,11 +67,10 @@ def record(
         OSError: A URDF file cannot be read.
     """
     drawing = drawing_of(env)
-    if not isinstance(key, State):
+    if isinstance(key, State):
+        _require_own(env, key)
+    else:
         require_key("key", key)
-    elif jnp.ndim(key.done):
-        given = Fact(f"a state of a batch of shape {jnp.shape(key.done)}")
-        raise ValueError(message("key", given, "a key, or the state of one world"))
     checks.integer("steps", steps, optional=True)
     checks.integer("worlds", worlds, optional=True)
     plan = None
@@ -95,6 +94,27 @@ def record(
     seen = jax.jit(jax.vmap(run))(starts, None, plan)
     seen = jax.tree.map(np.asarray, seen)
     return _trajectory(env, drawing, seen, labels)
+
+
+def _require_own(env: Env, state: State) -> None:
+    """Checks that the argument ``key`` is a state of one world of an environment.
+
+    Raises:
+        TypeError: A part of it has the wrong type or precision.
+        ValueError: It has a batch, or is one of another environment.
+    """
+    if jnp.ndim(state.done):
+        given = Fact(f"a state of a batch of shape {jnp.shape(state.done)}")
+        raise ValueError(message("key", given, "a key, or the state of one world"))
+    action = jax.ShapeDtypeStruct((env.action_size,), env.dtype)
+    try:
+        jax.eval_shape(env.step, state, action)
+    except (TypeError, ValueError) as error:
+        text = str(error)
+        if not text.startswith("state"):
+            raise
+        # who records knows the state by the name of the argument here
+        raise type(error)("key" + text.removeprefix("state")) from error
 
 
 def _starts(key: RNGKey | State, worlds: int) -> PyTree:
