@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import pickle
 import re
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from newton_qd.qd import (
     EvolveConfig,
     evolve,
     load_run,
+    make_policy,
     make_scoring_function,
     make_task,
     policy_of,
@@ -114,6 +116,25 @@ def test_initial_weights_are_drawn_one_by_one() -> None:
     text = search._population.lower(jax.random.split(jax.random.key(0), 4)).as_text()
     shapes = re.findall(r"@lapack_sgeqrf_ffi.*: \(tensor<([\dx]+)xf32>\)", text)
     assert set(shapes) == {"3x2"}  # Flax draws the transpose of 2 x 3
+
+
+def linear(key: jax.Array) -> Any:
+    weights = jax.random.normal(key, (2, 2), jnp.float32)
+    return jax.tree_util.Partial(jnp.dot, weights)
+
+
+def test_a_policy_pickles_as_it_was_made() -> None:
+    env = newton_qd.create("pointmaze")
+    for policy in (make_policy(env, (3,)), policy_of(env, linear)):
+        again = pickle.loads(pickle.dumps(policy))
+        weights = policy.init(jax.random.key(1))
+        assert again.size == policy.size
+        expected = policy.of_weights(weights, OBSERVATION)
+        assert np.array_equal(again.of_weights(weights, OBSERVATION), expected)
+        # a changed one is another policy, which pickle cannot make again
+        changed = dataclasses.replace(policy, apply=lambda weights, obs: obs)
+        with pytest.raises((AttributeError, pickle.PicklingError), match="local"):
+            pickle.dumps(changed)
 
 
 def test_errors() -> None:

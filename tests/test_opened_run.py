@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import pickle
 import shutil
 from pathlib import Path
 from typing import Any
@@ -187,6 +188,15 @@ def test_an_evaluation_repeats_the_archive_bitwise(found: Run) -> None:
     assert alone.fitnesses == archive.fitnesses[cells[1]]
     place = tuple((archive.centroids[cells[1]] * 4).astype(int).tolist())
     assert found.evaluate(place).cells == cells[1]  # as ``elite`` reads it
+
+
+def test_a_run_goes_to_other_processes(found: Run) -> None:
+    found.evaluate(int(found.cells[0]))  # compiled functions do not pickle
+    again = pickle.loads(pickle.dumps(found))
+    assert again.config == found.config and again.path == found.path
+    for name in ("fitnesses", "descriptors"):
+        expected = getattr(found.evaluate(), name)
+        assert np.array_equal(getattr(again.evaluate(), name), expected)
 
 
 @pytest.mark.parametrize("kind", [jax.random.key, jax.random.PRNGKey])

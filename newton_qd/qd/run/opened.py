@@ -7,7 +7,7 @@ import functools
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -60,6 +60,8 @@ class Elite:
 class Run:
     """The results folder of a run, opened.
 
+    It pickles, for other processes, if the network of a policy of your own does.
+
     Attributes:
         path: The folder.
         config: Settings with a grid or a number of centroids.
@@ -84,6 +86,11 @@ class Run:
     metrics: dict[str, np.ndarray]
     reevaluated: Reevaluated | None
     start_key: RNGKey
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Returns what pickle stores: no compiled functions."""
+        fields = dataclasses.fields(self)
+        return {field.name: getattr(self, field.name) for field in fields}
 
     def __repr__(self) -> str:
         return f"<Run {self.path}: {results_text(self.config, self.metrics)}>"

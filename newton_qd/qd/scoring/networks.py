@@ -37,7 +37,17 @@ def policy_of(env: Environment, network: Any) -> Policy:
         ValueError: Actions of the network have the wrong shape.
     """
     checks.environment(env, needs="observation_size")
-    dummy = jnp.zeros((env.observation_size,), jnp.float32)
+    return _own(env.observation_size, env.action_size, network)
+
+
+def _own(observation_size: int, action_size: int, network: Any) -> Policy:
+    """Makes a policy from a network of your own.
+
+    Raises:
+        TypeError: ``network`` is no network.
+        ValueError: Its actions have the wrong shape.
+    """
+    dummy = jnp.zeros((observation_size,), jnp.float32)
     linen = hasattr(network, "init") and hasattr(network, "apply")
     if linen:
         module: Any = network
@@ -75,9 +85,9 @@ def policy_of(env: Environment, network: Any) -> Policy:
         return jnp.asarray(model(observation))
 
     given = jax.eval_shape(apply, zeros, dummy).shape
-    if given != (env.action_size,):
+    if given != (action_size,):
         wrong = Fact(f"actions of shape {given}")
-        raise ValueError(message("network", wrong, f"shape {(env.action_size,)}"))
+        raise ValueError(message("network", wrong, f"shape {(action_size,)}"))
     return Policy(
         size=size,
         init=init,
@@ -85,7 +95,7 @@ def policy_of(env: Environment, network: Any) -> Policy:
         apply=apply,
         ravel=lambda parameters: ravel_pytree(parameters)[0],
         network=network if linen else None,
-    )
+    ).made_by(_own, observation_size, action_size, network)
 
 
 def policy_for(task: Task, hidden: tuple[int, ...]) -> Policy:

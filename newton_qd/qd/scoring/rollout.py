@@ -34,6 +34,8 @@ from newton_qd.types import (
 class Policy:
     """A network whose weights are one vector: a multilayer perceptron or your own.
 
+    It pickles if its network does, and is made again where it is read.
+
     Attributes:
         size: Number of weights.
         init: Maps a key to weights (size,).
@@ -50,6 +52,24 @@ class Policy:
     apply: Callable[[PyTree, Observation], jax.Array]
     ravel: Callable[[PyTree], jax.Array]
     network: Any
+    # not an argument: dataclasses.replace returns a policy that is not made like this
+    _made: tuple[Callable[..., Policy], Any] | None = dataclasses.field(
+        default=None, init=False, compare=False, repr=False
+    )
+
+    def made_by(self, maker: Callable[..., Policy], *arguments: Any) -> Policy:
+        """Returns this policy, whose functions pickle by how they were made.
+
+        Args:
+            maker: Function that made it.
+            *arguments: Its arguments.
+        """
+        object.__setattr__(self, "_made", (maker, arguments))
+        return self
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        """Returns what pickle stores."""
+        return super().__reduce_ex__(protocol) if self._made is None else self._made
 
     def of_weights(self, weights: jax.Array, observation: Observation) -> jax.Array:
         """Returns the action (A,) of a policy with weights (size,)."""
@@ -86,15 +106,24 @@ def make_policy(env: Environment, hidden: tuple[int, ...]) -> Policy:
     checks.instance("hidden", hidden, (tuple, list), "a tuple of integers")
     for index, width in enumerate(hidden):
         checks.integer(f"hidden[{index}]", width)
+    return _perceptron(env.observation_size, env.action_size, tuple(hidden))
+
+
+def _perceptron(observation_size: int, action_size: int, hidden: tuple) -> Policy:
+    """Builds QDax's perceptron.
+
+    Raises:
+        MissingExtra: QDax is not installed.
+    """
     require_extra("qdax", "qd")
     from qdax.core.neuroevolution.networks.networks import MLP
 
     network = MLP(
-        layer_sizes=(*hidden, env.action_size),
+        layer_sizes=(*hidden, action_size),
         kernel_init=jax.nn.initializers.lecun_uniform(),
         final_activation=jnp.tanh,
     )
-    dummy = jnp.zeros((env.observation_size,), jnp.float32)
+    dummy = jnp.zeros((observation_size,), jnp.float32)
     example = jax.eval_shape(network.init, jax.random.key(0), dummy)
     zeros = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), example)
     size, unravel = flattened(zeros)
@@ -113,7 +142,7 @@ def make_policy(env: Environment, hidden: tuple[int, ...]) -> Policy:
         apply=apply,
         ravel=lambda parameters: ravel_pytree(parameters)[0],
         network=network,
-    )
+    ).made_by(_perceptron, observation_size, action_size, hidden)
 
 
 def flattened(zeros: PyTree) -> tuple[int, Callable[[jax.Array], PyTree]]:
