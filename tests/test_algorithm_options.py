@@ -14,11 +14,16 @@ from point_runs import SMALL, interrupt_after, point_task, run
 import newton_qd.compat
 from newton_qd import cli
 from newton_qd.qd.algorithms.cma_me import CMAMEOptions
+from newton_qd.qd.algorithms.gradient_options import (
+    DifferentiableOptions,
+    check_smoothed,
+)
 from newton_qd.qd.algorithms.me_conditioned import ConditionedOptions
 from newton_qd.qd.algorithms.options import read_options
 from newton_qd.qd.algorithms.spec import AlgorithmSpec
 from newton_qd.qd.algorithms.variation import parents_in
-from newton_qd.qd.config import ConfigError, read_config
+from newton_qd.qd.config import ConfigError, EvolveConfig, read_config
+from newton_qd.qd.scoring.task import make_task
 
 
 def test_what_does_not_exist_is_refused(tmp_path: Path) -> None:
@@ -183,6 +188,14 @@ def test_options_out_of_range_are_refused(
     [
         ({"algorithm": "cma-me", "iso_sigma": 0.1}, "iso_sigma: got 0.1; .* no iso"),
         ({"algorithm": "me-es", "line_sigma": 0}, "line_sigma: got 0.0; .*0.2, the"),
+        (
+            {"algorithm": "omg-mega", "options": {"algebraic_tail": True}},
+            "options: algebraic_tail: got True, .* no effect on 'point', without feet",
+        ),
+        (
+            {"algorithm": "me-actor-critic", "options": {"smooth_width": 0.2}},
+            "options: smooth_width: got 0.2, .*; allowed: no value, or another env",
+        ),
         ({"statistic": "median"}, "statistic: got 'median'; .*'mean', .* starts = 1"),
     ],
 )
@@ -192,6 +205,20 @@ def test_settings_without_effect_are_refused(
     """In a new run; others can be resumed, as those with such an option."""
     with pytest.raises(ConfigError, match=f"^{message}"):
         run(SMALL.replace(**settings))
+
+
+def test_smooth_feet_are_an_option_of_tasks_with_feet() -> None:
+    options: Any = {"smooth_width": 0.2}
+    for name in ("hopper_uni", "pointmaze"):
+        config = EvolveConfig(
+            env_name=name, algorithm="omg-mega", options=options, episode_length=10
+        )
+        given, task = read_options(DifferentiableOptions, config), make_task(config)
+        if name == "hopper_uni":
+            check_smoothed(config, given, task)
+            continue
+        with pytest.raises(ConfigError, match="no effect on 'pointmaze', without feet"):
+            check_smoothed(config, given, task)
 
 
 @pytest.mark.slow

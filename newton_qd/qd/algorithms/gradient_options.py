@@ -7,6 +7,7 @@ import functools
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from newton_qd.checks import message
 from newton_qd.qd.algorithms.options import Options, only_with
 
 if TYPE_CHECKING:  # importing the options imports no JAX
@@ -123,6 +124,9 @@ SHORT: Mapping[str, Any] = {"window": 8}
 """Default of the window for the halfcheetah."""
 
 
+_SMOOTHED = ("smooth_width", "algebraic_tail")
+"""Options that change the gradient of feet contact alone."""
+
 MAZES = ("antmaze", "antmaze_u", "antmaze_big", "antmaze_hardest", "humanoid_maze")
 """Tasks with negative rewards, and with falls that end an episode."""
 
@@ -157,6 +161,34 @@ def differentiable(
     if termination_width:
         env = with_smooth_termination(env, termination_width)
     return dataclasses.replace(task, env=env)
+
+
+def check_smoothed(config: EvolveConfig, options: Options, task: Task) -> None:
+    """Checks that the options of smooth feet contact in a new run have an effect.
+
+    Args:
+        config: Settings of the run.
+        options: Options of its algorithm.
+        task: The task.
+
+    Raises:
+        ConfigError: The state descriptor of the task is not feet contact, and one of
+            the options is given.
+    """
+    from newton_qd.envs.base import Env
+    from newton_qd.qd.config import ConfigError
+    from newton_qd.wrappers import FeetContactWrapper
+    from newton_qd.wrappers.base import outermost
+
+    if not isinstance(options, DifferentiableOptions):
+        return
+    if isinstance(task.env, Env) and outermost(task.env, FeetContactWrapper):
+        return
+    for name, value in config.options:
+        if name in _SMOOTHED:
+            why = f"which has no effect on {config.env_name!r}, without feet contact"
+            allowed = "no value, or another environment"
+            raise ConfigError(message(f"options: {name}", value, allowed, why=why))
 
 
 def gradient_scoring(

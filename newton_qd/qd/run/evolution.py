@@ -18,6 +18,7 @@ from newton_qd.checks import Fact, message
 from newton_qd.errors import require_extra
 from newton_qd.physics import interrupts
 from newton_qd.qd.algorithms import algorithm_named
+from newton_qd.qd.algorithms.gradient_options import check_smoothed
 from newton_qd.qd.config import ConfigError, EvolveConfig
 from newton_qd.qd.facts import environment_facts
 from newton_qd.qd.run.archive import archive_of
@@ -101,18 +102,22 @@ def evolve(
         ("tensorboard", tensorboard),
     ):
         checks.flag(name, value, error=ConfigError)
-    algorithm_named(config.algorithm).read_options(config)
+    algorithm = algorithm_named(config.algorithm)
+    options = algorithm.read_options(config)
     mesh = _mesh(devices, resume)
     chosen = _device(device, devices)
     # after the other arguments, whose errors would come one by one otherwise
     folder = _folder(out, config, resume, tensorboard)
-    if folder is None or not folder.has_config:
-        algorithm_named(config.algorithm).check_effect(config)
+    new = folder is None or not folder.has_config
+    if new:
+        algorithm.check_effect(config)
     interrupts.install()  # before the handlers below, so that it outlives them
     with ExitStack() as stack:
         stop = stack.enter_context(graceful_stop())
         stack.enter_context(jax.default_device(chosen))
         task = made_task(task_factory, config)
+        if new:
+            check_smoothed(config, options, task)
         config = config.resolve(task.descriptor_length)
         check_memory(config, task, chosen)
         config, start = _started(config, start_from, task, folder)
