@@ -37,7 +37,8 @@ from newton_qd.viewing import (
     write_explorer,
     write_replay,
 )
-from newton_qd.viewing.drawing import body_frames, drawing_of_system
+from newton_qd.viewing.drawing import body_frames, composed, drawing_of_system
+from newton_qd.viewing.sight import camera_offset
 from newton_qd.viewing.trajectory import Trajectory
 from newton_qd.viewing.video import _durations
 
@@ -186,6 +187,28 @@ def test_every_shape_is_one_of_the_files(name: str) -> None:
     assert drawing.follow is (name not in fixed)
     target = [s for s in drawing.shapes if s.body < 0 and s.color[3] < 1]
     assert len(target) == 1  # of the maze, which one can see through
+
+
+@pytest.mark.parametrize(
+    ("name", "rise"), [("antmaze_u", 2.2), ("antmaze", 0.45), ("ant_uni", 0.45)]
+)
+def test_no_wall_hides_the_robot_at_first(name: str, rise: float) -> None:
+    """The start of ``antmaze_u`` is 2 m from a wall, which is 2 m high."""
+    drawing = drawing_of(newton_qd.create(name))
+    x, y, z = offset = camera_offset(drawing)
+    assert z / np.hypot(x, y) == pytest.approx(rise)
+    assert html.drawing_data(drawing)["camera"] == offset.tolist()
+    if name == "antmaze_u":
+        walls = [shape for shape in drawing.shapes if shape.body < 0 and shape.visual]
+        (wall,) = [shape for shape in walls if shape.frame[1] == -2.5]
+        edge = wall.frame[1] + wall.size[1]
+        assert edge == -2 and wall.frame[2] + wall.size[2] == 2
+        frames = body_frames(drawing, drawing.rest_q)
+        for part in drawing.shapes:
+            if part.body >= 0:
+                place = composed(frames[part.body], part.frame)[:3]
+                way = drawing.centre + offset - place
+                assert place[2] + way[2] * (edge - place[1]) / way[1] > 2
 
 
 def test_the_maze_is_that_of_the_environment() -> None:

@@ -11,9 +11,9 @@ import numpy as np
 from newton_qd import checks
 from newton_qd.viewing.drawing import Drawing, body_frames
 from newton_qd.viewing.newton_model import newton_model
+from newton_qd.viewing.sight import FIELD, camera_offset
 from newton_qd.viewing.trajectory import Trajectory
 
-_FIELD = 40.0 * math.pi / 180.0  # vertical field of view, as in the pages [rad]
 _SKY = 0x00F2EDE8  # blue, green, red: the light theme of the pages
 _SAMPLES = 4  # rays of a pixel
 _REACH = 7.0  # half width of the grid around the way of a robot [radii]
@@ -58,7 +58,9 @@ class Camera:
         from newton.sensors import SensorCamera
 
         self.width, self.height = width, height
-        self._drawing, self._zoom, self._elevation = drawing, zoom, elevation
+        self._drawing = drawing
+        rise = None if elevation is None else math.tan(math.radians(elevation))
+        self._offset = camera_offset(drawing, rise) / zoom
         self._model = newton_model(drawing, area)
         self._state = self._model.state()
         options = SensorCamera.RenderConfig()
@@ -71,7 +73,7 @@ class Camera:
         direction = wp.vec3f(0.329, 0.423, -0.844)  # of length 1
         self._sensor.create_default_light(direction=direction)
         self._rays = SensorCamera.compute_camera_rays_pinhole(
-            width, height, camera_fov=_FIELD, sample_count=_SAMPLES
+            width, height, camera_fov=FIELD, sample_count=_SAMPLES
         )
         self._image = self._sensor.allocate_image_color(1, width, height)
 
@@ -94,7 +96,7 @@ class Camera:
         if self._drawing.follow:
             # the height stays, so that a hopping robot is seen to hop
             aim[:2] = frames[self._drawing.torso, :2]
-        pose = _pose(self._drawing, aim, self._zoom, self._elevation)
+        pose = _pose(aim, self._offset)
         place = wp.array([wp.transform(*pose)], dtype=wp.transformf)
         self._sensor.update(self._state, place, self._rays, color_image=self._image)
         image: Any = self._image
@@ -103,16 +105,9 @@ class Camera:
         return np.stack(parts, axis=-1).astype(np.uint8)
 
 
-def _pose(
-    drawing: Drawing, aim: np.ndarray, zoom: float, elevation: float | None
-) -> list[float]:
-    """Returns the frame (7,) of a camera that looks at a point, as the pages do."""
-    up, side = (0.45, 0.42) if drawing.follow else (1.1, 0.2)
-    if elevation is not None:
-        up = math.tan(math.radians(elevation))
-    distance = 1.15 * drawing.radius / math.sin(_FIELD / 2) / zoom
-    away = np.array([-side, -math.sqrt(1 - side * side), up])
-    back = away / np.linalg.norm(away)
+def _pose(aim: np.ndarray, offset: np.ndarray) -> list[float]:
+    """Returns the frame (7,) of a camera that looks at a point from an offset (3,)."""
+    back = offset / np.linalg.norm(offset)
     right = np.cross([0.0, 0.0, 1.0], back)
     right /= np.linalg.norm(right)
     matrix = np.stack([right, np.cross(back, right), back], axis=1)
@@ -124,7 +119,7 @@ def _pose(
             matrix[1, 0] - matrix[0, 1],
         ]
     ) / (4 * w)
-    return [float(x) for x in (*(aim + distance * back), *vector, w)]
+    return [float(x) for x in (*(aim + offset), *vector, w)]
 
 
 def times(trajectory: Trajectory, rate: float) -> np.ndarray:

@@ -20,6 +20,7 @@ import numpy as np
 
 from newton_qd.checks import Fact, message
 from newton_qd.viewing.drawing import Drawing, DrawnShape
+from newton_qd.viewing.sight import camera_offset
 from newton_qd.viewing.trajectory import Trajectory
 
 _PAGES = "newton_qd.viewing"
@@ -156,6 +157,7 @@ def drawing_data(drawing: Drawing) -> dict[str, Any]:
         "shapes": [_shape_data(shape) for shape in drawing.shapes],
         "centre": drawing.centre.tolist(),
         "radius": drawing.radius,
+        "camera": camera_offset(drawing).tolist(),
         "follow": drawing.follow,
         "grid": drawing.grid,
     }

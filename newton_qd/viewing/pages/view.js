@@ -329,17 +329,11 @@
     this.arrows.instanceMatrix.needsUpdate = true;
   };
 
-  // Looks at the robot from the side and above.
+  // Looks at the robot from the side and above, from where no wall hides it.
   View.home = function () {
-    const c = this.drawing.centre, r = this.drawing.radius;
-    const distance = 1.15 * r / Math.sin((FIELD / 2) * Math.PI / 180);
-    const flat = this.drawing.follow ? 0.45 : 1.1; // a fixed scene is seen from above
-    const side = this.drawing.follow ? 0.42 : 0.2;
-    const level = distance / Math.hypot(1, flat);
+    const c = this.drawing.centre, away = this.drawing.camera;
     this.controls.target.set(c[0], c[1], c[2]);
-    this.camera.position.set(
-      c[0] - side * level, c[1] - Math.sqrt(1 - side * side) * level,
-      c[2] + flat * level);
+    this.camera.position.set(c[0] + away[0], c[1] + away[1], c[2] + away[2]);
     this.controls.update();
   };
 
