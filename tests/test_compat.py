@@ -154,6 +154,26 @@ def test_functions_of_jumpy() -> None:
     assert jp.vmap(jnp.dot)(x, x).tolist() == [25, 0]
     assert jp.index_update(x, (1, 0), 7).tolist() == [[3, 4], [7, 0]]
     assert 2 <= jp.randint(jp.random_prngkey(0), low=2, high=4) < 4
+    for name, sign in (("arccos", -1), ("arcsin", 1)):
+        safe, plain = getattr(jp, f"safe_{name}"), getattr(jnp, name)
+        assert safe(0.5) == plain(0.5) and safe(-1.0) == plain(-1.0)
+        slope = jax.grad(safe)(0.5)
+        np.testing.assert_allclose(slope, jax.grad(plain)(0.5), rtol=1e-6)
+        assert np.isfinite(jax.grad(safe)(1.0)) and sign * jax.grad(safe)(1.0) > 1000
+
+
+def test_jumpy_has_the_names_of_brax_v1() -> None:
+    """All functions and constants of ``brax/v1/jumpy.py``."""
+    jp: Any = importlib.import_module("brax.v1.jumpy")
+    names = """abs all amax amin any arange arccos arcsin arctan2 arctanh argmax argmin
+        array atleast_1d atleast_2d atleast_3d choice clip concatenate cond cos cross
+        diag dot exp expand_dims eye float32 floor fori_loop index_update inf int32 inv
+        logical_and logical_not logical_or matmul maximum mean meshgrid minimum multiply
+        ndarray norm ones ones_like outer pi randint random_prngkey random_split
+        random_uniform repeat reshape roll safe_arccos safe_arcsin safe_norm scan
+        segment_sum sign sin sqrt square stack sum take tanh tile top_k tree_map var
+        vmap where while_loop zeros zeros_like"""
+    assert not [name for name in names.split() if not hasattr(jp, name)]
 
 
 @pytest.mark.parametrize("name", ["ant", "ur5e"])

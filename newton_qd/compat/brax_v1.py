@@ -30,12 +30,16 @@ __all__ = [
     "random_split",
     "random_uniform",
     "render",
+    "safe_arccos",
+    "safe_arcsin",
     "safe_norm",
     "save_html",
     "take",
     "vec_to_arr",
     "vmap",
 ]
+
+_INSIDE = 1e-7  # the spacing of float32 below 1 is 6e-8
 
 
 def random_prngkey(seed: int) -> jax.Array:
@@ -97,6 +101,28 @@ def safe_norm(x: jax.Array, axis: int | None = None) -> jax.Array:
     zero = jnp.all(x == 0, axis=axis, keepdims=True)
     norm = jnp.linalg.norm(jnp.where(zero, 1.0, x), axis=axis)
     return jnp.where(zero.reshape(norm.shape), 0.0, norm)
+
+
+@jax.custom_jvp
+def safe_arccos(x: jax.Array) -> jax.Array:
+    """Returns the inverse cosine. Its gradient is finite at -1 and 1, too."""
+    return jnp.arccos(x)
+
+
+@jax.custom_jvp
+def safe_arcsin(x: jax.Array) -> jax.Array:
+    """Returns the inverse sine. Its gradient is finite at -1 and 1, too."""
+    return jnp.arcsin(x)
+
+
+def _slope(x: jax.Array) -> jax.Array:
+    """Returns the derivative of the inverse sine, inside of [-1, 1] by 1e-7."""
+    inside = jnp.clip(x, -1.0 + _INSIDE, 1.0 - _INSIDE)
+    return 1.0 / jnp.sqrt(1.0 - inside * inside)
+
+
+safe_arccos.defjvps(lambda tangent, _, x: -tangent * _slope(x))
+safe_arcsin.defjvps(lambda tangent, _, x: tangent * _slope(x))
 
 
 def vec_to_arr(vector: Any) -> np.ndarray:
