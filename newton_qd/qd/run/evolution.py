@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from typing import Any
 
@@ -90,18 +90,8 @@ def evolve(
         SearchError: No individual of the initial population has finite scores.
     """
     begin = time.monotonic()
-    allowed = "an EvolveConfig, such as EvolveConfig(env_name='ant_uni')"
-    checks.instance("config", config, EvolveConfig, allowed, error=ConfigError)
-    seconds = checkpoint_seconds
-    checks.number(
-        "checkpoint_seconds", seconds, least=0, endless=True, error=ConfigError
-    )
-    for name, value in (
-        ("resume", resume),
-        ("progress", progress),
-        ("tensorboard", tensorboard),
-    ):
-        checks.flag(name, value, error=ConfigError)
+    flags = {"resume": resume, "progress": progress, "tensorboard": tensorboard}
+    _check_arguments(config, checkpoint_seconds, flags)
     algorithm = algorithm_named(config.algorithm)
     options = algorithm.read_options(config)
     mesh = _mesh(devices, resume)
@@ -138,6 +128,22 @@ def evolve(
         state = run_generations(search, state, config.iterations, watchers, stop, save)
         result = _result(config, search.checkpoint(state), folder, begin)
         return _finished(result, search, task, folder, display, stop, begin)
+
+
+def _check_arguments(
+    config: EvolveConfig, checkpoint_seconds: float, flags: Mapping[str, bool]
+) -> None:
+    """Checks the arguments that need no other one.
+
+    Raises:
+        ConfigError: One of them is wrong.
+    """
+    allowed = "an EvolveConfig, such as EvolveConfig(env_name='ant_uni')"
+    checks.instance("config", config, EvolveConfig, allowed, error=ConfigError)
+    name, seconds = "checkpoint_seconds", checkpoint_seconds
+    checks.number(name, seconds, least=0, endless=True, error=ConfigError)
+    for name, value in flags.items():
+        checks.flag(name, value, error=ConfigError)
 
 
 def _folder(
