@@ -136,10 +136,10 @@ def control_step(system: System) -> Step:
         system: The system.
 
     Returns:
-        A function of ``q`` (nq,), ``v`` (nv,), ``control`` (nu,) and ``params``
-        (:func:`~newton_qd.physics.parameters.parameter_count`,). It returns the next
-        state and the fault (). ``params`` is optional: without it the world has the
-        parameters of the system. The function supports first derivatives in reverse
+        A function of ``q`` (nq,), ``v`` (nv,), ``control`` (nu,) and ``params``, the
+        row (n,) of :func:`~newton_qd.physics.parameters.parameter_row`. It returns the
+        next state and the fault (). ``params`` is optional: without it the world has
+        the parameters of the system. The function supports first derivatives in reverse
         mode, but neither second derivatives nor forward mode. Under ``vmap`` all
         worlds share one launch.
     """

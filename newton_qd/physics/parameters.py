@@ -71,11 +71,6 @@ def parameter_shapes(system: System) -> dict[str, tuple[int, ...]]:
     return layout.parameters(system).shapes
 
 
-def parameter_count(system: System) -> int:
-    """Returns the number of parameters of one world, counting every array element."""
-    return layout.parameters(system).size
-
-
 @takes_system
 def default_params(system: System) -> PhysicsParams:
     """Returns the parameters of one world with the values of the robot's files."""
