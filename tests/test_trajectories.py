@@ -18,6 +18,7 @@ from newton_qd.files import temporary_name
 from newton_qd.physics import reference
 from newton_qd.viewing import Trajectory, camera, joined, record, render
 from newton_qd.viewing.camera import pictures, times
+from newton_qd.viewing.sight import camera_offset
 
 KEY = jax.random.key(0)
 
@@ -95,12 +96,12 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
 @pytest.mark.parametrize("elevation", [None, 30.0])
 def test_a_camera_looks_at_its_aim(elevation: float | None) -> None:
     drawing, aim = point(1).drawing, np.array([1.0, -2.0, 0.5])
-    near, far = (
-        np.array(camera._pose(drawing, aim, zoom, elevation)) for zoom in (2.0, 1.0)
-    )
-    away = far[:3] - aim
-    np.testing.assert_allclose(near[:3] - aim, away / 2)
-    right, up, back = reference.rotation_matrix(far[3:]).T
+    away = camera_offset(drawing, elevation=elevation)
+    near = camera_offset(drawing, zoom=2.0, elevation=elevation)
+    np.testing.assert_allclose(near, away / 2)
+    pose = np.array(camera._pose(aim, away))
+    np.testing.assert_allclose(pose[:3], aim + away)
+    right, up, back = reference.rotation_matrix(pose[3:]).T
     np.testing.assert_allclose(back, away / np.linalg.norm(away), atol=1e-12)
     assert abs(right[2]) < 1e-12 and up[2] > 0
     if elevation is not None:

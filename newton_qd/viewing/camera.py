@@ -59,8 +59,7 @@ class Camera:
 
         self.width, self.height = width, height
         self._drawing = drawing
-        rise = None if elevation is None else math.tan(math.radians(elevation))
-        self._offset = camera_offset(drawing, rise) / zoom
+        self._offset = camera_offset(drawing, zoom=zoom, elevation=elevation)
         self._model = newton_model(drawing, area)
         self._state = self._model.state()
         options = SensorCamera.RenderConfig()

@@ -19,19 +19,22 @@ _SIDE_FIXED, _RISE_FIXED = 0.2, 1.1  # a fixed scene is seen from above
 _POINTS = 256  # on a line of sight
 
 
-def camera_offset(drawing: Drawing, rise: float | None = None) -> np.ndarray:
+def camera_offset(
+    drawing: Drawing, *, zoom: float = 1.0, elevation: float | None = None
+) -> np.ndarray:
     """Returns the vector (3,) from the point that is looked at to the camera [m].
 
     Args:
         drawing: What is drawn.
-        rise: Tangent of the angle of the view above the ground. ``None``: the smallest
-            of some from which no wall hides the robot in its default pose.
+        zoom: Size of the robot in a picture [-].
+        elevation: Angle of the view above the ground [deg]. ``None``: the smallest of
+            some from which no wall hides the robot in its default pose.
     """
-    if not drawing.follow:
-        return _offset(drawing, _SIDE_FIXED, _RISE_FIXED if rise is None else rise)
-    if rise is not None:
-        return _offset(drawing, _SIDE, rise)
-    offsets = [_offset(drawing, _SIDE, each) for each in _RISES]
+    side = _SIDE if drawing.follow else _SIDE_FIXED
+    rises = _RISES if drawing.follow else (_RISE_FIXED,)
+    if elevation is not None:
+        rises = (math.tan(math.radians(elevation)),)
+    offsets = [_offset(drawing, side, rise) / zoom for rise in rises]
     seen = (offset for offset in offsets if not _hidden(drawing, offset))
     return next(seen, offsets[0])  # under a roof, no other view is better
 
