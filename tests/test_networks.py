@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import pickle
 import re
@@ -135,6 +136,16 @@ def test_a_policy_pickles_as_it_was_made() -> None:
         changed = dataclasses.replace(policy, apply=lambda weights, obs: obs)
         with pytest.raises((AttributeError, pickle.PicklingError), match="local"):
             pickle.dumps(changed)
+
+
+def test_copies_of_a_policy_are_equal() -> None:
+    """Otherwise a program that has it as a static argument would compile again."""
+    env = newton_qd.create("pointmaze")
+    for policy in (make_policy(env, (3,)), policy_of(env, linear)):
+        changed = dataclasses.replace(policy, apply=lambda weights, obs: obs)
+        for one in (policy, changed):
+            for again in (copy.copy(one), copy.deepcopy(one)):
+                assert again == one and hash(again) == hash(one)
 
 
 def test_errors() -> None:

@@ -71,6 +71,14 @@ class Policy:
         """Returns what pickle stores."""
         return super().__reduce_ex__(protocol) if self._made is None else self._made
 
+    def __copy__(self) -> Policy:
+        """Returns this policy itself, which never changes."""
+        return self  # one that is made again would not be equal, and compile again
+
+    def __deepcopy__(self, memo: Any) -> Policy:
+        """Returns this policy itself, which never changes."""
+        return self
+
     def of_weights(self, weights: jax.Array, observation: Observation) -> jax.Array:
         """Returns the action (A,) of a policy with weights (size,)."""
         return self.apply(self.unravel(weights), observation)
