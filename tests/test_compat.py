@@ -154,6 +154,9 @@ def test_functions_of_jumpy() -> None:
     assert jp.vmap(jnp.dot)(x, x).tolist() == [25, 0]
     assert jp.index_update(x, (1, 0), 7).tolist() == [[3, 4], [7, 0]]
     assert 2 <= jp.randint(jp.random_prngkey(0), low=2, high=4) < 4
+    assert jp.expand_dims(x).shape == (1, 2, 2)
+    assert jp.clip(x, a_min=1, a_max=3).tolist() == [[3, 3], [1, 1]]
+    assert jp.choice(rng=jp.random_prngkey(0), a=5, shape=(2,)).shape == (2,)
     for name, sign in (("arccos", -1), ("arcsin", 1)):
         safe, plain = getattr(jp, f"safe_{name}"), getattr(jnp, name)
         assert safe(0.5) == plain(0.5) and safe(-1.0) == plain(-1.0)

@@ -23,6 +23,9 @@ from newton_qd.files import write_atomically
 __all__ = [
     "QP",
     "Joint",
+    "choice",
+    "clip",
+    "expand_dims",
     "index_update",
     "norm",
     "randint",
@@ -69,6 +72,28 @@ def randint(
 ) -> jax.Array:
     """Returns uniform random integers from ``low`` to below ``high``."""
     return jax.random.randint(rng, shape, low, high)
+
+
+def choice(
+    rng: jax.Array,
+    a: Any,
+    shape: tuple[int, ...] = (),
+    replace: bool = True,
+    p: Any | None = None,
+    axis: int = 0,
+) -> jax.Array:
+    """Returns random elements of an array, or of the integers below ``a``."""
+    return jax.random.choice(rng, a, shape, replace, p, axis)
+
+
+def clip(a: ArrayLike, a_min: ArrayLike, a_max: ArrayLike) -> jax.Array:
+    """Returns values that are at least ``a_min`` and at most ``a_max``."""
+    return jnp.clip(jnp.asarray(a), a_min, a_max)
+
+
+def expand_dims(x: ArrayLike, axis: int | tuple[int, ...] = 0) -> jax.Array:
+    """Returns an array with another axis of length 1, which is the first by default."""
+    return jnp.expand_dims(jnp.asarray(x), axis)
 
 
 def take(tree: Any, i: Any, axis: int = 0) -> Any:
