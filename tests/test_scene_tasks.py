@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from contract import reset, step
 
 import newton_qd
 from newton_qd.envs.ant import Ant
@@ -34,51 +36,74 @@ SCALE = {"trap": [15, 8], "maze": [22.5, 22.5]}
 TARGET = np.array([35.0, 0.0])
 
 
-def action_of(env: Env, size: float = 0.0) -> jax.Array:
-    return jnp.full((env.action_size,), size, env.dtype)
+@functools.cache
+def lone_ant() -> Ant:
+    """The ant outside of scenes."""
+    return Ant()
+
+
+@functools.cache
+def in_scene(task: str) -> Any:
+    """The ant in the scene of a task."""
+    return TASKS[task](lone_ant(), "ant")
+
+
+def action_of(env: Env, size: float = 0.0) -> np.ndarray:
+    return np.full((env.action_size,), size, env.dtype)
+
+
+def displaced(state: State, start: int, values: list[float]) -> State:
+    """A state with other coordinates, from one of them on."""
+    physics: Any = state.pipeline_state
+    q = np.array(physics.q)
+    q[start : start + len(values)] = values
+    return state.replace(pipeline_state=dataclasses.replace(physics, q=jnp.asarray(q)))
 
 
 def placed(env: Env, position: list[float]) -> State:
     """A state of the reset with the torso elsewhere."""
-    state = env.reset(KEY)
-    physics: Any = state.pipeline_state
-    q = physics.q.at[:3].set(jnp.asarray(position, env.dtype))
-    return state.replace(pipeline_state=dataclasses.replace(physics, q=q))
+    return displaced(reset(env)(KEY), 0, position)
 
 
 @pytest.mark.parametrize("task", TASKS)
 def test_observation_has_the_same_bits_in_every_program(task: str) -> None:
-    env = TASKS[task](Ant(), "ant")
+    env = in_scene(task)
     keys = jax.random.split(KEY, 8)
     starts = jnp.linspace(0.1, 7.3, 8, dtype=env.dtype)
 
-    def seen(key: jax.Array, x: jax.Array) -> jax.Array:
+    def begin(key: jax.Array, x: jax.Array) -> State:
         state = env.reset(key)
         physics: Any = state.pipeline_state
         q = physics.q.at[:2].set(x)
-        state = state.replace(pipeline_state=dataclasses.replace(physics, q=q))
+        return state.replace(pipeline_state=dataclasses.replace(physics, q=q))
+
+    def after(state: State) -> jax.Array:
         return env.step(state, action_of(env, 0.3)).obs
 
-    batch = jax.jit(jax.vmap(seen))(keys, starts)
+    def seen(key: jax.Array, x: jax.Array) -> jax.Array:
+        return after(begin(key, x))
+
+    batch = np.asarray(jax.jit(jax.vmap(seen))(keys, starts))
     one_by_one = jax.jit(lambda *x: jax.lax.map(lambda y: seen(*y), x))(keys, starts)
     assert np.array_equal(batch, one_by_one)
-    assert np.array_equal(batch, jax.vmap(seen)(keys, starts))
+    # without jit, each operation is a program
+    begin = jax.jit(begin)
     for i in (0, 3):
-        assert np.array_equal(batch[i], seen(keys[i], starts[i]))
+        assert np.array_equal(batch[i], after(begin(keys[i], starts[i])))
 
 
 @pytest.mark.parametrize("task", TASKS)
 def test_observation(task: str) -> None:
     """Scaled position, then the ant's, then contact rows of the walls too."""
-    env, ant = TASKS[task](Ant(), "ant"), Ant()
+    env, ant = in_scene(task), lone_ant()
     rows = ROWS[task]
     assert env.observation_size == 2 + 27 + 6 * rows
     assert sum(size for _, size in env.observation_layout) == env.observation_size
     around = TASKS[task](EpisodeWrapper(Ant(), 5, 1), "ant")
     assert around.observation_layout == env.observation_layout
     start = placed(env, [3.0, -1.5, 0.6])
-    after = jax.jit(env.step)(start, action_of(env, 0.3))
-    plain = jax.jit(ant.step)(placed(ant, [3.0, -1.5, 0.6]), action_of(ant, 0.3))
+    after = step(env)(start, action_of(env, 0.3))
+    plain = step(ant)(placed(ant, [3.0, -1.5, 0.6]), action_of(ant, 0.3))
     obs, expected = np.asarray(after.obs), np.asarray(plain.obs)
     xy = np.asarray(after.pipeline_state.q[:2])
     place = (xy - CENTRE[task]) / np.array(SCALE[task])
@@ -92,16 +117,16 @@ def test_observation(task: str) -> None:
 
 
 def test_position_is_not_clipped() -> None:
-    env = TrapWrapper(Ant(), "ant")
-    after = jax.jit(env.step)(placed(env, [60.0, 40.0, 0.6]), action_of(env))
+    env = in_scene("trap")
+    after = step(env)(placed(env, [60.0, 40.0, 0.6]), action_of(env))
     np.testing.assert_allclose(after.obs[:2], [3.0, 5.0], atol=0.01)
 
 
 def test_trap_keeps_reward_and_end() -> None:
-    env, ant = TrapWrapper(Ant(), "ant"), Ant()
+    env, ant = in_scene("trap"), lone_ant()
     for height in (0.6, 1.5):
-        ours = jax.jit(env.step)(placed(env, [3.0, 0.0, height]), action_of(env, 0.5))
-        theirs = jax.jit(ant.step)(placed(ant, [3.0, 0.0, height]), action_of(ant, 0.5))
+        ours = step(env)(placed(env, [3.0, 0.0, height]), action_of(env, 0.5))
+        theirs = step(ant)(placed(ant, [3.0, 0.0, height]), action_of(ant, 0.5))
         assert float(ours.reward) == float(theirs.reward)
         assert float(ours.done) == float(theirs.done) == float(height > 1)
         assert set(ours.metrics) == set(theirs.metrics)
@@ -109,20 +134,20 @@ def test_trap_keeps_reward_and_end() -> None:
 
 def test_trap_walls_are_there() -> None:
     """An ant at rest against the back wall is pushed back; the plain ant is not."""
-    env, ant = TrapWrapper(Ant(), "ant"), Ant()
-    pushed = jax.jit(env.step)(placed(env, [10.9, 0.0, 0.6]), action_of(env))
-    free = jax.jit(ant.step)(placed(ant, [10.9, 0.0, 0.6]), action_of(ant))
+    env, ant = in_scene("trap"), lone_ant()
+    pushed = step(env)(placed(env, [10.9, 0.0, 0.6]), action_of(env))
+    free = step(ant)(placed(ant, [10.9, 0.0, 0.6]), action_of(ant))
     assert float(pushed.pipeline_state.v[0]) < -0.1
     assert abs(float(free.pipeline_state.v[0])) < 0.02
 
 
 def test_maze_reward() -> None:
-    env = MazeWrapper(Ant(), "ant")
-    first = env.reset(KEY)
+    env = in_scene("maze")
+    first = reset(env)(KEY)
     assert float(first.reward) == pytest.approx(-35.0)
     assert float(first.done) == 0
     for position in ([3.0, -1.5, 0.6], [34.0, 1.0, 0.6], [35.0, 0.0, 0.6]):
-        after = jax.jit(env.step)(placed(env, position), action_of(env, 0.2))
+        after = step(env)(placed(env, position), action_of(env, 0.2))
         xy = np.asarray(after.pipeline_state.q[:2], np.float64)
         expected = -np.linalg.norm(xy - TARGET)
         assert float(after.reward) == pytest.approx(expected, rel=1e-5, abs=1e-6)
@@ -134,21 +159,22 @@ def test_maze_reward() -> None:
     ("height", "done"), [(0.3, 1), (0.6, 0), (1.5, 0), (4.9, 0), (5.3, 1)]
 )
 def test_maze_end(height: float, done: int) -> None:
-    env = MazeWrapper(Ant(), "ant")
+    env = in_scene("maze")
     state = placed(env, [3.0, 0.0, height])
     if height < 0.5:  # it falls on its back
-        physics = state.pipeline_state
-        q = physics.q.at[3:7].set(jnp.array([1.0, 0.0, 0.0, 0.0]))
-        moving = dataclasses.replace(physics, q=q, v=physics.v.at[2].set(-10.0))
+        state = displaced(state, 3, [1.0, 0.0, 0.0, 0.0])
+        v = np.array(state.pipeline_state.v)
+        v[2] = -10.0
+        moving = dataclasses.replace(state.pipeline_state, v=jnp.asarray(v))
         state = state.replace(pipeline_state=moving)
-    after = jax.jit(env.step)(state, action_of(env))
+    after = step(env)(state, action_of(env))
     reached = float(after.pipeline_state.q[2])
     assert (reached < 0.2 or reached > 5.0) == bool(done)
     assert float(after.done) == done
 
 
 def test_maze_reward_has_a_gradient_at_the_target() -> None:
-    env = MazeWrapper(Ant(), "ant")
+    env = in_scene("maze")
 
     def reward(xy: jax.Array) -> jax.Array:
         state = env.reset(KEY)
@@ -164,8 +190,8 @@ def test_maze_reward_has_a_gradient_at_the_target() -> None:
 
 @pytest.mark.parametrize("task", TASKS)
 def test_fault_is_contained(task: str) -> None:
-    env = TASKS[task](Ant(), "ant")
-    after = jax.jit(env.step)(env.reset(KEY), action_of(env, np.nan))
+    env = in_scene(task)
+    after = step(env)(reset(env)(KEY), action_of(env, np.nan))
     assert int(after.info["fault"]) == 1
     assert float(after.reward) == 0 and float(after.done) == 1
     assert np.isfinite(after.obs).all()
@@ -205,15 +231,11 @@ def test_by_hand_around_episodes(task: str, typed: bool) -> None:
 def test_maze_ends_episodes_inside_auto_reset() -> None:
     """The height that ends the plain ant's episode does not end one in the maze."""
     env = MazeWrapper(newton_qd.create("ant"), "ant")
-    state = env.reset(KEY)
-    q = state.pipeline_state.q.at[2].set(1.5)
-    physics = dataclasses.replace(state.pipeline_state, q=q)
-    after = jax.jit(env.step)(state.replace(pipeline_state=physics), action_of(env))
+    state = reset(env)(KEY)
+    after = step(env)(displaced(state, 2, [1.5]), action_of(env))
     assert float(after.done) == 0
     assert float(after.pipeline_state.q[2]) > 1.4
-    q = state.pipeline_state.q.at[2].set(6.0)
-    physics = dataclasses.replace(state.pipeline_state, q=q)
-    after = jax.jit(env.step)(state.replace(pipeline_state=physics), action_of(env))
+    after = step(env)(displaced(state, 2, [6.0]), action_of(env))
     assert float(after.done) == 1
     np.testing.assert_array_equal(after.obs, after.info["first_obs"])
 
@@ -223,11 +245,12 @@ def test_fixed_initial_state(task: str) -> None:
     """Whichever wrapper is put on first."""
     first = FixedInitialStateWrapper(TASKS[task](Ant(), "ant"))
     last = TASKS[task](FixedInitialStateWrapper(Ant()), "ant")
-    batch = VectorWrapper(last, 2).reset(KEY)
-    one, other = first.reset(KEY), last.reset(jax.random.key(1))
+    batch = jax.jit(VectorWrapper(last, 2).reset)(KEY)
+    one, other = reset(first)(KEY), reset(last)(jax.random.key(1))
+    fixed = last.fixed_state()
     for state in (one, other):
         assert state.obs.shape == (last.observation_size,)
-        np.testing.assert_array_equal(state.obs, last.fixed_state().obs)
+        np.testing.assert_array_equal(state.obs, fixed.obs)
         assert not np.asarray(state.pipeline_state.v).any()
     np.testing.assert_array_equal(batch.obs, np.stack([other.obs] * 2))
 
@@ -238,7 +261,7 @@ def test_with_scene() -> None:
     assert ant.system.scene is None and moved.system.scene is TRAP
     assert (ant.observation_size, moved.observation_size) == (87, 93)
     assert moved.with_scene(None).system is ant.system
-    after = jax.jit(moved.step)(moved.reset(KEY), action_of(moved))
+    after = step(moved)(reset(moved)(KEY), action_of(moved))
     assert float(after.metrics["reward_survive"]) == 7.0
     chain = EpisodeWrapper(Wrapper(ant), 5, 1)
     other: Any = chain.with_scene(MAZE)
