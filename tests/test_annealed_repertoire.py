@@ -209,15 +209,9 @@ def test_the_first_of_equally_fit_individuals_enters() -> None:
     ],
 )
 def test_refuses(rate: float, floor: float, message: str) -> None:
+    given: Any = np.zeros((1, 2)), np.zeros(1), np.zeros((1, 2)), np.zeros((4, 2))
     with pytest.raises(ValueError, match=message):
-        AnnealedRepertoire.init(
-            np.zeros((1, 2)),
-            np.zeros(1),
-            np.zeros((1, 2)),
-            np.zeros((4, 2)),
-            learning_rate=rate,
-            threshold_min=floor,
-        )
+        AnnealedRepertoire.init(*given, learning_rate=rate, threshold_min=floor)
 
 
 @pytest.mark.parametrize(

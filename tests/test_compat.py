@@ -140,7 +140,7 @@ def test_functions_of_jumpy() -> None:
         and jp.norm(x, 1).tolist() == [5, 0]
         and jp.safe_norm(x, axis=1).tolist() == [5, 0]
     )
-    slope = jax.grad(lambda x: jp.safe_norm(x, axis=1).sum())(x)
+    slope = jax.jit(jax.grad(lambda x: jp.safe_norm(x, axis=1).sum()))(x)
     np.testing.assert_allclose(slope, [[0.6, 0.8], [0, 0]], rtol=1e-6)
     assert jp.safe_norm(x[1]) == 0
     assert jp.take({"x": x}, [1, 0])["x"].tolist() == [[0, 0], [3, 4]]
@@ -184,7 +184,8 @@ def test_flax_saves_the_leaves_of_a_state(name: str) -> None:
     from flax import serialization
 
     env = newton_qd.compat.brax_envs.create(name, episode_length=5)
-    state, pattern = env.reset(jax.random.key(0)), env.reset(jax.random.key(1))
+    reset, step = jax.jit(env.reset), jax.jit(env.step)
+    state, pattern = reset(jax.random.key(0)), reset(jax.random.key(1))
     with pytest.raises(TypeError, match="State"):  # as the page for QDax says
         serialization.to_bytes(state)
     content = serialization.to_bytes(jax.tree.leaves(state))
@@ -194,9 +195,7 @@ def test_flax_saves_the_leaves_of_a_state(name: str) -> None:
         np.testing.assert_array_equal(found, known)
         assert found.dtype == known.dtype
     action = jnp.zeros(env.action_size)
-    np.testing.assert_array_equal(
-        env.step(read, action).obs, env.step(state, action).obs
-    )
+    np.testing.assert_array_equal(step(read, action).obs, step(state, action).obs)
 
 
 def test_installing_is_silent() -> None:
@@ -348,9 +347,11 @@ def test_policies_have_random_numbers_of_their_own() -> None:
 
     module: Any = importlib.import_module("newton_qd.compat.env_creators")
     described: Any = lambda data, _: data.obs[:, 0]  # noqa: E731
-    fitnesses, *_ = module.scoring_function_brax_envs(
-        jnp.zeros((3, 1)), jax.random.key(0), 2, Line().reset, play, described
-    )
+    fitnesses = jax.jit(
+        lambda policies, key: module.scoring_function_brax_envs(
+            policies, key, 2, Line().reset, play, described
+        )[0]
+    )(np.zeros((3, 1), np.float32), jax.random.key(0))
     assert len(set(fitnesses.tolist())) == 3
 
 
@@ -380,7 +381,9 @@ def test_what_comes_after_the_end_costs_nothing() -> None:
 
     faults = jnp.array([[0, 0, 0, 1], [0, 1, 0, 0]])
     described: Any = lambda data, _: data.obs[:, 0]  # noqa: E731
-    found = evaluate(play, (start, faults), (None, 0), 4, described)
+    found = jax.jit(
+        lambda start, faults: evaluate(play, (start, faults), (None, 0), 4, described)
+    )(start, faults)
     assert found[0].tolist() == [3.0, -np.inf]
 
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from point_runs import SMALL, PointEnv, PointState, point_task
@@ -46,20 +46,22 @@ def test_genotypes_that_are_no_weights(make: Any) -> None:
         with pytest.raises(
             ValueError, match=r"genotypes: got shape \(.*allowed: \(N, "
         ):
-            score(jnp.zeros(shape), key)
-    whole = score(jnp.ones((2, policy.size), jnp.int32), key)
-    real = score(jnp.ones((2, policy.size)), key)
+            score(np.zeros(shape, np.float32), key)
+    shape = (2, policy.size)
+    whole = jax.jit(score)(np.ones(shape, np.int32), key)
+    real = jax.jit(score)(np.ones(shape, np.float32), key)
     np.testing.assert_array_equal(whole[0], real[0])
 
 
 def test_scores_are_those_without_gradients_and_point_uphill() -> None:
     task = smooth_task()
     policy = make_policy(task.env, (4,))
-    genotypes = jax.vmap(policy.init)(jax.random.split(jax.random.key(0), 8))
-    genotypes = genotypes.at[3, 0].set(jnp.nan)
+    draw = jax.jit(jax.vmap(policy.init))
+    genotypes = np.array(draw(jax.random.split(jax.random.key(0), 8)))
+    genotypes[3, 0] = np.nan
     key = jax.random.key(1)
     score = jax.jit(make_gradient_scoring_function(task, policy, STEPS))
-    fitnesses, descriptors, extra = score(genotypes, key)
+    fitnesses, descriptors, extra = jax.device_get(score(genotypes, key))
     plain = jax.jit(make_scoring_function(task, policy, STEPS))
     without = plain(genotypes, key)
     np.testing.assert_array_equal(fitnesses, without[0])
@@ -82,7 +84,8 @@ def test_scores_are_those_without_gradients_and_point_uphill() -> None:
 
 def test_pytree_genotypes_and_plans() -> None:
     task, key = smooth_task(), jax.random.key(1)
-    weights = {"a": 0.1 * jnp.ones((5, 2, 3)), "b": {"c": 0.1 * jnp.ones((5, 2))}}
+    small = functools.partial(np.full, fill_value=0.1, dtype=np.float32)
+    weights = {"a": small((5, 2, 3)), "b": {"c": small((5, 2))}}
 
     def policy(tree: Any, obs: jax.Array) -> jax.Array:
         return tree["a"] @ obs + tree["b"]["c"]
@@ -90,7 +93,7 @@ def test_pytree_genotypes_and_plans() -> None:
     score = make_gradient_scoring_function(
         task, policy, STEPS, GradientOptions(window=2, clip=10.0)
     )
-    extra = jax.jit(score)(weights, key)[2]
+    extra = jax.device_get(jax.jit(score)(weights, key)[2])
     for name in ("gradients", "normalized_grads"):
         shapes = jax.tree.map(lambda x: x.shape, extra[name])
         assert shapes == {"a": (5, 2, 3, 3), "b": {"c": (5, 2, 3)}}
@@ -99,12 +102,14 @@ def test_pytree_genotypes_and_plans() -> None:
     ]
     np.testing.assert_allclose(sum(squares), 1.0, 1e-5)
     # a leaf without numbers has no length
-    found = unit_rows({**extra["gradients"], "none": jnp.zeros((5, 0, 3))})
+    given = {**extra["gradients"], "none": np.zeros((5, 0, 3), np.float32)}
+    found = jax.jit(unit_rows)(given)
     np.testing.assert_array_equal(found["a"], extra["normalized_grads"]["a"])
     # a plan of actions, in any shape of as many numbers
     score = jax.jit(make_gradient_scoring_function(task, None, STEPS))
-    plans = jax.random.normal(key, (5, STEPS, 2), jnp.float32)
-    shaped, flat = score(plans, key), score(plans.reshape(5, -1), key)
+    plans = np.random.default_rng(0).normal(size=(5, STEPS, 2)).astype(np.float32)
+    given = plans, plans.reshape(5, -1)
+    shaped, flat = (jax.device_get(score(each, key)) for each in given)
     assert shaped[2]["gradients"].shape == (5, STEPS, 2, 3)
     np.testing.assert_array_equal(
         shaped[2]["gradients"].reshape(5, -1, 3), flat[2]["gradients"]
@@ -113,7 +118,8 @@ def test_pytree_genotypes_and_plans() -> None:
 
 def test_directions_of_the_largest_numbers() -> None:
     """Their norm is no number, and their direction is."""
-    rows = unit_rows(jnp.array([[[3e38, -3e38, 3e38, 3e38]]]).swapaxes(1, 2))
+    large = np.array([[[3e38], [-3e38], [3e38], [3e38]]], np.float32)
+    rows = np.asarray(jax.jit(unit_rows)(large))
     np.testing.assert_allclose(rows[0, :, 0], [0.5, -0.5, 0.5, 0.5], rtol=1e-6)
 
 

@@ -68,18 +68,23 @@ def test_weights_are_a_vector(name: str) -> None:
     network, key = NETWORKS[name](), jax.random.key(3)
     policy = policy_of(newton_qd.create("pointmaze"), network)
     assert policy.size == 2 * HIDDEN + HIDDEN + HIDDEN * 2 + 2
-    weights = policy.init(key)
-    if name == "linen":
-        wanted = network.apply(network.init(key, OBSERVATION), OBSERVATION)
-    else:
-        wanted = network(key)(OBSERVATION)
-    assert np.allclose(policy.of_weights(weights, OBSERVATION), wanted, atol=1e-6)
-    assert np.array_equal(policy.ravel(policy.unravel(weights)), weights)
+    weights = jax.jit(policy.init)(key)
+
+    @jax.jit
+    def answer(key: jax.Array) -> jax.Array:
+        if name == "linen":
+            return network.apply(network.init(key, OBSERVATION), OBSERVATION)
+        return network(key)(OBSERVATION)
+
+    found = jax.jit(policy.of_weights)(weights, OBSERVATION)
+    assert np.allclose(found, answer(key), atol=1e-6)
+    again = jax.jit(lambda x: policy.ravel(policy.unravel(x)))(weights)
+    assert np.array_equal(again, weights)
     with pytest.raises(
         ValueError, match=r"weights: got shape \(3,\); allowed: \(17,\)"
     ):
         policy.of_weights(weights[:3], OBSERVATION)
-    both = jax.vmap(policy.init)(jax.random.split(key, 2))
+    both = np.asarray(jax.jit(jax.vmap(policy.init))(jax.random.split(key, 2)))
     assert both.shape == (2, policy.size) and not np.array_equal(*both)
 
 

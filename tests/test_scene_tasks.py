@@ -48,7 +48,7 @@ def in_scene(task: str) -> Any:
     return TASKS[task](lone_ant(), "ant")
 
 
-def action_of(env: Env, size: float = 0.0) -> np.ndarray:
+def action_of(env: Env, size: float = 0.0) -> Any:
     return np.full((env.action_size,), size, env.dtype)
 
 
