@@ -50,17 +50,28 @@ def method(measure: Any = reading, **changes: Any) -> ActorCritic:
     return ActorCritic(PointEnv(), policy, measure, LENGTH, settings)
 
 
-def learner(way: ActorCritic, aim: tuple[float, ...] = (1.0, 0.0, 0.0)) -> Any:
-    def begin(aim: jax.Array) -> Any:
-        first = jax.vmap(PointEnv().reset)(jax.random.split(jax.random.key(0), 4))
-        return way.begin(jax.random.key(1), jnp.zeros(SIZE), aim, first)
+@compiled
+def begun(aim: jax.Array) -> Any:
+    first = jax.vmap(PointEnv().reset)(jax.random.split(jax.random.key(0), 4))
+    return method().begin(jax.random.key(1), jnp.zeros(SIZE), aim, first)
 
-    return compiled(begin)(np.array(aim, np.float32))
+
+def learner(aim: tuple[float, ...] = (1.0, 0.0, 0.0)) -> Any:
+    """A new actor: it is the same for all settings of ``method`` that tests change."""
+    return begun(np.array(aim, np.float32))
+
+
+@functools.cache
+def scale_of_observations() -> tuple[jax.Array, jax.Array]:
+    return compiled(method().scale)(jax.random.key(2), learner().first)
+
+
+def weights_of(size: float) -> jax.Array:
+    return jnp.asarray(size * np.random.default_rng(4).normal(size=SIZE), jnp.float32)
 
 
 def learned(way: ActorCritic, aim: tuple[float, ...], updates: int = 60) -> Any:
-    start = learner(way, aim)
-    scale = compiled(way.scale)(jax.random.key(2), start.first)
+    start, scale = learner(aim), scale_of_observations()
 
     def update(carry: Any, key: jax.Array) -> tuple[Any, jax.Array]:
         return way.update(carry, scale, key)
@@ -84,11 +95,13 @@ def play(weights: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 def test_the_gradient_is_that_of_the_window() -> None:
     """Against rewards, measures and the last value, added up step by step."""
-    way, aim = method(noise=0.0), jnp.array([1.0, 0.3, -0.2])
-    start = learner(way, (1.0, 0.3, -0.2))
-    scale = compiled(way.scale)(jax.random.key(2), start.first)
-    weights = 0.3 * jax.random.normal(jax.random.key(4), (SIZE,))
-    world = jax.tree.map(lambda x: x[0], start.first)
+    way, start, scale = (
+        method(noise=0.0),
+        learner((1.0, 0.3, -0.2)),
+        scale_of_observations(),
+    )
+    weights, aim = weights_of(0.3), start.aim
+    world = jax.tree.map(lambda x: np.asarray(x)[0], start.first)
     discount, env = SETTINGS.discount, PointEnv()
 
     def by_hand(weights: jax.Array) -> jax.Array:
@@ -116,9 +129,8 @@ def test_the_gradient_is_that_of_the_window() -> None:
 def test_each_world_has_weights_of_its_own() -> None:
     """With noise on weights, each window has the policy that its noise makes."""
     way = method(noise=0.0, weight_noise=0.3)
-    start, key = learner(way), jax.random.key(4)
-    scale = compiled(way.scale)(jax.random.key(2), start.first)
-    weights = 0.3 * jax.random.normal(key, (SIZE,))
+    start, key = learner(), jax.random.key(4)
+    scale, weights = scale_of_observations(), weights_of(0.3)
     rest = jnp.zeros((SETTINGS.window, 2))
 
     def window(weights: jax.Array, world: Any) -> jax.Array:
@@ -132,21 +144,22 @@ def test_each_world_has_weights_of_its_own() -> None:
     assert np.ptp(found - compiled(jax.vmap(window, (None, 0)))(weights, start.first))
 
 
+def other_critic() -> Any:
+    """Weights of a critic that are not those of the start."""
+    draw = np.random.default_rng(5).normal
+    return jax.tree.map(
+        lambda x: np.asarray(x) + draw(size=x.shape).astype(np.float32),
+        learner().critic,
+    )
+
+
 @pytest.mark.slow
 def test_values_inside_of_a_window_count() -> None:
     """The TD(lambda) return as the weighted mean of the returns of all lengths."""
     part, way = 0.7, method(noise=0.0, actor_trace=0.7)
-    start = learner(way)
-    key = jax.random.key(4)
-    start = dataclasses.replace(
-        start,
-        target=jax.tree.map(
-            lambda x: x + jax.random.normal(key, x.shape), start.target
-        ),
-    )
-    scale = compiled(way.scale)(jax.random.key(2), start.first)
-    weights = 0.3 * jax.random.normal(key, (SIZE,))
-    world = jax.tree.map(lambda x: x[0], start.first)
+    start = dataclasses.replace(learner(), target=other_critic())
+    scale, weights = scale_of_observations(), weights_of(0.3)
+    world = jax.tree.map(lambda x: np.asarray(x)[0], start.first)
     discount, env = SETTINGS.discount, PointEnv()
 
     def by_hand(weights: jax.Array) -> jax.Array:
@@ -172,15 +185,13 @@ def test_values_inside_of_a_window_count() -> None:
 def test_the_critic_learns_td_lambda_targets() -> None:
     """The target of the first step, as the weighted mean of returns of all lengths."""
     trace, discount, way = 0.6, SETTINGS.discount, method(noise=0.0, trace=0.6)
-    start, key = learner(way), jax.random.key(4)
-    scale = jnp.array([0.1, -0.2, 0.3]), jnp.array([0.5, 2.0, 1.0])
-    critic = jax.tree.map(lambda x: x + jax.random.normal(key, x.shape), start.critic)
-    start = dataclasses.replace(start, target=critic)
-    weights = 0.3 * jax.random.normal(key, (SIZE,))
-    world = jax.tree.map(lambda x: x[0], start.first)
+    scale: Any = np.array([[0.1, -0.2, 0.3], [0.5, 2.0, 1.0]], np.float32)
+    critic, weights = other_critic(), weights_of(0.3)
+    start = dataclasses.replace(learner(), target=critic)
+    world = jax.tree.map(lambda x: np.asarray(x)[0], start.first)
 
     def value(obs: np.ndarray) -> float:
-        (first, bias), (last, offset) = jax.device_get(critic)
+        (first, bias), (last, offset) = critic
         hidden = np.tanh((obs - scale[0]) / scale[1] @ first + bias)
         return float((hidden @ last + offset)[0]) / (1 - discount)
 
@@ -206,8 +217,8 @@ def test_the_critic_learns_td_lambda_targets() -> None:
 
 def test_an_update_follows_the_mean_gradient_and_moves_the_target_critic() -> None:
     way, key = method(), jax.random.key(4)
-    start = dataclasses.replace(learner(way), weights=0.3 * jnp.ones(SIZE))
-    scale = jnp.zeros(3), jnp.ones(3)
+    start = dataclasses.replace(learner(), weights=jnp.full(SIZE, 0.3))
+    scale: Any = np.zeros(3, np.float32), np.ones(3, np.float32)
 
     @compiled
     def both() -> Any:
@@ -229,18 +240,17 @@ def test_an_update_follows_the_mean_gradient_and_moves_the_target_critic() -> No
 
 
 def test_the_age_of_a_world_begins_again_after_a_fall() -> None:
-    right = jnp.array([1.0, 0.0])
+    right: Any = np.array([1.0, 0.0], np.float32)
     settings = dataclasses.replace(SETTINGS, window=10, noise=0.0)
     beyond = 2 * right  # clipped to 1
     way = ActorCritic(PointEnv(), lambda *_: beyond, reading, LENGTH, settings)
-    first = jax.vmap(PointEnv().reset)(jax.random.split(jax.random.key(0), 4))
-    start = way.begin(jax.random.key(1), jnp.zeros(SIZE), jnp.ones(3), first)
+    start = learner((1.0, 1.0, 1.0))
     assert start.age.tolist() == [0, 5, 10, 15]
-    scale = jnp.zeros(3), jnp.ones(3)
+    scale: Any = np.zeros(3, np.float32), np.ones(3, np.float32)
     after, failed = compiled(way.update)(start, scale, jax.random.key(2))
     # a step is 0.3 long, and the point falls 2 away from the middle: in step 7
     assert not failed and after.age.tolist() == [3, 3, 3, 3]
-    place = first.pipeline_state + 3 * 0.3 * right
+    place = np.asarray(start.first.pipeline_state) + 3 * 0.3 * right
     np.testing.assert_allclose(after.worlds.pipeline_state, place, atol=1e-5)
 
 
@@ -253,6 +263,34 @@ class Over(PointEnv):
         return dataclasses.replace(state, done=jnp.ones_like(state.done), info=info)
 
 
+@functools.cache
+def ends(window: int, beyond: bool) -> Any:
+    """Compiled functions of weights and a place: what a window finds from there."""
+    way = method(noise=0.0, window=window, beyond_length=beyond)
+    way = dataclasses.replace(way, env=Over(), policy=lambda weights, _: weights[:2])
+    start = learner()
+    ones = jax.tree.map(jnp.ones_like, start.target)
+    start = dataclasses.replace(start, target=ones)
+    scale = jnp.zeros(3), jnp.ones(3)
+    first = Over()._state(jnp.full(2, 0.1), jnp.zeros(()))
+
+    def by_hand(weights: jax.Array, push: jax.Array, counts: jax.Array) -> jax.Array:
+        world = Over()._state(jnp.full(2, push), jnp.zeros(()))
+        state = PointEnv().step(world, weights[:2])
+        value = way._value(start.target, scale, state.obs)
+        return state.reward + counts * SETTINGS.discount * value
+
+    def by_window(weights: jax.Array, push: jax.Array) -> tuple[jax.Array, Any]:
+        noise = jnp.zeros((window, 2))
+        world = Over()._state(jnp.full(2, push), jnp.zeros(()))
+        return way._window(weights, start, scale, first, world, noise)
+
+    return (
+        compiled(jax.value_and_grad(by_window, has_aux=True)),
+        compiled(jax.value_and_grad(by_hand)),
+    )
+
+
 @pytest.mark.parametrize("window", [1, 3])
 @pytest.mark.parametrize("beyond", [False, True])
 @pytest.mark.parametrize("push", [0.5, 8.0])
@@ -260,35 +298,16 @@ def test_the_end_of_a_whole_episode_has_a_value(
     window: int, beyond: bool, push: float
 ) -> None:
     """Also within a window, whose other steps belong to other episodes."""
-    way = method(noise=0.0, window=window, beyond_length=beyond)
-    way = dataclasses.replace(way, env=Over(), policy=lambda weights, _: weights[:2])
-    start = learner(way)
-    ones = jax.tree.map(jnp.ones_like, start.target)
-    start = dataclasses.replace(start, target=ones)
-    scale = jnp.zeros(3), jnp.ones(3)
-    world = Over()._state(jnp.full(2, push), jnp.zeros(()))
-    first = Over()._state(jnp.full(2, 0.1), jnp.zeros(()))
+    by_window, by_hand = ends(window, beyond)[0], ends(1, False)[1]
     counts = beyond and push < 2  # farther from the middle, the point falls
-
-    def by_hand(weights: jax.Array) -> jax.Array:
-        state = PointEnv().step(world, weights[:2])
-        value = way._value(start.target, scale, state.obs)
-        return state.reward + counts * SETTINGS.discount * value
-
-    def by_window(weights: jax.Array) -> tuple[jax.Array, Any]:
-        noise = jnp.zeros((window, 2))
-        return way._window(weights, start, scale, first, world, noise)
-
-    weights = jnp.full(SIZE, 0.3)
-    (total, found), slope = compiled(jax.value_and_grad(by_window, has_aux=True))(
-        weights
-    )
-    expected, other = compiled(jax.value_and_grad(by_hand))(weights)
-    last, _, targets, dones = found
+    weights, place = np.full(SIZE, 0.3, np.float32), np.float32(push)
+    (total, found), slope = by_window(weights, place)
+    expected, other = by_hand(weights, place, np.float32(counts))
+    last, _, targets, dones = jax.device_get(found)
     np.testing.assert_allclose((total, targets[0]), expected, rtol=1e-5)
     np.testing.assert_allclose(slope, other, rtol=1e-5)
     assert dones.tolist() == [1] * window
-    np.testing.assert_array_equal(last.pipeline_state, first.pipeline_state)
+    np.testing.assert_array_equal(last.pipeline_state, np.full(2, 0.1, np.float32))
 
 
 class Blind(PointEnv):
@@ -302,8 +321,13 @@ class Blind(PointEnv):
 
 def test_the_scale_is_that_of_observations_that_are_numbers() -> None:
     way = dataclasses.replace(method(), env=Blind())
-    first = jax.vmap(Blind().reset)(jax.random.split(jax.random.key(0), 4))
-    for found in compiled(way.scale)(jax.random.key(2), first):
+
+    @compiled
+    def scale() -> tuple[jax.Array, jax.Array]:
+        first = jax.vmap(Blind().reset)(jax.random.split(jax.random.key(0), 4))
+        return way.scale(jax.random.key(2), first)
+
+    for found in scale():
         assert np.isfinite(found).all()
 
 
@@ -412,9 +436,7 @@ def test_individuals_are_actors_and_what_lies_between_them_and_elites() -> None:
 
 
 def test_a_single_copy_is_the_actor_itself() -> None:
-    state = generations(1)[0][0]
-    cells = compute_euclidean_centroids((4, 4), [-2.0, -2.0], [2.0, 2.0])
-    archive = compiled(MapElitesRepertoire.init_default)(jnp.zeros(SIZE), cells)
+    archive, state = initial()[0], generations(1)[0][0]
     offspring, _ = compiled(emitter(copies=1).emit)(archive, state, jax.random.key(0))
     np.testing.assert_array_equal(offspring, state.snapshots.reshape(-1, SIZE))
 
@@ -422,15 +444,15 @@ def test_a_single_copy_is_the_actor_itself() -> None:
 def test_noise_of_offspring_is_log_uniform() -> None:
     """Actors and elites are equal, so there is nothing but noise between them."""
     state = generations(1)[0][0]
-    point = state.snapshots[0, 0]
-    state = dataclasses.replace(state, snapshots=jnp.tile(point, (2, 3, 1)))
-    cells = compute_euclidean_centroids((4, 4), [-2.0, -2.0], [2.0, 2.0])
-    archive = MapElitesRepertoire.init_default(genotype=point, centroids=cells)
-    archive = archive.replace(
-        genotypes=jnp.tile(point, (16, 1)), fitnesses=jnp.zeros((16, 1))
+    point = np.asarray(state.snapshots)[0, 0]
+    state = dataclasses.replace(state, snapshots=np.tile(point, (2, 3, 1)))
+    archive: Any = initial()[0].replace(
+        genotypes=np.tile(point, (16, 1)), fitnesses=np.zeros((16, 1), np.float32)
     )
     made = emitter(copies=100, spread=(1e-3, 1.0))
-    offspring = compiled(made.emit)(archive, state, jax.random.key(0))[0][6:]
+    offspring = np.asarray(compiled(made.emit)(archive, state, jax.random.key(0))[0])[
+        6:
+    ]
     tens = np.log10(np.sqrt(np.mean(np.square(offspring - point), axis=1)))
     assert tens.min() < -2.7 and -0.3 < tens.max()
     assert abs(np.median(tens) + 1.5) < 0.3

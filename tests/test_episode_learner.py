@@ -25,6 +25,7 @@ from test_actor_critic import (
     play,
     policy,
     reading,
+    weights_of,
 )
 
 from newton_qd.qd import EvolveConfig, make_task
@@ -43,7 +44,8 @@ from newton_qd.qd.scoring.networks import policy_for
 from newton_qd.qd.scoring.rollout import episode_of
 
 KEY = jax.random.key(4)
-PLAIN = (jnp.zeros(3), jnp.ones(3))  # scale of observations
+# scale of observations
+PLAIN: Any = (np.zeros(3, np.float32), np.ones(3, np.float32))
 
 
 def episodes(
@@ -53,48 +55,54 @@ def episodes(
     return EpisodeLearning(method(measure, noise=noise), PointEnv(), **given)
 
 
+@functools.cache
+def slopes(averaged: bool) -> Any:
+    return compiled(episodes(averaged=averaged).slopes)
+
+
+@compiled
+def slopes_by_hand(weights: jax.Array, start: Any, averaged: jax.Array) -> Any:
+    """Of rewards and measures up to a fall, added up step by step."""
+    env = PointEnv()
+
+    def total(weights: jax.Array, state: Any) -> tuple[jax.Array, jax.Array]:
+        def advance(carry: Any, _: None) -> tuple[Any, None]:
+            state, sums, up = carry
+            state = env.step(state, policy(weights, state.obs))
+            gains = jnp.array([state.reward, *state.pipeline_state, 1.0])
+            return (state, sums + up * gains, up * (1 - state.done)), None
+
+        carry = state, jnp.zeros(4), jnp.ones(())
+        (_, sums, up), _ = jax.lax.scan(advance, carry, length=LENGTH)
+        share = jnp.where(averaged, LENGTH / sums[3], 1)
+        return jnp.append(sums[0], sums[1:3] * share) @ start.aim, up
+
+    each = jax.vmap(jax.grad(total, has_aux=True), in_axes=(None, 0))
+    return each(weights, start.first)
+
+
 @pytest.mark.parametrize("averaged", [False, True])
 @pytest.mark.parametrize("size", [0.3, 3.0])  # the second one falls
 def test_the_gradient_is_that_of_the_episode(size: float, averaged: bool) -> None:
-    """Against rewards and measures up to a fall, added up step by step."""
-    later, aim = episodes(averaged=averaged), jnp.array([1.0, 0.3, -0.2])
-    start = learner(later.method, (1.0, 0.3, -0.2))
-    weights = size * jax.random.normal(jax.random.key(4), (SIZE,))
-    env = PointEnv()
-
-    def by_hand(weights: jax.Array, state: Any) -> tuple[jax.Array, jax.Array]:
-        gained, measured = jnp.zeros(()), jnp.zeros(2)
-        steps, up = jnp.zeros(()), jnp.ones(())
-        for _ in range(LENGTH):
-            state = env.step(state, policy(weights, state.obs))
-            gained += up * state.reward
-            measured += up * state.pipeline_state
-            steps += up
-            up = up * (1 - state.done)
-        measured = measured * LENGTH / steps if averaged else measured
-        return jnp.append(gained, measured) @ aim, up
-
-    found, sound = compiled(later.slopes)(weights, start, jax.random.key(6))
-    expected, up = compiled(
-        jax.vmap(jax.grad(by_hand, has_aux=True), in_axes=(None, 0))
-    )(weights, start.first)
-    assert (up.min() == 0) == (size == 3.0) and sound.all()
+    start, weights = learner((1.0, 0.3, -0.2)), weights_of(size)
+    found, sound = slopes(averaged)(weights, start, jax.random.key(6))
+    expected, up = jax.device_get(slopes_by_hand(weights, start, averaged))
+    assert (up.min() == 0) == (size == 3.0) and np.all(sound)
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
 
 
 def test_each_world_has_weights_of_its_own() -> None:
     later = episodes(weight_noise=0.3)
-    start, key = learner(later.method), jax.random.key(6)
-    weights = 0.3 * jax.random.normal(jax.random.key(4), (SIZE,))
-    found, sound = compiled(later.slopes)(weights, start, key)
+    start, key = jax.device_get(learner()), jax.random.key(6)
+    weights = np.array([0.5, 0.4, 0.6, -0.3, 0.1, 0.2], np.float32)
+    found, sound = jax.device_get(compiled(later.slopes)(weights, start, key))
     assert sound.any() and not sound.all()  # a fault does not count
-    rest = jnp.zeros((LENGTH, 2))
+    rest = np.zeros((LENGTH, 2), np.float32)
     other = jax.random.normal(jax.random.split(key)[1], (SETTINGS.worlds, SIZE))
-    for world, own in enumerate(weights + 0.3 * other):
+    alone = compiled(jax.grad(later._worth, has_aux=True))
+    for world, own in enumerate(weights + np.float32(0.3) * np.asarray(other)):
         first = jax.tree.map(lambda x, world=world: x[world], start.first)
-        slope, faulty = compiled(jax.grad(later._worth, has_aux=True))(
-            own, start.aim, first, rest
-        )
+        slope, faulty = alone(own, start.aim, first, rest)
         assert bool(faulty) is not bool(sound[world])
         slope = np.where(faulty, 0, slope)
         np.testing.assert_allclose(found[world], slope, rtol=1e-5, atol=1e-5)
@@ -110,12 +118,13 @@ def test_weights_for_whitened_observations_have_their_own_gradient() -> None:
         method(noise=0.0, worlds=1), policy=biased, whitening=white
     )
     later = EpisodeLearning(way, PointEnv(), after=0, updates=1, weight_noise=0.0)
-    scale = jnp.array([0.5, -1.0, 0.2]), jnp.array([0.5, 2.0, 1.0])
-    weights, aim = 0.1 * jax.random.normal(KEY, (8,)), jnp.array([1.0, 0.3, -0.2])
-    first = jax.vmap(PointEnv().reset)(KEY[None])
 
     @compiled
     def both() -> tuple[jax.Array, jax.Array]:
+        scale = jnp.array([0.5, -1.0, 0.2]), jnp.array([0.5, 2.0, 1.0])
+        weights, aim = 0.1 * jax.random.normal(KEY, (8,)), jnp.array([1.0, 0.3, -0.2])
+        first = jax.vmap(PointEnv().reset)(KEY[None])
+
         def worth(weights: jax.Array) -> jax.Array:
             one = jax.tree.map(lambda x: x[0], first)
             rest = jnp.zeros((LENGTH, 2))
@@ -126,8 +135,9 @@ def test_weights_for_whitened_observations_have_their_own_gradient() -> None:
         mean = next(x for x in jax.tree.leaves(moments) if x.shape == (8,))
         return mean, jax.grad(worth)(weights)
 
-    mean, slope = both()  # Adam's mean of the loss, whose length is limited
-    found, expected = (x / jnp.linalg.norm(x) for x in (-mean, slope))
+    # Adam's mean of the loss, whose length is limited
+    mean, slope = jax.device_get(both())
+    found, expected = (x / np.linalg.norm(x) for x in (-mean, slope))
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
@@ -160,7 +170,7 @@ def test_a_fall_has_the_gradient_of_an_episode() -> None:
 @pytest.mark.slow
 def test_actors_reach_what_they_aim_at() -> None:
     later = episodes(noise=0.1, weight_noise=0.1)
-    start = learner(later.method)
+    start = learner()
 
     def update(carry: Any, key: jax.Array) -> tuple[Any, jax.Array]:
         return later.update(carry, PLAIN, key)
@@ -171,17 +181,23 @@ def test_actors_reach_what_they_aim_at() -> None:
     assert play(jnp.zeros(SIZE))[0] < 12 < 17 < play(best.weights)[0]
 
 
-def broken(after_this: float, before: Any, after: Any) -> jax.Array:
+def broken(after_this: Any, before: Any, after: Any) -> jax.Array:
     del before
     position = after.pipeline_state
     return jnp.where(position > after_this, jnp.nan, position)
 
 
+@compiled
+def updated(start: Any, limit: jax.Array) -> tuple[Any, jax.Array]:
+    """An actor after an update with a measure that is no number beyond a limit."""
+    later = episodes(functools.partial(broken, limit))
+    return later.update(start, PLAIN, jax.random.key(2))
+
+
 @pytest.mark.parametrize(("limit", "lost"), [(-9.0, True), (9.0, False)])
 def test_lost_gradients_change_nothing(limit: float, lost: bool) -> None:
-    later = episodes(functools.partial(broken, limit))
-    start = learner(later.method, (1.0, 1.0, 1.0))
-    after, failed = compiled(later.update)(start, PLAIN, jax.random.key(2))
+    start = learner((1.0, 1.0, 1.0))
+    after, failed = updated(start, np.float32(limit))
     assert bool(failed) is lost
     same = np.array_equal(after.weights, start.weights)
     assert same is lost and np.isfinite(after.weights).all()
@@ -202,7 +218,7 @@ def test_actors_go_on_from_episodes_after_some_generations() -> None:
     given = genotypes, jnp.arange(4.0), genotypes[:, :2]
     archive = compiled(MapElitesRepertoire.init)(*given, cells, {})
     counts: Any = {"actors": 2, "branches": 1, "updates": 2, "steered": 0.0}
-    first = PointEnv().reset(jax.random.key(0))
+    first = compiled(PointEnv().reset)(jax.random.key(0))
 
     def states(later: EpisodeLearning | None) -> list[Any]:
         made = ActorCriticEmitter(method(), first, **counts, measures=2, later=later)

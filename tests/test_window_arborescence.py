@@ -53,16 +53,18 @@ def generations(number: int) -> list[tuple[Any, Any]]:
     cells = compute_euclidean_centroids((4, 4), [-2.0, -2.0], [2.0, 2.0])
     genotypes = 0.1 * jax.random.normal(jax.random.key(0), (16, SIZE), jnp.float32)
     fitnesses, found, _ = compiled(score)(genotypes, jax.random.key(0))
-    repertoire = AnnealedRepertoire.init(
-        genotypes, fitnesses, found, cells, learning_rate=0.1, threshold_min=0.0
+    begin = functools.partial(
+        AnnealedRepertoire.init, learning_rate=0.1, threshold_min=0.0
     )
+    repertoire = compiled(begin)(genotypes, fitnesses, found, cells)
+    scored, add = compiled(score), compiled(AnnealedRepertoire.add)
     state = init(jax.random.key(1), repertoire, genotypes, fitnesses, found, {})
     rows = []
     for generation in range(number):
         offspring, _ = emit(repertoire, state, jax.random.key(generation))
         rows.append((state, offspring))
-        fitnesses, found, _ = compiled(score)(offspring, jax.random.key(0))
-        repertoire = repertoire.add(offspring, found, fitnesses)
+        fitnesses, found, _ = scored(offspring, jax.random.key(0))
+        repertoire = add(repertoire, offspring, found, fitnesses)
         state = update(state, repertoire, offspring, fitnesses, found, {})
     return rows
 
