@@ -58,6 +58,9 @@ def score(genotypes: jax.Array, key: jax.Array) -> tuple[Any, Any, dict[str, Any
     return found[:, 0], found[:, 1:], {"gradients": jnp.swapaxes(gradients, 1, 2)}
 
 
+scored = compiled(score)
+
+
 def broken(
     genotypes: jax.Array, key: jax.Array, limit: Any = 0.8
 ) -> tuple[Any, Any, dict[str, Any]]:
@@ -70,8 +73,11 @@ def broken(
     return fitnesses, descriptors, {"gradients": gradients}
 
 
+@functools.cache
 def centroids(dtype: Any = jnp.float32) -> jax.Array:
-    return compute_euclidean_centroids((10, 10), [-1.0, -1.0], [1.0, 1.0]).astype(dtype)
+    with jax.ensure_compile_time_eval():
+        cells = compute_euclidean_centroids((10, 10), [-1.0, -1.0], [1.0, 1.0])
+        return cells.astype(dtype)
 
 
 def no_mutation(genotypes: Any, key: jax.Array) -> Any:
@@ -148,9 +154,10 @@ def algorithm(emitter: Any, scoring: Callable = score, annealed: bool = False) -
 
 
 @functools.cache
-def start() -> jax.Array:
+def start() -> np.ndarray:
     """(16, SIZE) initial population."""
-    return 0.1 * jax.random.normal(jax.random.key(0), (16, SIZE), jnp.float32)
+    draw = np.random.default_rng(0).normal
+    return (0.1 * draw(size=(16, SIZE))).astype(np.float32)
 
 
 def begin(emitter: Any, count: int = 16, scoring: Callable = score) -> tuple:
@@ -159,8 +166,14 @@ def begin(emitter: Any, count: int = 16, scoring: Callable = score) -> tuple:
     return init(start()[:count], centroids(), jax.random.key(0))[:2]
 
 
-def emit(emitter: Any, repertoire: Any, state: Any) -> jax.Array:
-    return compiled(emitter.emit)(repertoire, state, jax.random.key(1))[0]
+@functools.cache
+def emission(emitter: Any) -> Any:
+    return compiled(emitter.emit)
+
+
+def emit(emitter: Any, repertoire: Any, state: Any) -> np.ndarray:
+    """Offspring of an emitter."""
+    return np.asarray(emission(emitter)(repertoire, state, jax.random.key(1))[0])
 
 
 @functools.cache
@@ -190,8 +203,11 @@ def result(name: str, limit: float = np.inf) -> Any:
 def isoline_coverage() -> float:
     """What QDax's variation alone fills with the same number of individuals."""
     search = algorithm(isoline(16))
-    repertoire, state, _ = search.init(start(), centroids(), jax.random.key(0))
-    carry = (repertoire, state, jax.random.key(1))
-    scan = functools.partial(jax.lax.scan, search.scan_update, length=ITERATIONS)
-    _, rows = compiled(scan)(carry, None)
-    return float(rows["coverage"][-1])
+
+    def run(initial: jax.Array) -> jax.Array:
+        begun = search.init(initial, centroids(), jax.random.key(0))[:2]
+        carry = (*begun, jax.random.key(1))
+        _, rows = jax.lax.scan(search.scan_update, carry, length=ITERATIONS)
+        return rows["coverage"][-1]
+
+    return float(compiled(run)(start()))

@@ -80,12 +80,10 @@ def test_errors_name_what_is_wrong() -> None:
         emitter = GradientVariationEmitter(4, optax.sgd(1.0), directions=[(1, 0)])
         emit(emitter, *begin(emitter))
     # Values are known outside jit only; what finds them may be compiled.
-    scoring = compiled(broken)
-    search = algorithm(
-        CMAMEGAEmitter(scoring, sigma_g=1.0, start=jnp.ones(SIZE)), scoring
-    )
+    emitter = CMAMEGAEmitter(compiled(broken), sigma_g=1.0, start=jnp.ones(SIZE))
+    archive = begin(OMGMEGAEmitter(4, sigma_g=0.5))[0]
     with pytest.raises(GradientsError, match="not finite"):
-        search.init(start(), centroids(), jax.random.key(0))
+        emitter.init(jax.random.key(0), archive, start(), fitnesses, descriptors, extra)
 
 
 def test_gradients_that_were_set_to_zero_are_not_known() -> None:

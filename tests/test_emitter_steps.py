@@ -19,6 +19,7 @@ from emitter_problems import (
     compiled,
     emit,
     score,
+    scored,
     start,
 )
 from qdax.core.containers.mapelites_repertoire import (
@@ -38,16 +39,21 @@ from newton_qd.qd.emitters import (
 )
 from newton_qd.qd.emitters.gradient_line import _units
 from newton_qd.qd.emitters.ranking import IMPROVED, NEW, WORSE, best_of
-from newton_qd.qd.scoring.gradient_scores import normalize
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
+
+
+def gradients_at_start() -> np.ndarray:
+    """(3, SIZE) gradients of the first genotype."""
+    return np.asarray(scored(start()[:1], jax.random.key(0))[2]["gradients"])[0].T
 
 
 def test_omg_mega_steps_along_the_gradients() -> None:
     emitter = OMGMEGAEmitter(64, sigma_g=0.3)
     repertoire, state = begin(emitter, 1)
-    steps = np.asarray(emit(emitter, repertoire, state) - start()[:1])
-    gradients = normalize(score(start()[:1], jax.random.key(0))[2]["gradients"][0].T)
+    steps = emit(emitter, repertoire, state) - start()[:1]
+    gradients = gradients_at_start()
+    gradients = gradients / np.linalg.norm(gradients, axis=1, keepdims=True)
     coefficients, residual, _, _ = np.linalg.lstsq(gradients.T, steps.T, rcond=None)
     assert np.max(residual) < 1e-9
     assert np.all(coefficients[0] > 0)
@@ -70,8 +76,9 @@ def test_each_parent_draws_a_direction() -> None:
     emitter = GradientVariationEmitter(
         32, optax.sgd(0.1), directions=[(1, 0, 0), (0, 0, -1)]
     )
-    steps = np.asarray(emit(emitter, *begin(emitter, 1)) - start()[:1]) / 0.1
-    rows = normalize(score(start()[:1], jax.random.key(0))[2]["gradients"][0].T)
+    steps = (emit(emitter, *begin(emitter, 1)) - start()[:1]) / 0.1
+    rows = gradients_at_start()
+    rows = rows / np.linalg.norm(rows, axis=1, keepdims=True)
     near = [np.abs(steps - way).max(axis=1) < 1e-4 for way in (rows[0], -rows[2])]
     assert np.all(near[0] ^ near[1]) and 4 < near[0].sum() < 28
 
@@ -81,7 +88,7 @@ def test_steering_lands_in_empty_cells() -> None:
     emitter = SteeringEmitter(32, max_step=100.0)
     repertoire, state = begin(emitter)
     genotypes = emit(emitter, repertoire, state)
-    descriptors = compiled(score)(genotypes, jax.random.key(0))[1]
+    descriptors = scored(genotypes, jax.random.key(0))[1]
     cells = compiled(get_cells_indices)(descriptors, centroids())
     repertoire = jax.device_get(repertoire)
     assert np.all(repertoire.fitnesses[cells, 0] == -jnp.inf)
@@ -113,18 +120,19 @@ def test_large_jacobians_give_short_steps(large: float) -> None:
 
 def test_without_known_gradients_steering_starts_from_elites() -> None:
     emitter = SteeringEmitter(8, max_step=1.0)
-    repertoire, state = begin(emitter)
+    repertoire, state = jax.device_get(begin(emitter))
     changed = repertoire.replace(fitnesses=repertoire.fitnesses + 1)
-    assert not jnp.any(state.known(changed)) and changed.fitnesses[0, 0] == -jnp.inf
+    assert not np.any(state.known(changed)) and changed.fitnesses[0, 0] == -np.inf
     genotypes = emit(emitter, changed, state)
-    same = np.all(np.asarray(genotypes)[:, None] == changed.genotypes, axis=-1)
-    filled = np.asarray(changed.fitnesses[:, 0]) > -np.inf
+    same = np.all(genotypes[:, None] == changed.genotypes, axis=-1)
+    filled = changed.fitnesses[:, 0] > -np.inf
     assert np.all(np.any(same & filled, axis=1))
-    chosen = compiled(lambda: state.select(changed, jax.random.key(2), 16))()
+    select = compiled(lambda state, given: state.select(given, jax.random.key(2), 16))
+    chosen = np.asarray(select(state, changed))
     assert filled[chosen].all()
     # with one known elite, this one alone moves, along means of halves
     (cell, *_) = np.flatnonzero(filled)
-    known = jnp.where(jnp.arange(len(filled)) == cell, state.fitnesses, -jnp.inf)
+    known = np.where(np.arange(len(filled)) == cell, state.fitnesses, -np.inf)
     found = emit(emitter, repertoire, state.replace(fitnesses=known))
     halves = (found - repertoire.genotypes[cell]).reshape(-1, 2, SIZE // 2)
     np.testing.assert_allclose(halves, halves[..., :1] + 0 * halves, atol=1e-5)
@@ -153,8 +161,8 @@ def test_lines_climb_and_steer() -> None:
     edges = 0.1 * 8 ** (np.arange(4) / 3)
     assert np.all((lengths >= edges[:-1] - 1e-5) & (lengths <= edges[1:] + 1e-5))
     ways = steps / lengths[..., None]
-    gradients = np.asarray(score(start()[:1], jax.random.key(0))[2]["gradients"][0])
-    uphill = gradients[:, 0] / np.linalg.norm(gradients[:, 0])
+    uphill = gradients_at_start()[0]
+    uphill = uphill / np.linalg.norm(uphill)
     np.testing.assert_allclose(ways[:2], np.broadcast_to(uphill, (2, 3, SIZE)), 1e-4)
     # The others change the descriptors alone, which are means of halves.
     for way in ways[2:]:
@@ -164,8 +172,8 @@ def test_lines_climb_and_steer() -> None:
 
 
 def test_lines_without_a_gradient_have_random_directions() -> None:
-    rows = jnp.array([[np.inf, 1.0], [np.nan, 1.0], [0.0, 0.0], [3.0, 4.0]])
-    ways = compiled(_units)(rows, jax.random.key(0))
+    rows = np.array([[np.inf, 1], [np.nan, 1], [0, 0], [3, 4]], np.float32)
+    ways = np.asarray(compiled(_units)(rows, jax.random.key(0)))
     np.testing.assert_allclose(np.linalg.norm(ways, axis=1), 1, rtol=1e-6)
     np.testing.assert_allclose(ways[3], [0.6, 0.8], rtol=1e-6)
 
@@ -187,20 +195,24 @@ def test_lines_steer_towards_the_empty_cell() -> None:
         along(score), parents=4, branches=2, shortest=0.1, longest=0.2
     )
     parent = start()[:1]
-    _, place, _ = compiled(score)(parent, jax.random.key(0))
-    empty = jnp.arange(100)[:, None] == 7
+    _, place, _ = scored(parent, jax.random.key(0))
+    empty = np.arange(100)[:, None] == 7
+    place, cells = np.asarray(place), np.asarray(centroids())
+    given: dict[str, Any] = {
+        "genotypes": np.tile(parent, (100, 1)),
+        "fitnesses": np.where(empty, -np.inf, 0.0).astype(np.float32),
+        "descriptors": np.tile(place, (100, 1)),
+        "centroids": cells,
+    }
     repertoire = MapElitesRepertoire(
-        genotypes=jnp.tile(parent, (100, 1)),
-        fitnesses=jnp.where(empty, -jnp.inf, 0.0),
-        descriptors=jnp.tile(place, (100, 1)),
-        centroids=centroids(),
+        **given,
         extra_scores={},
         keys_extra_scores=(),
     )
     steered = emit(emitter, repertoire, ()).reshape(4, 2, SIZE)[2:]
-    found = compiled(score)(steered.reshape(-1, SIZE), jax.random.key(0))[1]
-    away = np.linalg.norm(found - centroids()[7], axis=1)
-    assert np.all(away < np.linalg.norm(place - centroids()[7]) - 0.01)
+    found = scored(steered.reshape(-1, SIZE), jax.random.key(0))[1]
+    away = np.linalg.norm(np.asarray(found) - cells[7], axis=1)
+    assert np.all(away < np.linalg.norm(place - cells[7]) - 0.01)
 
 
 def unbeatable(genotypes: jax.Array, key: jax.Array) -> tuple:
@@ -214,7 +226,6 @@ def unbeatable(genotypes: jax.Array, key: jax.Array) -> tuple:
     ("rule", "period", "expected"),
     [
         (RestartRule.BASIC, 3, [1, 2, 0, 1, 2, 0]),
-        (RestartRule.NO_IMPROVEMENT, None, [0, 0, 0, 0, 0, 0]),
         ("no_improvement", None, [0, 0, 0, 0, 0, 0]),
     ],
 )
@@ -249,24 +260,27 @@ def test_points_restart_from_elites(
 def test_failed_offspring_do_not_move_the_distribution() -> None:
     emitter = CMAMEGAEmitter(score, sigma_g=0.5, batch_size=5)
     begun = emitter._strategy(2).init(jnp.float32)
-    coefficients = jnp.full((4, 3), 100.0).at[0].set(0.5)
-    finite = jnp.array([True, False, False, False])
-    scores = jnp.float32([1, 0, 0, 0]), jnp.full(4, -jnp.inf)
+    coefficients = np.full((4, 3), 100, np.float32)
+    coefficients[0] = 0.5
+    finite = np.array([True, False, False, False])
+    scores = np.array([[1, 0, 0, 0], [-np.inf] * 4], np.float32)
     adapt = compiled(emitter._adapt)
     after, improved, _ = adapt(begun, coefficients, *scores, finite)
     assert improved and 0 < after.mean.max() <= 0.5
     # their fitness is no number, so it is above no bar
-    none = jnp.zeros(4), jnp.full(4, -5.0), finite & ~finite
+    nothing = np.zeros(4, np.float32)
+    none = nothing, nothing - 5, finite & ~finite
     assert not adapt(begun, coefficients, *none)[1]
     # an individual at the bar does not enter
-    equal = jnp.zeros(4), jnp.zeros(4), finite | ~finite
+    equal = nothing, nothing, finite | ~finite
     assert not adapt(begun, coefficients, *equal)[1]
 
 
 def test_points_draw_offspring_of_their_own_along_unit_gradients() -> None:
     emitter = CMAMEGAEmitter(score, sigma_g=0.5, batch_size=8, num_emitters=2)
     state = begin(emitter)[1]
-    assert np.abs(state.coefficients[0] - state.coefficients[1]).max() > 0.1
+    one, two = np.asarray(state.coefficients)
+    assert np.abs(one - two).max() > 0.1
     np.testing.assert_allclose(np.linalg.norm(state.gradients, axis=-1), 1, rtol=1e-5)
 
 
@@ -352,9 +366,9 @@ def test_emitting_and_updating_agree() -> None:
     far = np.full(SIZE, 0.9, np.float32)
     emitter = CMAMEGAEmitter(score, sigma_g=0.5, batch_size=9, start=far)
     search = algorithm(emitter)
-    repertoire, state = begin(emitter)
+    repertoire, state = jax.device_get(begin(emitter))
     genotypes = emit(emitter, repertoire, state)
-    fitnesses, descriptors, _ = compiled(score)(genotypes, jax.random.key(2))
+    fitnesses, descriptors, _ = scored(genotypes, jax.random.key(2))
     tell = compiled(search.tell)
     _, after, _ = tell(genotypes, fitnesses, descriptors, repertoire, state)
     own, *cells = np.asarray(compiled(get_cells_indices)(descriptors, centroids()))
@@ -372,12 +386,12 @@ def test_emitting_and_updating_agree() -> None:
     np.testing.assert_allclose(after.points[0], expected, atol=1e-5)
     # what is not finite is counted; a point without gradients begins again
     assert int(after.rejected) == 0
-    lost = fitnesses.at[3].set(jnp.nan)
+    lost = np.array(fitnesses)
+    lost[3] = np.nan
     state = state.replace(finite=~state.finite)
     _, after, _ = tell(genotypes, lost, descriptors, repertoire, state)
     assert [int(x) for x in (after.rejected, after.restarts, after.age[0])] == [1, 1, 0]
     # the point itself was counted when its gradients were found
-    _, after, _ = tell(
-        genotypes, lost.at[0].set(jnp.nan), descriptors, repertoire, state
-    )
+    lost[0] = np.nan
+    _, after, _ = tell(genotypes, lost, descriptors, repertoire, state)
     assert int(after.rejected) == 1
