@@ -10,8 +10,10 @@ much inertia about the torso, where the kernels add it up, as about its own join
 from __future__ import annotations
 
 import contextlib
+import functools
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -146,6 +148,9 @@ def random_state(
     return q, 2.0 * rng.normal(size=system.nv)
 
 
+built = functools.cache(build_system)
+
+
 def error(ours: np.ndarray, theirs: np.ndarray) -> float:
     """Largest difference, relative to the largest entry or 1e-3."""
     return float(np.abs(ours - theirs).max() / max(np.abs(theirs).max(), 1e-3))
@@ -155,9 +160,8 @@ def error(ours: np.ndarray, theirs: np.ndarray) -> float:
 def test_equations_of_motion(robot: RobotSpec, dtype: str) -> None:
     tolerance = ROUNDED.get((robot.name, dtype), TOLERANCE[dtype])
     with jax.enable_x64(True) if dtype == "float64" else contextlib.nullcontext():
-        system = build_system(robot, dtype)
-        mass_matrix = _jitted(physics.mass_matrix, system)
-        bias_forces = _jitted(physics.bias_forces, system)
+        system = built(robot, dtype)
+        both = _jitted(_mass_and_bias, system)
         theirs = MujocoReference(find_urdf(robot.urdf), system)
         rng = np.random.default_rng(7)
         for _ in range(STATES):
@@ -167,7 +171,7 @@ def test_equations_of_motion(robot: RobotSpec, dtype: str) -> None:
             theirs.set_state(q.astype(np.float64), v.astype(np.float64))
             expected = theirs.mass_matrix()
             scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
-            mass, bias = mass_matrix(q), bias_forces(q, v)
+            mass, bias = both(q, v)
             assert mass.dtype == bias.dtype == dtype
             assert np.abs((mass - expected) / scale).max() < tolerance
             assert error(bias, theirs.bias_forces()) < tolerance
@@ -176,17 +180,21 @@ def test_equations_of_motion(robot: RobotSpec, dtype: str) -> None:
             assert error(acceleration, theirs.acceleration(force)) < tolerance
 
 
-def _jitted(function: Callable, system: System) -> Callable[..., np.ndarray]:
+def _mass_and_bias(system: System, q: Any, v: Any) -> tuple[jax.Array, jax.Array]:
+    return physics.mass_matrix(system, q), physics.bias_forces(system, q, v)
+
+
+def _jitted(function: Callable, system: System) -> Callable[..., Any]:
     compiled = jax.jit(lambda *arguments: function(system, *arguments))
-    return lambda *arguments: np.asarray(compiled(*arguments))
+    return lambda *arguments: jax.device_get(compiled(*arguments))
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_kinematics(robot: RobotSpec, dtype: str) -> None:
     tolerance = TOLERANCE[dtype]
     with jax.enable_x64(True) if dtype == "float64" else contextlib.nullcontext():
-        system = build_system(robot, dtype)
-        compute = jax.jit(lambda q, v: physics.forward_kinematics(system, q, v))
+        system = built(robot, dtype)
+        compute = _jitted(physics.forward_kinematics, system)
         theirs = MujocoReference(find_urdf(robot.urdf), system)
         rng = np.random.default_rng(8)
         for _ in range(STATES):
@@ -205,7 +213,7 @@ def test_kinematics(robot: RobotSpec, dtype: str) -> None:
 
 def test_numpy_reference(robot: RobotSpec) -> None:
     """The slow reference of the package is a third opinion, in double precision."""
-    system = build_system(robot, "float32")
+    system = built(robot, "float32")
     theirs = MujocoReference(find_urdf(robot.urdf), system)
     np.testing.assert_array_equal(system.damping, theirs.damping())
     rng = np.random.default_rng(9)
