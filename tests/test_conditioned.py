@@ -254,6 +254,10 @@ def grid(count: int) -> MapElitesRepertoire:
     return held.replace(fitnesses=held.fitnesses.at[0, 0].set(1.0))
 
 
+def targets(made: Any, held: MapElitesRepertoire, key: jax.Array, count: int) -> Any:
+    return compiled(lambda held, key: made._targets(held, key, count))(held, key)
+
+
 def test_multipliers_stay_within_bounds() -> None:
     made, held = emitter(), grid(2)
     logits = jnp.array([6.0, 5.9, 0.0, -6.0])
@@ -277,7 +281,7 @@ def test_a_return_of_one_unit_weighs_as_much_as_half_of_the_extent() -> None:
     made: Any = emitter()
     held, key, logits = grid(2), jax.random.key(0), jnp.array([0.5, -1.0, 2.0, 0.0])
     worlds = compiled(made._worlds)(held, logits, jnp.float32(3.0), key)
-    cells = np.asarray(made._targets(held, key, 6))
+    cells = np.asarray(targets(made, held, key, 6))
     share = 1 / (1 + np.exp(-np.asarray(logits)[cells]))
     expected = [(1 - share) * LENGTH / 3, share]
     np.testing.assert_allclose(worlds.weights.T, expected, rtol=1e-5)
@@ -292,11 +296,12 @@ def test_offspring_lie_between_an_elite_and_the_policy_for_its_descriptor() -> N
     elite, place = jnp.ones(policy().size), jnp.float32([0.9, -0.3])
     actor = jax.random.normal(jax.random.key(0), (made._policy.size,))
     held = grid(2).replace(  # the place is not the centre of its cell
-        genotypes=jnp.tile(elite, (4, 1)), descriptors=jnp.tile(place, (4, 1))
+        genotypes=np.tile(elite, (4, 1)), descriptors=np.tile(place, (4, 1))
     )
     learner, none = types.SimpleNamespace(weights=actor), jnp.zeros(0, jnp.int32)
     state = types.SimpleNamespace(learner=learner, scale=None, cells=none, failed=None)
-    found = np.asarray(made.emit(held, state, jax.random.key(1))[0])
+    emit = compiled(lambda held: made.emit(held, state, jax.random.key(1))[0])  # pyright: ignore[reportArgumentType]
+    found = np.asarray(emit(held))
     told = np.asarray(made._policy.specialized(actor, jnp.float32(scaled(place))))
     way = np.asarray(elite) - told
     parts = (found - told) @ way / (way @ way)
@@ -306,7 +311,7 @@ def test_offspring_lie_between_an_elite_and_the_policy_for_its_descriptor() -> N
 
 def test_empty_targets_are_near_elites() -> None:
     made, held = emitter(empty=1.0), grid(8)
-    cells = np.asarray(made._targets(held, jax.random.key(0), 16))
+    cells = np.asarray(targets(made, held, jax.random.key(0), 16))
     place = np.asarray(held.centroids)
     away = np.linalg.norm(place - place[0], axis=1)
     assert cells.min() > 0 and away[cells].mean() < 0.6 * away[1:].mean()

@@ -88,14 +88,16 @@ def test_an_emitter_is_told_of_faulty_individuals(
     grid = jnp.linspace(0, 1, 5)[:, None]
     empty = MapElitesRepertoire.init_default(genotype=jnp.zeros(2), centroids=grid)
     scores: Any = (
-        jnp.array([1, 2, jnp.nan, 4], jnp.float32),
-        jnp.array([[0], [0.5], [1], [jnp.nan]], jnp.float32),
+        np.array([1, 2, np.nan, 4], np.float32),
+        np.array([[0], [0.5], [1], [np.nan]], np.float32),
         {},
     )
-    repertoire, told, metrics = made.begin(empty, jnp.zeros((4, 2)), scores)
+    begin = jax.jit(made.begin)
+    repertoire, told, metrics = begin(empty, np.zeros((4, 2), np.float32), scores)
     assert told[0].tolist() == [1, 2, fitness, fitness]
     assert told[1].tolist() == [[0], [0.5], [1], [0]]
-    assert repertoire.fitnesses[:, 0].tolist() == [1, -np.inf, 2, -np.inf, -np.inf]
+    fitnesses = np.asarray(repertoire.fitnesses)[:, 0]
+    assert fitnesses.tolist() == [1, -np.inf, 2, -np.inf, -np.inf]
     assert metrics["rejected"] == 2
 
 
@@ -113,6 +115,7 @@ def test_of_equally_fit_individuals_the_first_enters() -> None:
     made = generation.Generation(emitter, jax.random.key(0), False, 0.0)
     grid = jnp.linspace(0, 1, 5)[:, None]
     empty = MapElitesRepertoire.init_default(genotype=jnp.zeros(1), centroids=grid)
-    scores: Any = jnp.array([1.0, 2.0, 2.0]), jnp.zeros((3, 1)), {}
-    repertoire = made.enter(empty, jnp.array([[5.0], [6.0], [7.0]]), scores)
-    assert repertoire.genotypes[0] == 6.0
+    scores: Any = np.array([1, 2, 2], np.float32), np.zeros((3, 1), np.float32), {}
+    genotypes = np.array([[5], [6], [7]], np.float32)
+    repertoire = jax.jit(made.enter)(empty, genotypes, scores)
+    assert np.asarray(repertoire.genotypes)[0] == 6.0

@@ -56,7 +56,7 @@ def roll(env: Humanoid) -> Rolled:
     system = env.system
     q, v, _ = random_states(system, np.random.default_rng(0), WORLDS)
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), WORLDS))
-    start = jax.vmap(lambda q, v: physics.initial_state(system, q, v))(q, v)
+    start = jax.jit(jax.vmap(lambda q, v: physics.initial_state(system, q, v)))(q, v)
     state = state.replace(pipeline_state=start)
     shape = (STEPS, WORLDS, env.action_size)
     actions = np.random.default_rng(1).uniform(-1.0, 1.0, shape)
@@ -253,7 +253,10 @@ def test_weights_and_positions_can_be_chosen() -> None:
     assert env.observation_size == 229
     assert env.observation_layout[0] == ("torso position x y [m]", 2)
     ones = jnp.ones(17, np.float32)
-    dear, cheap = (jax.jit(e.step)(e.fixed_state(), ones) for e in (env, humanoid()))
+    dear, cheap = (
+        jax.device_get(jax.jit(lambda e=e: e.step(e.fixed_state(), ones))())
+        for e in (env, humanoid())
+    )
     close(dear.metrics["reward_quadctrl"], -17.0, 1e-6)
     close(cheap.metrics["reward_quadctrl"], -1.7, 1e-6)
     assert float(cheap.metrics["reward_linvel"]) != 0.0

@@ -81,7 +81,7 @@ def pushed(system: System, start: str) -> np.ndarray:
         ]
     still = np.zeros((len(rows), system.nv))
     states = (x.astype(np.float32) for x in (q, still, controls))
-    path = np.asarray(jax.vmap(rollout(system))(*states).q)
+    path = np.asarray(jax.jit(jax.vmap(rollout(system)))(*states).q)
     angles = path[np.arange(len(rows)), :, at]
     return np.array([side for side, _ in rows])[:, None] * (
         angles - np.array(limit)[:, None]

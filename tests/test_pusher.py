@@ -157,7 +157,8 @@ DEFAULT = {
 def test_default_pose() -> None:
     """The object is where the mean of its resets is; the rest is the original's."""
     env: Any = BraxViewsWrapper(Pusher())
-    qp, index = env.fixed_state().qp, env.sys.body.index
+    qp = jax.device_get(jax.jit(lambda: env.fixed_state().qp)())
+    index = env.sys.body.index
     for name, (place, rotation) in DEFAULT.items():
         np.testing.assert_allclose(qp.pos[index[name]], place, atol=2e-6)
         np.testing.assert_allclose(qp.rot[index[name]], rotation, atol=2e-6)
@@ -274,7 +275,7 @@ def test_reset() -> None:
     share = 0.5 * np.pi * 0.17**2 / (0.3 * 0.4)
     assert np.mean(radius < 0.17 - 1e-6) == pytest.approx(share, abs=0.03)
     bent = Pusher(reset_noise_scale=0.2, reset_velocity_noise_scale=0.0)
-    state = bent.reset(jax.random.key(0)).pipeline_state
+    state = jax.device_get(jax.jit(bent.reset)(jax.random.key(0))).pipeline_state
     assert 0.1 < np.abs(state.q[:7] - pose).max() <= 0.2 and not state.v.any()
 
 

@@ -41,9 +41,8 @@ def step_of(system: System) -> Any:
 
 def seen(system: System, state: PhysicsState) -> Any:
     """Bodies of a batch of states, by the kernel of the kinematics."""
-    return jax.vmap(functools.partial(physics.forward_kinematics, system))(
-        state.q, state.v
-    )
+    read = functools.partial(physics.forward_kinematics, system)
+    return jax.jit(jax.vmap(read))(state.q, state.v)
 
 
 @pytest.mark.parametrize("robot", [ANT, HALFCHEETAH, HUMANOID], ids=lambda r: r.name)
@@ -62,7 +61,8 @@ def test_step_and_kinematics_read_the_same(x64: None, robot: RobotSpec) -> None:
         jax.tree.map(np.testing.assert_array_equal, state.bodies, bodies)
     else:
         assert state.bodies is None
-    begun = jax.vmap(functools.partial(physics.initial_state, system))(state.q, state.v)
+    begin = jax.jit(jax.vmap(functools.partial(physics.initial_state, system)))
+    begun = begin(state.q, state.v)
     jax.tree.map(np.testing.assert_array_equal, state.bodies, begun.bodies)
     np.testing.assert_array_equal(state.torso_xy, begun.torso_xy)
     for name in ("feet_contact", "smooth_feet_contact"):

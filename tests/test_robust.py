@@ -128,12 +128,12 @@ def test_a_gradient_that_one_start_has_lost_is_lost(scatter: Scatter | None) -> 
 def test_the_price_of_scatter() -> None:
     price = Scatter(width=3.0, offset=10.0)
     # two episodes that end 2 w apart: each is w away from their mean
-    found = jnp.asarray([[[0.0, 1.0]] * 3, [[6.0, 1.0]] * 3], jnp.float32)
-    fitnesses = jnp.asarray([30.0, -4.0, -12.0], jnp.float32)
-    counted = price.counted(fitnesses, found, found.mean(axis=0))
+    found = np.array([[[0.0, 1.0]] * 3, [[6.0, 1.0]] * 3], np.float32)
+    fitnesses = np.array([30.0, -4.0, -12.0], np.float32)
+    counted = jax.jit(price.counted)(fitnesses, found, found.mean(axis=0))
     # half of the fitness with offset; what is below the offset does not gain
     assert np.allclose(counted, [10.0, -7.0, -12.0])
-    same = price.counted(fitnesses, found[:1], found[0])
+    same = jax.jit(price.counted)(fitnesses, found[:1], found[0])
     assert np.allclose(same, fitnesses)
     # a run's width is that of a cell: 16 cells in a square of side 2
     config = SMALL.replace(scatter=0.5, starts=2)
@@ -228,9 +228,8 @@ def test_a_run_from_several_starts(tmp_path: Path, scatter: float) -> None:
     if price is None:
         assert np.allclose(mean, again.fitnesses, rtol=1e-5)
         return
-    each = jnp.moveaxis(jnp.asarray(alone.descriptors), 1, 0)
-    middle = jnp.asarray(again.descriptors)
-    counted = price.counted(jnp.asarray(mean), each, middle)
+    each = np.moveaxis(np.asarray(alone.descriptors), 1, 0)
+    counted = jax.jit(price.counted)(mean, each, again.descriptors)
     assert np.allclose(counted, again.fitnesses, rtol=1e-5)
     assert np.any(again.fitnesses < mean - 1)
 

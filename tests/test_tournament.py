@@ -26,12 +26,14 @@ CELLS, BATCH = 5, 40_000
 def archive() -> MapElitesRepertoire:
     """Five elites whose genotype is their rank, in the middle of empty cells."""
     size = len(centroids())
-    filled = jnp.arange(10, 10 + CELLS)
-    fitnesses = jnp.full((size, 1), -jnp.inf)
-    ranks = jnp.asarray([3.0, 0.0, 4.0, 1.0, 2.0])
+    fitnesses = np.full((size, 1), -np.inf, np.float32)
+    genotypes = np.full((size, 1), -1, np.float32)
+    ranks = np.array([3, 0, 4, 1, 2], np.float32)
+    genotypes[10 : 10 + CELLS, 0] = ranks
+    fitnesses[10 : 10 + CELLS, 0] = -10 + ranks**2
     return MapElitesRepertoire(
-        genotypes=jnp.full((size,), -1.0).at[filled].set(ranks)[:, None],
-        fitnesses=fitnesses.at[filled, 0].set(-10 + ranks**2),
+        genotypes=jnp.asarray(genotypes),
+        fitnesses=jnp.asarray(fitnesses),
         descriptors=centroids(),
         extra_scores={},
         keys_extra_scores=(),
@@ -46,7 +48,7 @@ def test_the_second_parent_is_the_fittest_of_some(tournament: int) -> None:
         return jnp.concatenate([first, second], axis=1)
 
     emitter = TournamentEmitter(both, batch_size=BATCH, tournament=tournament)
-    found, _ = emitter.emit(archive(), None, jax.random.key(3))
+    found, _ = jax.jit(emitter.emit)(archive(), None, jax.random.key(3))
     first, second = np.asarray(found).astype(int).T
     every = np.bincount(first, minlength=CELLS) / BATCH
     np.testing.assert_allclose(every, 1 / CELLS, atol=0.01)
