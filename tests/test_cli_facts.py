@@ -175,7 +175,7 @@ def test_the_doctor_prints_json_without_what(
     assert "--json: got it with gradients" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("arguments", [["--version"], ["-h"], ["envs"]])
+@pytest.mark.parametrize("arguments", [["--version"], ["-h"], ["envs", "pointmaze"]])
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EPIPE])
 def test_an_output_that_takes_nothing(
     arguments: list[str], number: int, monkeypatch: pytest.MonkeyPatch

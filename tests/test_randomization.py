@@ -13,8 +13,7 @@ from contract import make, random_actions, reset, row, same, step
 
 import newton_qd
 from newton_qd import PhysicsParams, State, randomize_params
-from newton_qd.physics.parameters import FIELDS
-from newton_qd.wrappers import RandomParamsWrapper, Wrapper
+from newton_qd.wrappers import RandomParamsWrapper
 
 KEY = jax.random.key(7)
 RANGES: dict[str, Any] = {
@@ -222,16 +221,3 @@ def test_environments_of_other_libraries_are_refused() -> None:
     env.unwrapped = env  # as those of brax and Gymnasium
     with pytest.raises(TypeError, match=r"env: got namespace\(.*; allowed: an env"):
         randomize_params(KEY, env)
-
-
-def test_every_simulated_robot_has_parameters() -> None:
-    for name in newton_qd.registered_envs():
-        env = newton_qd.create(name)
-        params = Wrapper(env).default_params
-        if isinstance(params, PhysicsParams):
-            assert all(np.isfinite(getattr(params, field)).all() for field in FIELDS)
-            # the drag of the swimmer drives its root beside the action
-            base: Any = env.unwrapped
-            assert params.gear_scale.shape == (base.system.nu,)
-        else:
-            assert name == "pointmaze"

@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 import pickle
 import tomllib
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 import pytest
 
 import newton_qd
-from newton_qd import tasks
+from newton_qd import PhysicsParams, tasks
 from newton_qd.envs.ant import Ant
 from newton_qd.envs.base import Env, PhysicsEnv
 from newton_qd.extractors import (
     get_feet_contact_proportion,
     get_final_xy_position,
 )
+from newton_qd.physics.parameters import FIELDS
 from newton_qd.wrappers import (
     AutoResetWrapper,
     CompletedEvalWrapper,
@@ -27,6 +30,7 @@ from newton_qd.wrappers import (
     FeetContactWrapper,
     FixedInitialStateWrapper,
     VectorWrapper,
+    Wrapper,
 )
 
 
@@ -236,9 +240,36 @@ def test_tables_are_columns_of_the_rows() -> None:
         newton_qd.tables.reward_offset["ant"]
 
 
+@functools.cache
+def created(name: str) -> Env:
+    """An environment as ``create`` makes it; to make all of them takes a second."""
+    return newton_qd.create(name)
+
+
+def test_every_simulated_robot_has_parameters() -> None:
+    for name in newton_qd.registered_envs():
+        env = created(name)
+        params = Wrapper(env).default_params
+        if isinstance(params, PhysicsParams):
+            assert all(np.isfinite(getattr(params, field)).all() for field in FIELDS)
+            # the drag of the swimmer drives its root beside the action
+            base: Any = env.unwrapped
+            assert params.gear_scale.shape == (base.system.nu,)
+        else:
+            assert name == "pointmaze"
+
+
+def test_every_forward_reward_is_a_metric() -> None:
+    for name in newton_qd.registered_envs():
+        base = created(name).unwrapped
+        if isinstance(base, PhysicsEnv) and base.forward_reward_name is not None:
+            metrics = jax.eval_shape(base.reset, jax.random.key(0)).metrics
+            assert base.forward_reward_name in metrics
+
+
 def test_tables_agree_with_the_environments() -> None:
     for name in newton_qd.registered_envs():
-        base = newton_qd.create(name).unwrapped
+        base = created(name).unwrapped
         if isinstance(base, PhysicsEnv):
             inside = tasks.ENVIRONMENTS[name].base_name
             assert newton_qd.tables.FEET_NAMES.get(inside, ()) == base.robot.feet
