@@ -259,6 +259,16 @@ def test_every_simulated_robot_has_parameters() -> None:
             assert name == "pointmaze"
 
 
+@pytest.mark.parametrize("name", newton_qd.registered_envs())
+def test_no_array_is_promoted_implicitly(name: str) -> None:
+    """JAX can refuse implicit types and axes, for users who look for mistakes."""
+    env = created(name)
+    with jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
+        state = jax.eval_shape(env.reset, jax.random.key(0))
+        action = jax.ShapeDtypeStruct((env.action_size,), np.float32)
+        jax.eval_shape(jax.grad(lambda a, s: env.step(s, a).reward), action, state)
+
+
 def test_every_forward_reward_is_a_metric() -> None:
     for name in newton_qd.registered_envs():
         base = created(name).unwrapped

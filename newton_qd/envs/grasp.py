@@ -136,7 +136,7 @@ class Grasp(Servos, MovingTarget):
         seen = physics.seen_bodies(self.system, state)
         names = ", ".join(self._bodies)
         # the palm does not turn, so its axes are the world's
-        local = self._rows(seen.com) - self._com(seen, "palm")
+        local = self._rows(seen.com) - self._com(seen, "palm")[None]
         to_object, to_target, ahead = self._ways(seen)
         hand, carried = self._speed(seen, _HAND), self._speed(seen, "object")
         return {

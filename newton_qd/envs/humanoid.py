@@ -122,7 +122,7 @@ class Humanoid(PhysicsEnv):
         seen = physics.seen_bodies(self.system, state)
         mass = jnp.asarray(self.system.mass[bodies], self.dtype)[:, None]
         velocity = seen.linear_velocity[bodies]
-        arm = seen.com[bodies] - self._centre_of_mass(seen)
+        arm = seen.com[bodies] - self._centre_of_mass(seen)[None]
         square = ordered_sum(jnp.square(arm).T)[:, None]
         share = mass * velocity / np.asarray(self.system.total_mass, self.dtype)
         turning = cross(arm, velocity) / (_NEAR + square)
@@ -156,7 +156,7 @@ class Humanoid(PhysicsEnv):
         moment = isotropic_inertia(self.system, self._bodies, "observed inertias")
         own = jnp.asarray(moment, self.dtype)[:, None]
         total = own + rounded(added)
-        return total[:, :, None] * jnp.eye(3, dtype=self.dtype)
+        return total[:, :, None] * jnp.eye(3, dtype=self.dtype)[None]
 
     def outcome(
         self, before: PhysicsState, after: PhysicsState, action: Action

@@ -119,7 +119,7 @@ class Swimmer(PhysicsEnv):
         torques = []
         for first in range(len(_LINKS)):
             # the torque of a joint sums over its link and all links behind it
-            arm, push = centre[first:] - joint[first], force[first:]
+            arm, push = centre[first:] - joint[first][None], force[first:]
             left, right = arm[:, 0] * push[:, 1], arm[:, 1] * push[:, 0]
             torques.append(ordered_sum(rounded(left) - rounded(right)))
         return jnp.concatenate([ordered_sum(force), jnp.stack(torques)])

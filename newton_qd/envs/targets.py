@@ -181,7 +181,7 @@ class Pursuit(MovingTarget):
         del action
         seen = physics.seen_bodies(self.system, state)
         torso, names = self.robot.torso, ", ".join(self._bodies)
-        away = self._rows(seen.com) - seen.com[self.system.torso]
+        away = self._rows(seen.com) - seen.com[self.system.torso][None]
         local = self._in_torso(seen, away)
         distance, _ = self._aim(seen)
         aim = local[self._bodies.index("target")] / (_LEAST + distance)
