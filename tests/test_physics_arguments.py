@@ -52,6 +52,27 @@ def test_a_state_of_an_environment_is_no_state_of_the_physics(name: str) -> None
         function(SYSTEM, None, *control)
 
 
+def test_functions_of_a_float64_system_need_x64(x64: None) -> None:
+    """Otherwise JAX rounds the row, and the error names a dtype that nobody gave."""
+    system = physics.load_system(HOPPER, "float64")
+    q, v = jnp.zeros(system.nq), jnp.zeros(system.nv)
+    state, control = physics.initial_state(system, q, v), jnp.zeros(system.nu)
+    calls: dict[str, tuple[Any, ...]] = {
+        "default_params": (),
+        "step": (state, control),
+        "rollout": (state, control[None]),
+        "seen_bodies": (state,),
+        "contact_impulses": (state, control),
+        "initial_state": (q, v),
+        "bias_forces": (q, v),
+        "unit_quaternions": (q,),
+    }
+    words = r"^dtype: got 'float64' while JAX x64 is off; allowed: 'float32', or jax.co"
+    for name, arguments in calls.items():
+        with jax.enable_x64(False), pytest.raises(ValueError, match=words):
+            getattr(physics, name)(system, *arguments)
+
+
 def test_coordinates_are_real_numbers() -> None:
     wrong: Any = "abc"
     for function in (physics.forward_kinematics, physics.initial_state):

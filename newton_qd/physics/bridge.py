@@ -11,9 +11,11 @@ from typing import Protocol
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import warp as wp
 from jax.core import Tracer
 
+from newton_qd import checks
 from newton_qd.checks import Fact, message
 from newton_qd.physics import layout, row_calls
 from newton_qd.physics.explicit_mesh import split_as, split_row
@@ -78,8 +80,10 @@ def _row(
 
     Raises:
         TypeError: The type of an array is not that of the system.
-        ValueError: An array has the wrong shape.
+        ValueError: An array has the wrong shape, or the system is float64 and JAX x64
+            is off.
     """
+    checks.x64(np.dtype(system.dtype))  # else JAX would round the row to float32
     for name, array in arrays.items():
         allowed = f"an array of shape {shapes[name]}, {system.dtype}"
         if array.shape != shapes[name]:
@@ -111,8 +115,9 @@ class Step(Protocol):
 
         Raises:
             TypeError: The type of an array is not that of the system.
-            ValueError: An array has the wrong shape, or the value of
-                ``NEWTON_QD_THREADS`` is not allowed.
+            ValueError: An array has the wrong shape, the value of
+                ``NEWTON_QD_THREADS`` is not allowed, or the system is float64 and JAX
+                x64 is off.
         """
         ...
 
@@ -197,8 +202,8 @@ def rollout(
 
     Raises:
         TypeError: The type of an array is not that of the system.
-        ValueError: An array has the wrong shape, or the value of
-            ``NEWTON_QD_THREADS`` is not allowed.
+        ValueError: An array has the wrong shape, the value of ``NEWTON_QD_THREADS`` is
+            not allowed, or the system is float64 and JAX x64 is off.
     """
     if controls.ndim != 2 or controls.shape[1] != system.nu:
         allowed = f"an array of shape (steps, {system.nu}), {system.dtype}"
@@ -254,7 +259,8 @@ def kinematics(system: System) -> Callable[[jax.Array, jax.Array], Kinematics]:
     """Returns the differentiable kinematics of one world as a function.
 
     Its arguments are ``q`` (nq,) and ``v`` (nv,). It raises TypeError if the type of an
-    array is not that of the system, and ValueError if an array has the wrong shape.
+    array is not that of the system, and ValueError if an array has the wrong shape, or
+    if the system is float64 and JAX x64 is off.
     """
     read, written = layout.coordinates(system), layout.bodies(system)
     call = functools.partial(_kernel_call, system, size=read.size)
@@ -272,7 +278,8 @@ def dynamics(system: System, q: jax.Array, v: jax.Array) -> tuple[jax.Array, jax
 
     Raises:
         TypeError: The type of ``q`` or ``v`` is not that of the system.
-        ValueError: ``q`` or ``v`` has the wrong shape.
+        ValueError: ``q`` or ``v`` has the wrong shape, or the system is float64 and
+            JAX x64 is off.
     """
     read, written = layout.coordinates(system), layout.dynamics(system)
     call = _kernel_call(system, "dynamics_forward", read.size)
@@ -287,7 +294,8 @@ def contact_gaps(system: System, q: jax.Array) -> jax.Array:
 
     Raises:
         TypeError: The type of ``q`` is not that of the system.
-        ValueError: ``q`` has the wrong shape.
+        ValueError: ``q`` has the wrong shape, or the system is float64 and JAX x64 is
+            off.
     """
     read, written = layout.coordinates(system), layout.gaps(system)
     call = _kernel_call(system, "contact_gaps", read.size)
@@ -305,7 +313,8 @@ def contact_impulses(
 
     Raises:
         TypeError: The type of an array is not that of the system.
-        ValueError: An array has the wrong shape.
+        ValueError: An array has the wrong shape, or the system is float64 and JAX x64
+            is off.
     """
     read, written = layout.inputs(system), layout.impulses(system)
     call = _kernel_call(system, "contact_impulses", read.size)

@@ -32,8 +32,9 @@ def checked_vector(system: System, name: str, value: jax.Array, size: int) -> ja
 
     Raises:
         TypeError: It does not have real numbers.
-        ValueError: It has the wrong shape.
+        ValueError: It has the wrong shape, or the system is float64 and JAX x64 is off.
     """
+    checks.x64(np.dtype(system.dtype))
     allowed = f"an array of shape ({size},)"
     checks.instance(name, value, (jax.Array, np.ndarray, list, tuple), allowed)
     require_real(name, jnp.asarray(value))
@@ -57,7 +58,8 @@ def forward_kinematics(system: System, q: jax.Array, v: jax.Array) -> Kinematics
 
     Raises:
         TypeError: ``q`` or ``v`` does not have real numbers.
-        ValueError: ``q`` or ``v`` has the wrong shape.
+        ValueError: ``q`` or ``v`` has the wrong shape, or the system is float64 and
+            JAX x64 is off.
     """
     q = checked_vector(system, "q", q, system.nq)
     v = checked_vector(system, "v", v, system.nv)
@@ -79,7 +81,8 @@ def seen_bodies(system: System, state: PhysicsState) -> Kinematics:
 
     Raises:
         TypeError: ``state`` is not a ``PhysicsState``.
-        ValueError: ``q`` or ``v`` of the state has the wrong shape.
+        ValueError: ``q`` or ``v`` of the state has the wrong shape, or the system is
+            float64 and JAX x64 is off.
     """
     require_physics_state(state)
     if state.bodies is not None:
@@ -102,7 +105,8 @@ def mass_matrix(system: System, q: jax.Array) -> jax.Array:
 
     Raises:
         TypeError: ``q`` does not have real numbers.
-        ValueError: ``q`` has the wrong shape.
+        ValueError: ``q`` has the wrong shape, or the system is float64 and JAX x64 is
+            off.
     """
     q = checked_vector(system, "q", q, system.nq)
     return bridge.dynamics(system, q, jnp.zeros((system.nv,), q.dtype))[0]
@@ -124,7 +128,8 @@ def bias_forces(system: System, q: jax.Array, v: jax.Array) -> jax.Array:
 
     Raises:
         TypeError: ``q`` or ``v`` does not have real numbers.
-        ValueError: ``q`` or ``v`` has the wrong shape.
+        ValueError: ``q`` or ``v`` has the wrong shape, or the system is float64 and
+            JAX x64 is off.
     """
     q = checked_vector(system, "q", q, system.nq)
     v = checked_vector(system, "v", v, system.nv)
@@ -147,7 +152,8 @@ def contact_gaps(system: System, q: jax.Array) -> jax.Array:
 
     Raises:
         TypeError: ``q`` does not have real numbers.
-        ValueError: ``q`` has the wrong shape.
+        ValueError: ``q`` has the wrong shape, or the system is float64 and JAX x64 is
+            off.
     """
     q = checked_vector(system, "q", q, system.nq)
     if not len(system.contact_body):
@@ -175,7 +181,8 @@ def contact_impulses(
 
     Raises:
         TypeError: ``state`` is not a ``PhysicsState``.
-        ValueError: The state or the control has the wrong shape.
+        ValueError: The state or the control has the wrong shape, or the system is
+            float64 and JAX x64 is off.
     """
     require_physics_state(state)
     q = checked_vector(system, "q", state.q, system.nq)
@@ -201,7 +208,8 @@ def lowest_contact(system: System, q: jax.Array) -> jax.Array:
 
     Raises:
         TypeError: ``q`` does not have real numbers.
-        ValueError: ``q`` has the wrong shape, or the robot has no ground contacts.
+        ValueError: ``q`` has the wrong shape, the robot has no ground contacts, or the
+            system is float64 and JAX x64 is off.
     """
     q = checked_vector(system, "q", q, system.nq)
     return _lowest(system, q, system.ground_contacts)
@@ -221,7 +229,8 @@ def on_ground(system: System, q: jax.Array) -> jax.Array:
 
     Raises:
         TypeError: ``q`` does not have real numbers.
-        ValueError: ``q`` has the wrong shape.
+        ValueError: ``q`` has the wrong shape, or the system is float64 and JAX x64 is
+            off.
     """
     q = checked_vector(system, "q", q, system.nq)
     grounding = grounding_coordinate(system)

@@ -73,11 +73,16 @@ def parameter_shapes(system: System) -> dict[str, tuple[int, ...]]:
 
 @takes_system
 def default_params(system: System) -> PhysicsParams:
-    """Returns the parameters of one world with the values of the robot's files."""
+    """Returns the parameters of one world with the values of the robot's files.
+
+    Raises:
+        ValueError: The system is float64 and JAX x64 is off.
+    """
     robot = system.robot
     values = dict.fromkeys(FIELDS, 1.0)
     values |= {"gravity": robot.gravity, "friction": robot.material.friction}
     dtype = jnp.dtype(system.dtype)
+    checks.x64(dtype)
     shapes = parameter_shapes(system)
     return PhysicsParams(**{k: jnp.full(shapes[k], values[k], dtype) for k in FIELDS})
 

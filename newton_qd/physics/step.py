@@ -39,7 +39,8 @@ def initial_state(system: System, q: jax.Array, v: jax.Array) -> PhysicsState:
         The state.
 
     Raises:
-        ValueError: ``q`` or ``v`` has the wrong shape.
+        ValueError: ``q`` or ``v`` has the wrong shape, or the system is float64 and
+            JAX x64 is off.
     """
     dtype = jnp.dtype(system.dtype)
     q = unit_quaternions(system, checked_vector(system, "q", q, system.nq))
@@ -76,8 +77,10 @@ def unit_quaternions(system: System, q: jax.Array) -> jax.Array:
 
     Raises:
         TypeError: ``q`` is not an array, or has the wrong dtype.
-        ValueError: ``q`` has the wrong shape.
+        ValueError: ``q`` has the wrong shape, or the system is float64 and JAX x64 is
+            off.
     """
+    checks.x64(np.dtype(system.dtype))
     q = checks.array("q", q, (system.nq,), system.dtype)
     for start in system.q_start[system.joint_kind == JointKind.FREE] + 3:
         quaternion = q[start : start + 4]
@@ -146,8 +149,8 @@ def step(
         TypeError: The type of the state, the control or a parameter is not that of
             the system.
         ValueError: The state, the control or a parameter has the wrong shape; a
-            concrete parameter is out of bounds; or the value of an environment
-            variable is not allowed.
+            concrete parameter is out of bounds; the value of an environment variable
+            is not allowed; or the system is float64 and JAX x64 is off.
     """
     require_physics_state(state)
     own = None if params is None else parameter_row(system, params)
@@ -211,8 +214,8 @@ def rollout(
         TypeError: The type of the state, a control or a parameter is not that of the
             system.
         ValueError: The state, the controls or a parameter has the wrong shape; a
-            concrete parameter is out of bounds; or the value of an environment
-            variable is not allowed.
+            concrete parameter is out of bounds; the value of an environment variable
+            is not allowed; or the system is float64 and JAX x64 is off.
     """
     require_physics_state(state)
     own = None if params is None else parameter_row(system, params)

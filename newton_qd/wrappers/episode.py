@@ -77,8 +77,8 @@ class EpisodeWrapper(Wrapper):
         require_state(state, "steps")
         nstate, steps = state, state.info["steps"]
         if self.action_repeat == 1:
-            steps = steps + _moving(state)
             nstate = self.env.step(state, action, params)
+            steps = steps + _moving(state)
         else:
             nstate, steps = self._repeat(state, action, params)
         over = steps >= self.episode_length
