@@ -11,6 +11,7 @@ that are marked ``gpu`` themselves are skipped.
 
 from __future__ import annotations
 
+import atexit
 import functools
 import gc
 import os
@@ -65,6 +66,16 @@ def pytest_configure(config: pytest.Config) -> None:
     """Sets what holds for the whole session, before anything is collected."""
     make_our_warnings_errors(config)
     choose_compilation(config)
+    if hasattr(config, "workerinput"):
+        end_without_cleaning()
+
+
+def end_without_cleaning() -> None:
+    """Ends this worker process before JAX frees each program, which takes seconds.
+
+    The session has all reports by then, and does not read how the process ended.
+    """
+    atexit.register(os._exit, 0)
 
 
 def make_our_warnings_errors(config: pytest.Config) -> None:
