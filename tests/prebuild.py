@@ -1,7 +1,7 @@
-"""Builds the kernels that most tests need, one process for each type.
+"""Builds what most tests need, in two processes.
 
-Worker processes that start together would each build them, because a kernel is in
-Warp's cache only when it is finished. Run as a script, it builds those of one type.
+Worker processes that start together would each build it, because a kernel is in Warp's
+cache only when it is finished. Run as a script, it builds the share of one process.
 """
 
 from __future__ import annotations
@@ -13,25 +13,22 @@ from pathlib import Path
 
 import processes
 
-# Environment and kernel of each module.
-KERNELS = {
-    "float32": (
-        ("ant", "step_backward"),
-        ("ant", "step_forward"),
-        ("antmaze", "step_forward"),
-        ("ant", "bodies_forward"),
+# Type and module of kernels, or the name of an environment: to make its model, Newton
+# needs kernels of its own. Both shares take equally long.
+SHARES: tuple[tuple[tuple[str, str] | str, ...], ...] = (
+    (
+        ("float32", "backward"),
+        ("float32", "forward"),
+        ("float32", "bodies"),
+        ("float64", "bodies"),
     ),
-    "float64": (
-        ("ant", "step_backward"),
-        ("ant", "step_forward"),
-        ("ant", "bodies_forward"),
-    ),
-}
+    (("float64", "backward"), ("float64", "forward"), "ant"),
+)
 TIMEOUT_S = 600.0
 
 
 def main() -> None:
-    """Builds the kernels of every type, all types at once.
+    """Builds all shares at once.
 
     A cache that an earlier session filled is left alone.
     """
@@ -40,33 +37,34 @@ def main() -> None:
         return
     builders = [
         processes.start(
-            [sys.executable, str(Path(__file__)), dtype],
+            [sys.executable, str(Path(__file__)), str(share)],
             seconds=TIMEOUT_S,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
-        for dtype in KERNELS
+        for share in range(len(SHARES))
     ]
     # a kernel that does not compile fails the tests that use it, not the session
     for builder in builders:
         builder.wait()
 
 
-def build(dtype: str) -> None:
-    """Builds the kernels of one type in this process."""
-    import jax
+def build(share: int) -> None:
+    """Builds a share in this process."""
     import warp as wp
 
     import newton_qd
-    from newton_qd.envs.base import PhysicsEnv
-    from newton_qd.physics.bridge import launcher
+    from newton_qd.physics.precision import Variant, build_kernels, pack_width
 
-    jax.config.update("jax_enable_x64", dtype == "float64")
-    for env_name, kernel in KERNELS[dtype]:
-        env = newton_qd.create(env_name, dtype=dtype).unwrapped
-        assert isinstance(env, PhysicsEnv)
-        launcher(env.system, wp.get_device("cpu")).prepare(kernel)
+    cpu = wp.get_device("cpu")
+    for item in SHARES[share]:
+        if isinstance(item, str):
+            newton_qd.create(item)
+            continue
+        dtype, name = item
+        kernels = build_kernels(Variant(dtype, pack_width(dtype, cpu)))
+        wp.load_module(getattr(kernels, name), device=cpu, block_dim=1)
 
 
 if __name__ == "__main__":
-    build(sys.argv[1])
+    build(int(sys.argv[1]))
