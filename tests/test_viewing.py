@@ -9,6 +9,7 @@ import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -27,6 +28,7 @@ from newton_qd.robots import ROBOTS
 from newton_qd.scenes import SCENES
 from newton_qd.viewing import (
     Recorder,
+    camera,
     drawing_of,
     html,
     joined,
@@ -445,6 +447,9 @@ def test_a_video_that_is_not_complete_leaves_the_old_one(
         yield
         raise OSError("Broken pipe\n\nFFMPEG COMMAND:\nffmpeg -y")
 
+    # what is in the pictures does not matter here
+    blank = SimpleNamespace(picture=lambda q: np.zeros((32, 32, 3), np.uint8))
+    monkeypatch.setattr(camera, "Camera", lambda *_: blank)
     target = tmp_path / "one.mp4"
     target.write_bytes(b"old")
     for writer, why in ((half, "no complete video"), (broken, "stopped: Broken pipe$")):
