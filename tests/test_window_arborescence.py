@@ -83,6 +83,7 @@ def test_gradients_raise_what_they_are_of() -> None:
             assert after[index] > before[index] + 0.02
 
 
+@pytest.mark.slow
 def test_offspring_lie_along_the_gradients() -> None:
     for state, offspring in generations(6):
         rows = offspring.reshape(POINTS, EACH, SIZE)
@@ -91,6 +92,7 @@ def test_offspring_lie_along_the_gradients() -> None:
         np.testing.assert_allclose(rows[:, 1:], state.points[:, None] + steps)
 
 
+@pytest.mark.slow
 def test_actors_walk_where_the_best_offspring_lie() -> None:
     states = [state for state, _ in generations(6)]
     for before, after in itertools.pairwise(states):
@@ -137,6 +139,7 @@ def test_gradients_have_length_one_for_whitened_observations() -> None:
     np.testing.assert_allclose(found.reshape(-1, 8), expected, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_points_begin_again_from_elites() -> None:
     rows = [state for state, _ in generations(6)]
     begun = [state for state in rows[1:] if not state.age.any()]
