@@ -9,6 +9,7 @@ import shlex
 from pathlib import Path
 
 import pytest
+from test_registry import created
 
 import newton_qd
 
@@ -73,7 +74,7 @@ def test_readme_table_of_environments() -> None:
     )
     assert {row[0] for row in rows} == set(newton_qd.registered_envs())
     for name, observation, action, descriptor in rows:
-        env = newton_qd.create(name)
+        env = created(name)
         assert env.observation_size == int(observation)
         assert env.action_size == int(action)
         length = getattr(env, "descriptor_length", None)
