@@ -113,7 +113,7 @@ def test_joints_of_a_robot(page: dict[str, Any]) -> None:
         ValueError, match=r"name: got 'up', .* no joint of crawler; .*left"
     ):
         env.joint("up")
-    seen = env.kinematics(env.fixed_state().pipeline_state)
+    seen = jax.jit(lambda: env.kinematics(env.fixed_state().pipeline_state))()
     assert seen.position.shape == (3, 3)
 
 
@@ -138,7 +138,7 @@ def test_numbers_of_numpy_are_numbers(page: dict[str, Any]) -> None:
     found = np.float32(2.0), np.bool_(False), {"height": np.int32(3)}
     plain = type("Plain", (Still,), {"outcome": lambda self, *given: found})
     env = plain(page["ROBOT"])
-    state = env.reset(jax.random.key(0))
+    state = jax.jit(env.reset)(jax.random.key(0))
     after = jax.jit(env.step)(state, jnp.zeros(env.action_size))
     assert (after.reward, after.done, after.metrics["height"]) == (2.0, 0.0, 3.0)
 

@@ -47,7 +47,7 @@ def test_it_stands_on_its_feet_and_falls_as_the_original() -> None:
     env: Any = newton_qd.create("humanoid_uni", episode_length=None, auto_reset=False)
     robot = env.unwrapped
     zero = jnp.zeros((100, env.action_size), np.float32)
-    state = robot.fixed_state()
+    state = jax.jit(robot.fixed_state)()
     contact = jnp.zeros(2, np.float32)
     state = state.replace(info={**state.info, "state_descriptor": contact})
     states = jax.jit(

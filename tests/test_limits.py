@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
+
 import jax
 import numpy as np
 import pytest
 from physics_helpers import DISTINCT, batched_step, report, rollout, variant
 
 from newton_qd.physics import load_system
-from newton_qd.physics.system import JointKind, System
+from newton_qd.physics.system import JointKind, PhysicsState, System
 from newton_qd.robots import ROBOTS
 
 SECONDS = 4.0  # after which a joint under full gear is still
@@ -55,6 +58,12 @@ def test_a_pose_on_its_limits_feels_nothing(name: str) -> None:
     assert share < 0.02
 
 
+@functools.cache
+def rollouts(system: System) -> Callable[..., PhysicsState]:
+    """The jitted rollout of a batch of worlds."""
+    return jax.jit(jax.vmap(rollout(system)))
+
+
 def pushed(system: System, start: str) -> np.ndarray:
     """Angles beyond its limits (2 n, steps) of each joint under its full gear alone.
 
@@ -81,7 +90,7 @@ def pushed(system: System, start: str) -> np.ndarray:
         ]
     still = np.zeros((len(rows), system.nv))
     states = (x.astype(np.float32) for x in (q, still, controls))
-    path = np.asarray(jax.jit(jax.vmap(rollout(system)))(*states).q)
+    path = np.asarray(rollouts(system)(*states).q)
     angles = path[np.arange(len(rows)), :, at]
     return np.array([side for side, _ in rows])[:, None] * (
         angles - np.array(limit)[:, None]

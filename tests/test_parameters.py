@@ -383,16 +383,17 @@ def test_friction_holds_a_box(x64: None, tmp_path: Path) -> None:
     system = box_system(tmp_path, angle)
     default = physics.default_params(system)
 
-    def slide(friction: float) -> np.ndarray:
+    @jax.jit
+    def slide(friction: float) -> jax.Array:
         def advance(state: PhysicsState, _: None) -> tuple[PhysicsState, None]:
-            params = default.replace(friction=jnp.asarray(friction))
+            params = default.replace(friction=friction)
             return physics.step(system, state, jnp.zeros(0), params)[0], None
 
         tilt = jnp.array([0.0, np.sin(angle / 2), 0.0, np.cos(angle / 2)])
         normal = jnp.array([np.sin(angle), 0.0, np.cos(angle)])
         q = jnp.concatenate([BOX_HEIGHT * normal, tilt])
         start = physics.initial_state(system, q, jnp.zeros(6))
-        return np.asarray(jax.lax.scan(advance, start, None, length=steps)[0].v)
+        return jax.lax.scan(advance, start, None, length=steps)[0].v
 
     along = np.array([np.cos(angle), 0.0, -np.sin(angle)])
     free = system.robot.gravity * np.sin(angle) * steps * system.robot.dt

@@ -229,15 +229,15 @@ def test_unknown_option(name: str) -> None:
 
 def test_euler_pitch_has_a_gradient_everywhere() -> None:
     angle = np.concatenate([np.linspace(-12.0, 12.0, 997), [np.pi / 2, -np.pi / 2]])
-    found = euler_pitch(jnp.asarray(angle, np.float32))
+    found = jax.jit(euler_pitch)(jnp.asarray(angle, np.float32))
     np.testing.assert_allclose(found, np.arcsin(np.sin(angle)), atol=3e-6)
-    slope = jax.vmap(jax.grad(euler_pitch))(jnp.asarray(angle, np.float32))
+    slope = jax.jit(jax.vmap(jax.grad(euler_pitch)))(jnp.asarray(angle, np.float32))
     assert set(np.unique(slope)) == {-1.0, 1.0}
 
 
 def test_feet_of_a_world_at_fault_carry_what_they_carried_before() -> None:
     env = make("hopper")
-    first, step = env.fixed_state(), jax.jit(env.step)
+    first, step = jax.jit(env.fixed_state)(), jax.jit(env.step)
     falling = dataclasses.replace(
         first.pipeline_state, v=first.pipeline_state.v.at[1].set(-2000.0)
     )
