@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import re
 import sys
 import tomllib
@@ -55,8 +56,13 @@ def declared(*extras: str) -> set[str]:
     return found
 
 
-def imported(folder: Path) -> Iterator[tuple[str, str]]:
+@functools.cache
+def imported(folder: Path) -> tuple[tuple[str, str], ...]:
     """File and root of every import in a folder that is not of Python."""
+    return tuple(_imported(folder))
+
+
+def _imported(folder: Path) -> Iterator[tuple[str, str]]:
     for path in sorted(folder.rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             names: list[str] = []

@@ -22,7 +22,7 @@ def calls(function: str) -> Iterator[tuple[str, ast.Call]]:
     """File and call of every use of a function of ``subprocess`` in the tests."""
     for path in sorted(TESTS.glob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Call):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
                 if ast.unparse(node.func) == f"subprocess.{function}":
                     yield f"{path.name}:{node.lineno}", node
 
