@@ -261,6 +261,72 @@ def test_qd_wrapper_forwards_the_descriptor() -> None:
     assert not hasattr(QDWrapper(Ant()), "descriptor_length")
 
 
+class Height(QDWrapper):
+    """Written for QDax 0.4: the descriptor of an episode has limits of its own."""
+
+    @property
+    def state_descriptor_length(self) -> int:
+        return 1
+
+    @property
+    def state_descriptor_limits(self) -> tuple[jax.Array, jax.Array]:
+        return jnp.array([-jnp.inf]), jnp.array([jnp.inf])
+
+    @property
+    def behavior_descriptor_length(self) -> int:
+        return 1
+
+    @property
+    def behavior_descriptor_limits(self) -> tuple[jax.Array, jax.Array]:
+        return jnp.zeros(1), jnp.ones(1)
+
+
+class HigherHeight(Height):
+    @property
+    def descriptor_limits(self) -> tuple[jax.Array, jax.Array]:
+        return jnp.zeros(1), 2 * jnp.ones(1)
+
+
+class LowHeight:
+    @property
+    def behavior_descriptor_limits(self) -> tuple[jax.Array, jax.Array]:
+        return -jnp.ones(1), jnp.zeros(1)
+
+
+class LowerHeight(LowHeight, HigherHeight):
+    pass
+
+
+@pytest.mark.parametrize(
+    ("kind", "limits"),
+    [
+        (Height, [[0], [1]]),
+        (HigherHeight, [[0], [2]]),
+        (LowerHeight, [[-1], [0]]),
+    ],
+)
+@pytest.mark.parametrize("inside", [Ant, PointMaze])
+def test_one_name_of_the_descriptor_is_enough(
+    kind: type[QDWrapper], limits: list[list[int]], inside: Callable[[], Env]
+) -> None:
+    env = kind(inside())
+    assert env.descriptor_length == env.behavior_descriptor_length == 1
+    for found in (env.descriptor_limits, env.behavior_descriptor_limits):
+        assert np.array_equal(found, limits)
+    assert not np.all(np.isfinite(env.state_descriptor_limits))
+
+
+def test_limits_of_an_episode_by_their_new_name() -> None:
+    class Bounded(PointMaze):
+        @property
+        def descriptor_limits(self) -> tuple[jax.Array, jax.Array]:
+            return -2 * jnp.ones(2), 2 * jnp.ones(2)
+
+    env = Bounded()
+    for found in (env.descriptor_limits, env.behavior_descriptor_limits):
+        assert np.array_equal(found, [[-2, -2], [2, 2]])
+
+
 @functools.cache
 def by_hand(wrapper: Callable[[Env, str], Env]) -> Any:
     return wrapper(newton_qd.create("ant", episode_length=3), "ant")

@@ -13,7 +13,7 @@ import numpy as np
 
 from newton_qd.checks import message
 from newton_qd.envs import rollouts
-from newton_qd.envs.renamed import accept_params
+from newton_qd.envs.renamed import accept_params, share_synonyms
 from newton_qd.envs.shown import described
 from newton_qd.envs.state import State, no_brax_view
 from newton_qd.robots import Material, RobotSpec
@@ -211,8 +211,13 @@ class QDEnv(Env):
     """An environment that writes ``info["state_descriptor"]``.
 
     The descriptor of an episode has the same length and limits as the state descriptor.
-    Both names that QDax has used for them work.
+    Both names that QDax has used for them work, also for a subclass that overrides one.
     """
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Gives the class both names of the properties of an episode's descriptor."""
+        super().__init_subclass__(**options)
+        share_synonyms(cls)
 
     @property
     @abc.abstractmethod

@@ -16,6 +16,11 @@ _RENAMED = {
     "_control": "control",
     "_place": "reset_pose",
 }
+_SYNONYMS = {
+    "behavior_descriptor_length": "descriptor_length",
+    "behavior_descriptor_limits": "descriptor_limits",
+}
+"""Names of QDax up to 0.4, and those of later releases."""
 
 
 def keep_old_names(kind: type) -> None:
@@ -34,6 +39,22 @@ def keep_old_names(kind: type) -> None:
             setattr(kind, new, vars(kind)[old])
         elif new in vars(kind):
             setattr(kind, old, vars(kind)[new])
+
+
+def share_synonyms(kind: type) -> None:
+    """Gives a class both names of a property of which it overrides one.
+
+    Without this, the other name would still be the property of a base class.
+
+    Args:
+        kind: A class that has just been made.
+    """
+    for pair in _SYNONYMS.items():
+        # the nearest class with one of them decides; it may be a mixin
+        nearest = next((vars(c) for c in kind.__mro__ if vars(c).keys() & pair), {})
+        for name, synonym in (pair, pair[::-1]):
+            if name in nearest and synonym not in nearest:
+                setattr(kind, synonym, nearest[name])
 
 
 def accept_params(kind: type) -> None:

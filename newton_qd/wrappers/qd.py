@@ -39,16 +39,6 @@ class QDWrapper(Wrapper, QDEnv):
         return self._described.descriptor_limits
 
     @property
-    def behavior_descriptor_length(self) -> int:
-        """Length of an episode's descriptor."""
-        return self.descriptor_length
-
-    @property
-    def behavior_descriptor_limits(self) -> tuple[jax.Array, jax.Array]:
-        """Lower and upper limits of an episode's descriptor, (nd,) each."""
-        return self.descriptor_limits
-
-    @property
     def _described(self) -> Any:
         # any environment with these properties; a wrapper may forward them
         return self.env
