@@ -165,6 +165,7 @@ def create(
             spec. They replace the arguments in the spec.
         material: Softness of contacts and limits; ``None``: as in the robot's spec.
         brax_views: Whether to add ``state.qp`` and ``env.sys`` for code for brax v1.
+            Without physics there are none.
         robot: Another robot for the task, such as a damaged one: see
             ``env.with_robot``. A base with an argument ``robot``, or with any keyword
             arguments, gets it instead. ``None``: that of the environment.
@@ -177,8 +178,8 @@ def create(
         UnknownEnvironment: ``env_name`` is not registered.
         TypeError: An argument has the wrong type, or a keyword argument is unknown.
         ValueError: A value or a combination of values is not allowed.
-        NotImplementedError: ``material``, ``robot`` or ``brax_views`` is given, and
-            the environment has no physics.
+        NotImplementedError: ``material`` or ``robot`` is given, and the environment
+            has no physics.
     """
     spec = _spec(env_name)
     checks.flag("auto_reset", auto_reset)
